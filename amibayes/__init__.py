@@ -1,0 +1,40 @@
+"""amibayes: Bayesian inference for aperture masking interferometry.
+
+Public names are loaded when they are first used (PEP 562), so that importing the
+package, and starting the command line, costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from amibayes.errors import AmibayesError, DataError, RunError, UsageError
+
+_HOME = {
+    "AmibayesError": "amibayes.errors",
+    "DataError": "amibayes.errors",
+    "RunError": "amibayes.errors",
+    "UsageError": "amibayes.errors",
+}
+
+__all__ = [
+    "AmibayesError",
+    "DataError",
+    "RunError",
+    "UsageError",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'amibayes' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,105 @@
+"""Options that mean one thing in every command."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import warnings
+
+from amibayes.errors import UsageError
+
+
+def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
+    """Add ``--out``, ``--overwrite``, ``--json`` and how much is said."""
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--out",
+        default=f"amibayes-{command}",
+        metavar="DIR",
+        help="folder for the results (default: %(default)s)",
+    )
+    group.add_argument(
+        "--overwrite", action="store_true", help="replace results that are there already"
+    )
+    group.add_argument(
+        "--json",
+        action="store_true",
+        help="print the result as JSON on standard output and nothing else there",
+    )
+    loudness = group.add_mutually_exclusive_group()
+    loudness.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    loudness.add_argument("--verbose", action="store_true", help="say what is being done")
+    group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+
+
+def add_seed_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--seed``: the same seed gives the same result."""
+    parser.add_argument(
+        "--seed",
+        type=non_negative_integer,
+        default=1,
+        metavar="N",
+        help="seed of all random numbers (default: %(default)s)",
+    )
+
+
+def non_negative_integer(text: str) -> int:
+    """Parse an integer that is not negative."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def positive_float(text: str) -> float:
+    """Parse a finite number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def number_range(text: str) -> tuple[float, float]:
+    """Parse ``LOW:HIGH`` with 0 ≤ LOW < HIGH."""
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LOW:HIGH") from None
+    if not 0.0 <= low < high < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} needs 0 <= LOW < HIGH")
+    return low, high
+
+
+def configure_logging(arguments: argparse.Namespace) -> None:
+    """Send the program's log and the libraries' warnings where they belong: standard error."""
+    level = logging.DEBUG if arguments.verbose else logging.WARNING
+    logging.basicConfig(stream=sys.stderr, level=level, format="amibayes: %(message)s")
+    for chatty in ("matplotlib", "PIL", "h5py"):
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    if not arguments.debug:
+        warnings.simplefilter("ignore")
+
+
+def refuse_repeated(paths: list[str]) -> None:
+    """Refuse a file that was given twice, under whatever name.
+
+    Raises
+    ------
+    UsageError
+        Naming the file.
+    """
+    from pathlib import Path
+
+    seen: set[Path] = set()
+    for path in paths:
+        resolved = Path(path).resolve()
+        if resolved in seen:
+            raise UsageError("is given twice", source=path, remedy="give every file once")
+        seen.add(resolved)

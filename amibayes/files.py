@@ -1,0 +1,106 @@
+"""Writing files whole or not at all, and saying what a file was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from amibayes.errors import RunError, UsageError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside ``path`` that replaces it when the block succeeds.
+
+    Raises
+    ------
+    RunError
+        Where the folder cannot be written or the disk is full.
+    """
+    final = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(
+            dir=final.parent, prefix=f".{final.stem}.", suffix=final.suffix
+        )
+        os.close(handle)
+    except OSError as error:
+        raise cannot_write(final, error) from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(final)
+    except OSError as error:
+        raise cannot_write(final, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def cannot_write(path: Path, error: OSError) -> RunError:
+    """Describe in one line an output that could not be written."""
+    return RunError(
+        f"cannot be written: {error.strerror or error}",
+        source=path,
+        remedy="choose a writable folder with space left",
+    )
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write ``text`` to ``path``, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write strict JSON (no NaN, no infinity) to ``path``, whole or not at all."""
+    write_text(path, to_json(content))
+
+
+def to_json(content: Any) -> str:
+    """Strict, indented JSON text; a NaN in it is a programming error."""
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def sha256(path: str | Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as stream:
+        while chunk := stream.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
+    """Make ``folder`` ready for files called ``names``.
+
+    Raises
+    ------
+    UsageError
+        Where one of the files is there already and ``overwrite`` is false, or
+        where ``folder`` is a file or cannot be made.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"cannot be made a folder: {error.strerror}", source=path, remedy="choose another --out"
+        ) from error
+    present = [name for name in names if (path / name).exists()]
+    if present and not overwrite:
+        raise UsageError(
+            "is there already", source=path / present[0], remedy="give --overwrite or another --out"
+        )
+    return path
