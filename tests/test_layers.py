@@ -34,6 +34,7 @@ LAYERS = [
     "report",
     "pipeline",
     "cli",
+    "__main__",
 ]
 
 
