@@ -1,0 +1,98 @@
+"""Closure phases and the baselines they are made of: incidence, kernel basis, covariance.
+
+Closure phases around the triangles of an array share baselines, so they are neither
+independent of each other nor, as a rule, of full rank: n stations give n(n−1)(n−2)/6
+triangles but only (n−1)(n−2)/2 independent combinations (kernel phases, Martinache 2010).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+
+from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
+
+RIDGE = 1e-4
+"""Weight of the pull towards equal baseline variances, relative to reproducing the errors."""
+
+FLOOR = 0.05
+"""Smallest baseline variance, in units of the mean one: no combination gets infinite weight."""
+
+
+def closure_matrix(triangles: IntArray) -> tuple[FloatArray, IntArray]:
+    """Incidence of triangles on baselines: closure phase = K · baseline phase.
+
+    Parameters
+    ----------
+    triangles : (n, 3) int array
+        Stations a, b, c of each triangle, whose closure phase is φ(ab) + φ(bc) − φ(ac).
+
+    Returns
+    -------
+    matrix : (n, n_baselines) float array
+        Entries −1, 0, +1; a baseline is counted positive from the lower to the higher station.
+    baselines : (n_baselines, 2) int array
+        The baselines that the triangles use, each with its lower station first.
+    """
+    a, b, c = np.asarray(triangles, dtype=np.intp).T
+    legs = np.stack([np.stack([a, b], 1), np.stack([b, c], 1), np.stack([a, c], 1)], axis=1)
+    sign = np.where(legs[..., 0] < legs[..., 1], 1.0, -1.0) * np.array([1.0, 1.0, -1.0])
+    baselines, column = np.unique(np.sort(legs, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
+    matrix = np.zeros((len(a), len(baselines)))
+    np.add.at(matrix, (np.repeat(np.arange(len(a)), 3), column.ravel()), sign.ravel())
+    return matrix, baselines
+
+
+def kernel_basis(matrix: FloatArray) -> FloatArray:
+    """Orthonormal basis (n_triangles, rank) of the closure phases that a matrix can produce."""
+    left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, singular > 1e-8 * singular[0]])
+
+
+def baseline_variances(matrix: FloatArray, closure_variance: FloatArray) -> FloatArray:
+    """Variances of independent baseline phases that reproduce closure-phase errors.
+
+    Among the solutions of |K| s = σ² the one nearest to equal variances is taken, with a
+    floor above zero: four stations have four triangles for six baselines, and plain
+    non-negative least squares would leave two baselines without noise.
+
+    Parameters
+    ----------
+    matrix : (n_triangles, n_baselines) float array
+        From `closure_matrix`.
+    closure_variance : (n_triangles,) or (n_triangles, n_sets) float array
+        Squared errors of the closure phases; each column is solved by itself.
+
+    Returns
+    -------
+    (n_baselines,) or (n_baselines, n_sets) float array
+    """
+    target = np.atleast_2d(closure_variance.T).T
+    share = np.abs(matrix)
+    mean = target.mean(axis=0) / share.sum(axis=1).mean()
+    system = np.vstack([share, np.sqrt(RIDGE) * np.eye(share.shape[1])])
+    right = np.vstack([target / mean, np.full((share.shape[1], target.shape[1]), np.sqrt(RIDGE))])
+    solution = np.linalg.lstsq(system, right, rcond=None)[0]
+    for column in np.flatnonzero((solution < FLOOR).any(axis=0)):
+        solution[:, column] = lsq_linear(system, right[:, column], bounds=(FLOOR, np.inf)).x
+    return np.asarray((solution * mean).reshape(share.shape[1:] + closure_variance.shape[1:]))
+
+
+def assumed_covariance(matrix: FloatArray, closure_variance: FloatArray) -> FloatArray:
+    """Covariance K Σ Kᵀ of closure phases whose file gives errors and no correlations.
+
+    Parameters
+    ----------
+    matrix : (n_triangles, n_baselines) float array
+    closure_variance : (n_triangles, n_sets) float array
+        Squared errors, one column per exposure and channel.
+
+    Returns
+    -------
+    (n_sets, n_triangles, n_triangles) float array
+    """
+    variances = baseline_variances(matrix, closure_variance)
+    return np.asarray(np.einsum("tb,bs,qb->stq", matrix, variances, matrix, optimize=True))
