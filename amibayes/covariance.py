@@ -13,7 +13,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, solve_triangular
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 
 from amibayes.errors import DataError
 from amibayes.units import FloatArray
@@ -38,6 +39,11 @@ class Covariance(Protocol):
     @property
     def variance(self) -> FloatArray:
         """Diagonal of the matrix, (size,)."""
+        ...
+
+    @property
+    def whitening(self) -> csr_array:
+        """The sparse matrix W, (rank, size), with W C Wᵀ = 1."""
         ...
 
     def whiten(self, x: FloatArray) -> FloatArray:
@@ -96,6 +102,11 @@ class DiagonalCovariance:
         """All entries are independent."""
         return self.size
 
+    @property
+    def whitening(self) -> csr_array:
+        """The sparse matrix W, (rank, size), with W C Wᵀ = 1."""
+        return csr_array(diags_array(1.0 / np.sqrt(self.variance)))
+
     def whiten(self, x: FloatArray) -> FloatArray:
         """x / σ."""
         return np.asarray((x.T / np.sqrt(self.variance)).T)
@@ -140,22 +151,6 @@ class Block:
     matrix: FloatArray
     basis: FloatArray | None = None
 
-    def factors(self) -> tuple[FloatArray, FloatArray]:
-        """(whitening (r, m), colouring (m, r)): unit noise ↔ noise of this covariance.
-
-        Raises
-        ------
-        DataError
-            Where the matrix is not positive definite on the basis.
-        """
-        basis = np.eye(len(self.index)) if self.basis is None else self.basis
-        try:
-            lower = cho_factor(basis.T @ self.matrix @ basis, lower=True)[0]
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise DataError("the covariance is not positive definite") from error
-        lower = np.tril(lower)
-        return solve_triangular(lower, basis.T, lower=True), basis @ lower
-
     def select(self, position: IntArray, inside: IntArray) -> Block:
         """Keep the entries ``inside`` of the block, which then stand at ``position``."""
         basis = self.basis
@@ -165,36 +160,17 @@ class Block:
         return Block(position, self.matrix[np.ix_(inside, inside)], basis)
 
 
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    """Blocks of one shape, stacked: ``index`` (g, m), ``rows`` (g, r)."""
-
-    index: IntArray
-    rows: IntArray
-    whitening: FloatArray
-    colouring: FloatArray
-
-    def apply(self, x: FloatArray, out: FloatArray) -> None:
-        g, m = self.index.shape
-        if m == 1:
-            out[self.rows[:, 0]] = self.whitening[:, 0] * x[self.index[:, 0]]
-        else:
-            out[self.rows.ravel()] = (
-                self.whitening @ x[self.index.ravel()].reshape(g, m, -1)
-            ).reshape(self.rows.size, -1)
-
-    def transpose(self, y: FloatArray, factor: FloatArray, out: FloatArray) -> None:
-        g, r = self.rows.shape
-        out[self.index.ravel()] = (factor @ y[self.rows.ravel()].reshape(g, r, -1)).reshape(
-            self.index.size, -1
-        )
-
-
-def _stack(blocks: Sequence[Block], first_row: int) -> _Batch:
-    whitening, colouring = (np.array(f) for f in zip(*(b.factors() for b in blocks), strict=True))
-    g, r = whitening.shape[:2]
-    rows = first_row + np.arange(g * r).reshape(g, r)
-    return _Batch(np.array([b.index for b in blocks]), rows, whitening, colouring)
+def _factors(blocks: Sequence[Block]) -> tuple[FloatArray, FloatArray]:
+    """Whitening (g, r, m) and colouring (g, r, m)ᵀ factors of g blocks of one shape."""
+    bases = np.array([np.eye(len(b.index)) if b.basis is None else b.basis for b in blocks])
+    inner = bases.swapaxes(1, 2) @ np.array([b.matrix for b in blocks]) @ bases
+    try:
+        lower = np.linalg.cholesky(inner)
+    except np.linalg.LinAlgError as error:
+        raise DataError("the covariance is not positive definite") from error
+    if not np.isfinite(lower).all():
+        raise DataError("the covariance has entries that are not finite")
+    return np.linalg.solve(lower, bases.swapaxes(1, 2)), bases @ lower
 
 
 class BlockCovariance:
@@ -221,19 +197,36 @@ class BlockCovariance:
             raise ValueError("the blocks of a covariance have to tile the data vector")
         self.size = size
         self.blocks = tuple(blocks)
-        self._batches = self._batched()
-        self.rank = sum(batch.rows.size for batch in self._batches)
+        self.whitening, self._colouring, self._logdet = self._assemble()
+        self.rank = int(self.whitening.shape[0])
 
-    def _batched(self) -> list[_Batch]:
+    def _alike(self) -> list[list[Block]]:
         kinds: dict[tuple[int, int], list[Block]] = {}
         for block in self.blocks:
             rank = len(block.index) if block.basis is None else block.basis.shape[1]
             kinds.setdefault((len(block.index), rank), []).append(block)
-        batches: list[_Batch] = []
-        for alike in kinds.values():
-            first = sum(batch.rows.size for batch in batches)
-            batches.append(_stack(alike, first))
-        return batches
+        return list(kinds.values())
+
+    def _assemble(self) -> tuple[csr_array, csr_array, float]:
+        row = 0
+        places, whitening, colouring, logdet = [], [], [], 0.0
+        for blocks in self._alike():
+            white, colour = _factors(blocks)
+            g, r, m = white.shape
+            rows = row + np.arange(g * r).reshape(g, r, 1)
+            columns = np.array([b.index for b in blocks]).reshape(g, 1, m)
+            places.append([np.broadcast_to(x, (g, r, m)).ravel() for x in (rows, columns)])
+            whitening.append(white.ravel())
+            colouring.append(colour.swapaxes(1, 2).ravel())
+            logdet += float(np.linalg.slogdet(colour.swapaxes(1, 2) @ colour)[1].sum())
+            row += g * r
+        where = tuple(np.concatenate(x) for x in zip(*places, strict=True)) if row else ([], [])
+        shape = (row, self.size)
+        return (
+            csr_array((np.concatenate(whitening or [[]]), where), shape=shape),
+            csr_array((np.concatenate(colouring or [[]]), where), shape=shape),
+            logdet,
+        )
 
     @property
     def variance(self) -> FloatArray:
@@ -245,34 +238,19 @@ class BlockCovariance:
 
     def whiten(self, x: FloatArray) -> FloatArray:
         """Independent, unit-variance combinations, (rank, …)."""
-        columns = x.reshape(self.size, -1)
-        out = np.empty((self.rank, columns.shape[1]))
-        for batch in self._batches:
-            batch.apply(columns, out)
-        return out.reshape((self.rank, *x.shape[1:]))
+        return np.asarray(self.whitening @ x)
 
     def solve(self, x: FloatArray) -> FloatArray:
         """(Pseudo-)inverse of the covariance times x, (size, …)."""
-        white = self.whiten(x).reshape(self.rank, -1)
-        out = np.empty((self.size, white.shape[1]))
-        for batch in self._batches:
-            batch.transpose(white, batch.whitening.swapaxes(1, 2), out)
-        return out.reshape(x.shape)
+        return np.asarray(self.whitening.T @ (self.whitening @ x))
 
     def logdet(self) -> float:
         """Logarithm of the determinant of the covariance of the independent combinations."""
-        return sum(
-            float(np.linalg.slogdet(b.colouring.swapaxes(1, 2) @ b.colouring)[1].sum())
-            for b in self._batches
-        )
+        return self._logdet
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Noise vectors, (size, n)."""
-        white = rng.standard_normal((self.rank, n))
-        out = np.empty((self.size, n))
-        for batch in self._batches:
-            batch.transpose(white, batch.colouring, out)
-        return out
+        return np.asarray(self._colouring.T @ rng.standard_normal((self.rank, n)))
 
     def dense(self) -> FloatArray:
         """The full matrix, (size, size)."""
@@ -320,8 +298,6 @@ def stack_covariances(parts: Sequence[Covariance]) -> Covariance:
 
 def covariance_from_matrix(matrix: FloatArray) -> Covariance:
     """Covariance of a matrix split into its connected groups of correlated entries."""
-    from scipy.sparse.csgraph import connected_components
-
     if not np.any(matrix - np.diag(np.diag(matrix))):
         return DiagonalCovariance(np.diag(matrix))
     count, label = connected_components(matrix != 0, directed=False)
