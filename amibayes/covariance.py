@@ -223,8 +223,8 @@ class BlockCovariance:
         where = tuple(np.concatenate(x) for x in zip(*places, strict=True)) if row else ([], [])
         shape = (row, self.size)
         return (
-            csr_array((np.concatenate(whitening or [[]]), where), shape=shape),
-            csr_array((np.concatenate(colouring or [[]]), where), shape=shape),
+            csr_array((np.concatenate([np.empty(0), *whitening]), where), shape=shape),
+            csr_array((np.concatenate([np.empty(0), *colouring]), where), shape=shape),
             logdet,
         )
 

@@ -23,6 +23,7 @@ LAYERS = [
     "closure",
     "covariance",
     "observables",
+    "synthetic",
     "oifits",
     "extraction",
     "calibration",

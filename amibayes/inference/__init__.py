@@ -1,0 +1,1 @@
+"""Model, likelihood, search and posterior of companions."""

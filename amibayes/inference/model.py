@@ -1,0 +1,162 @@
+"""The binary model: a disc, point companions, over-resolved light, and the channel's width.
+
+V = (V_A + Σ c_k E_k) / (1 + Σ c_k + f) with V_A the uniform disc of the primary,
+c_k the contrast (companion/primary flux ratio), f the over-resolved background
+(primary = 1) and E_k = sinc · exp(−2πi(uα + vδ)/λ), whose sinc is the average over the
+channel. Everything is evaluated for many parameter sets at once: points of the (u, v)
+plane down the rows, parameter sets across the columns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j0, j1
+
+from amibayes.inference.samples import Samples
+from amibayes.units import MAS, FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class BinaryModel:
+    """What is fitted and what is held fixed.
+
+    Parameters
+    ----------
+    companions : int
+        Number of companions, 0 or more.
+    diameter_mas : float or "free"
+        Uniform-disc diameter of the primary.
+    background : float or "free"
+        Over-resolved flux in units of the primary's.
+    smearing : bool
+        Average over the width of each channel.
+    """
+
+    companions: int = 1
+    diameter_mas: float | Literal["free"] = 0.0
+    background: float | Literal["free"] = 0.0
+    smearing: bool = True
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of a parameter vector."""
+        names: list[str] = []
+        for k in range(self.companions):
+            suffix = "" if k == 0 else f"_{k + 1}"
+            names += [f"east_mas{suffix}", f"north_mas{suffix}", f"contrast{suffix}"]
+        if self.diameter_mas == "free":
+            names.append("diameter_mas")
+        if self.background == "free":
+            names.append("background")
+        return tuple(names)
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number of free parameters that are not a companion's."""
+        return len(self.parameters) - 3 * self.companions
+
+    def split(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(companions (k, 3, n), diameter_mas (n,), background (n,)) of theta (n, n_dim)."""
+        n = len(theta)
+        pairs = theta[:, : 3 * self.companions].T.reshape(self.companions, 3, n)
+        rest = list(theta[:, 3 * self.companions :].T)
+        diameter = rest.pop(0) if self.diameter_mas == "free" else np.full(n, self.diameter_mas)
+        background = rest.pop(0) if self.background == "free" else np.full(n, self.background)
+        return pairs, np.asarray(diameter, dtype=float), np.asarray(background, dtype=float)
+
+    def visibility(self, samples: Samples, theta: FloatArray) -> ComplexArray:
+        """Complex visibilities, (n_samples, n), of parameter sets theta (n, n_dim)."""
+        pairs, diameter, background = self.split(theta)
+        total = 1.0 + pairs[:, 2].sum(axis=0) + background
+        light = disc(samples, diameter).astype(complex)
+        for east, north, contrast in pairs:
+            light += contrast * self.companion(samples, east, north)
+        return np.asarray(light / total)
+
+    def companion(
+        self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
+    ) -> ComplexArray:
+        """Visibility of a point at an offset, averaged over the channel, (n_samples, n)."""
+        angle = _angle(samples, east_mas, north_mas)
+        wave = np.exp(-1j * angle)
+        return np.asarray(wave * _sinc(angle * _half_band(samples))[0] if self.smearing else wave)
+
+    def gradient(self, samples: Samples, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
+        pairs, diameter, background = self.split(theta)
+        total = 1.0 + pairs[:, 2].sum(axis=0) + background
+        primary, by_diameter = disc_gradient(samples, diameter)
+        light, slopes = primary.astype(complex), []
+        for east, north, contrast in pairs:
+            wave, slope = self._companion_slope(samples, east, north)
+            light = light + contrast * wave
+            slopes.append((wave, contrast * slope))
+        value = light / total
+        out = []
+        for wave, slope in slopes:
+            scaled = slope * (2.0 * np.pi * MAS / total)
+            out += [
+                scaled * samples.u[:, None],
+                scaled * samples.v[:, None],
+                (wave - value) / total,
+            ]
+        if self.diameter_mas == "free":
+            out.append((by_diameter / total).astype(complex))
+        if self.background == "free":
+            out.append(-value / total)
+        return value, np.array(out).reshape(len(out), *value.shape)
+
+    def _companion_slope(
+        self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Visibility of a companion and its derivative by the phase angle."""
+        angle = _angle(samples, east_mas, north_mas)
+        wave = np.exp(-1j * angle)
+        if not self.smearing:
+            return wave, -1j * wave
+        half = _half_band(samples)
+        value, slope = _sinc(angle * half)
+        return value * wave, (half * slope - 1j * value) * wave
+
+
+def _angle(samples: Samples, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
+    turns = np.outer(samples.u, east_mas * MAS) + np.outer(samples.v, north_mas * MAS)
+    return 2.0 * np.pi * turns
+
+
+def _half_band(samples: Samples) -> FloatArray:
+    return 0.5 * samples.relative_band[:, None]
+
+
+def _sinc(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Evaluate sin(x)/x and its derivative."""
+    small = np.abs(x) < 1e-4
+    safe = np.where(small, 1.0, x)
+    value = np.where(small, 1.0 - x * x / 6.0, np.sin(safe) / safe)
+    slope = np.where(small, -x / 3.0, (np.cos(safe) - value) / safe)
+    return value, slope
+
+
+def disc(samples: Samples, diameter_mas: FloatArray) -> FloatArray:
+    """Visibility 2 J1(z)/z of uniform discs, z = π θ |u|, (n_samples, n)."""
+    if not np.any(diameter_mas):
+        return np.ones((len(samples), len(diameter_mas)))
+    return disc_gradient(samples, diameter_mas)[0]
+
+
+def disc_gradient(samples: Samples, diameter_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Visibility of uniform discs and its derivative by the diameter (per mas)."""
+    per_mas = np.pi * MAS * samples.frequency[:, None]
+    z = per_mas * np.abs(diameter_mas)
+    small = z < 1e-4
+    safe = np.where(small, 1.0, z)
+    ratio = np.where(small, 0.5 - z * z / 16.0, j1(safe) / safe)
+    # d/dz 2 J1(z)/z = −2 J2(z)/z and J2 = 2 J1/z − J0.
+    slope = np.where(small, -z / 4.0, -2.0 * (2.0 * ratio - j0(safe)) / safe)
+    return 2.0 * ratio, slope * per_mas * np.sign(diameter_mas + (diameter_mas == 0))

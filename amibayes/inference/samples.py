@@ -1,0 +1,84 @@
+"""The (u, v, λ) points at which a data set needs complex visibilities, each once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from amibayes.observables import Observables
+from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
+
+SAME_POINT = 1e-9
+"""Points nearer than this fraction of the longest baseline are one (float32 files differ more)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Distinct points of the (u, v) plane and how the data are built from them.
+
+    Parameters
+    ----------
+    u, v : (n,) float array
+        Spatial frequencies, cycles per radian.
+    relative_band : (n,) float array
+        Δλ/λ of the channel.
+    squares : (n_vis2, n) sparse array
+        V² = squares · |V|²; one entry 1 in each row.
+    legs : (n_closure, n) sparse array
+        Closure phase = legs · phase; entries are ±1.
+    """
+
+    u: FloatArray
+    v: FloatArray
+    relative_band: FloatArray
+    squares: csr_array
+    legs: csr_array
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Length of the spatial frequency, cycles per radian."""
+        return np.asarray(np.hypot(self.u, self.v))
+
+
+def samples_of(observables: Observables) -> Samples:
+    """Collect the points of unflagged observables; opposite points are conjugate, hence one."""
+    data = observables.unflagged()
+    v2, cp = data.vis2, data.closure_phase
+    u3 = np.concatenate([cp.u_m, -cp.u_m.sum(axis=1, keepdims=True)], axis=1)
+    v3 = np.concatenate([cp.v_m, -cp.v_m.sum(axis=1, keepdims=True)], axis=1)
+    wavelength = np.concatenate([v2.wavelength_m, np.repeat(cp.wavelength_m, 3)])
+    band = np.concatenate([v2.band_m, np.repeat(cp.band_m, 3)])
+    u = np.concatenate([v2.u_m[:, 0], u3.ravel()]) / wavelength
+    v = np.concatenate([v2.v_m[:, 0], v3.ravel()]) / wavelength
+    first, index, sign = _distinct(u, v, band / wavelength)
+    n, n2, n3 = len(first), len(v2), len(cp)
+    rows = np.repeat(np.arange(n3), 3)
+    legs = csr_array((sign[n2:], (rows, index[n2:])), shape=(n3, n))
+    orientation = sign[first]
+    return Samples(
+        u[first] * orientation,
+        v[first] * orientation,
+        (band / wavelength)[first],
+        csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
+        legs,
+    )
+
+
+def _distinct(
+    u: FloatArray, v: FloatArray, band: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    scale = SAME_POINT * np.hypot(u, v).max(initial=1e-300)
+    grid = np.stack([np.rint(u / scale), np.rint(v / scale)], axis=1)
+    lead = np.where(grid[:, 0] != 0, grid[:, 0], grid[:, 1])
+    sign = np.where(lead < 0, -1.0, 1.0)
+    key = np.column_stack([grid * sign[:, None], np.rint(band * 1e9)])
+    _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return first, index.ravel(), sign

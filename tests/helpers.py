@@ -1,0 +1,62 @@
+"""Data sets that tests make for themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.model import BinaryModel
+from amibayes.observables import Observables
+from amibayes.synthetic import point_source
+
+NIRISS_HOLES = np.array(
+    [
+        [0.0, -2.64],
+        [-2.28631, 0.0],
+        [2.28631, -1.32],
+        [-2.28631, 1.32],
+        [-1.14315, 1.98],
+        [2.28631, 1.32],
+        [1.14315, 1.98],
+    ]
+)
+
+
+def niriss(
+    vis2_error: float = 0.005,
+    closure_error_deg: float = 0.3,
+    covariance: str = "assumed",
+    channels: int = 1,
+) -> Observables:
+    """A point source seen by NIRISS through F480M, in one channel or several narrower ones."""
+    wavelength = 4.817e-6 + 0.302e-6 * ((np.arange(channels) + 0.5) / channels - 0.5)
+    return point_source(
+        NIRISS_HOLES,
+        wavelength,
+        0.302e-6 / channels,
+        vis2_error=vis2_error,
+        closure_error_rad=np.radians(closure_error_deg),
+        covariance=covariance,
+    )
+
+
+def simulated(
+    sheet: Observables,
+    theta: object,
+    rng: np.random.Generator | None,
+    model: BinaryModel | None = None,
+    shift_closure: float = 0.0,
+) -> Observables:
+    """The data a binary would give, with noise of the sheet's covariance (none without rng)."""
+    likelihood = Likelihood(sheet, model)
+    data = likelihood.predict([theta])[:, 0]
+    if rng is not None:
+        data = data + sheet.covariance.draw(rng, 1)[:, 0]
+    vis2, closure = np.split(data, [len(sheet.vis2)])
+    return replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=vis2),
+        closure_phase=replace(sheet.closure_phase, value=closure + shift_closure),
+    )
