@@ -1,0 +1,161 @@
+"""What a search gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.inference.bank import Grid
+from amibayes.inference.detection import candid_n_sigma
+from amibayes.inference.likelihood import Likelihood
+from amibayes.units import (
+    FloatArray,
+    contrast_to_delta_mag,
+    position_angle_deg,
+    separation,
+)
+
+
+@dataclass(frozen=True)
+class Companion:
+    """A companion's parameters with 1σ errors.
+
+    Errors come from the inverse Hessian of χ²; NaN where there is none.
+    """
+
+    east_mas: float
+    north_mas: float
+    contrast: float
+    east_error_mas: float = float("nan")
+    north_error_mas: float = float("nan")
+    contrast_error: float = float("nan")
+    separation_error_mas: float = float("nan")
+    position_angle_error_deg: float = float("nan")
+
+    @property
+    def separation_mas(self) -> float:
+        """Angular separation, mas."""
+        return float(separation(self.east_mas, self.north_mas))
+
+    @property
+    def position_angle_deg(self) -> float:
+        """Position angle, degrees east of north in [0, 360)."""
+        return float(position_angle_deg(self.east_mas, self.north_mas))
+
+    @property
+    def delta_mag(self) -> float:
+        """Magnitude difference to the primary."""
+        return float(contrast_to_delta_mag(self.contrast))
+
+    @property
+    def delta_mag_error(self) -> float:
+        """1σ error of the magnitude difference."""
+        return (
+            2.5 / np.log(10.0) * self.contrast_error / self.contrast
+            if self.contrast > 0
+            else np.nan
+        )
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A local maximum of the likelihood: its parameters, and its gain over no companion."""
+
+    theta: tuple[float, ...]
+    delta_chi2: float
+
+    @property
+    def companion(self) -> Companion:
+        """The mode's companion, without errors."""
+        return Companion(*self.theta[:3])
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """What a search found.
+
+    Parameters
+    ----------
+    companion : Companion
+        Joint best fit with errors.
+    theta : (n_dim,) float array
+        The best parameter vector, in the order of ``likelihood.parameters``.
+    theta_covariance : (n_dim, n_dim) float array
+    single_theta : (n_nuisance,) float array
+        The best fit without a companion.
+    chi2_single, chi2_binary : float
+    ndof : int
+        Independent data minus free parameters of the binary fit.
+    modes : tuple of Mode
+        Distinct solutions left standing, best first.
+    grid : Grid
+    bank_contrast, bank_sigma : (n_grid,) float array
+        Best linear contrast and its error at every position.
+    global_check : Mode
+        What the independent global optimiser found.
+    """
+
+    likelihood: Likelihood
+    companion: Companion
+    theta: FloatArray
+    theta_covariance: FloatArray
+    single_theta: FloatArray
+    chi2_single: float
+    chi2_binary: float
+    ndof: int
+    modes: tuple[Mode, ...]
+    grid: Grid
+    bank_contrast: FloatArray
+    bank_sigma: FloatArray
+    global_check: Mode
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def delta_chi2(self) -> float:
+        """χ² without minus χ² with the companion."""
+        return self.chi2_single - self.chi2_binary
+
+    @property
+    def candid_n_sigma(self) -> float:
+        """CANDID's nσ of the best fit."""
+        return candid_n_sigma(self.chi2_single, self.chi2_binary, self.ndof)
+
+    @property
+    def bank_delta_chi2(self) -> FloatArray:
+        """Gain in χ² at every position of the grid, for positive contrast."""
+        return np.where(self.bank_contrast > 0, (self.bank_contrast / self.bank_sigma) ** 2, 0.0)
+
+    def nuisance(self, name: str) -> float:
+        """Value of the diameter or background in the best fit, free or fixed."""
+        if name in self.likelihood.parameters:
+            return float(self.theta[self.likelihood.parameters.index(name)])
+        return float(getattr(self.likelihood.model, name))
+
+    def __repr__(self) -> str:
+        """One line for a notebook."""
+        c = self.companion
+        return (
+            f"<SearchResult: {c.separation_mas:.2f} mas, PA {c.position_angle_deg:.2f}°, contrast "
+            f"{c.contrast:.3g}, Δχ² {self.delta_chi2:.1f}, {len(self.modes)} modes>"
+        )
+
+
+def companion_of(theta: FloatArray, covariance: FloatArray) -> Companion:
+    """First companion of a parameter vector, its errors carried over from the covariance."""
+    east, north, contrast = (float(x) for x in theta[:3])
+    matrix = covariance[:2, :2]
+    rho = max(float(np.hypot(east, north)), 1e-300)
+    outward = np.array([east, north]) / rho
+    around = np.array([north, -east]) / rho**2
+    sigma = np.sqrt(np.diag(covariance)[:3])
+    return Companion(
+        east,
+        north,
+        contrast,
+        float(sigma[0]),
+        float(sigma[1]),
+        float(sigma[2]),
+        float(np.sqrt(outward @ matrix @ outward)),
+        float(np.degrees(np.sqrt(around @ matrix @ around))),
+    )

@@ -1,0 +1,245 @@
+"""The search: template bank, nonlinear refinement, global cross-check, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from amibayes.errors import DataError, UsageError
+from amibayes.inference.bank import Grid, TemplateBank, make_grid
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.refine import Box, fit_single, global_check, refine, single_likelihood
+from amibayes.inference.results import Mode, SearchResult, companion_of
+from amibayes.units import MAS, FloatArray
+
+IntArray = NDArray[np.intp]
+
+GRID_STEPS_PER_FRINGE = 8
+"""Lattice points per λ/B_max."""
+
+FEWEST_SEEDS, MOST_SEEDS = 5, 24
+"""How many peaks of the map are refined."""
+
+MODE_LIMIT = 25.0
+"""Modes within this Δχ² of the best one are left standing."""
+
+BRIGHT = 0.1
+"""Above this contrast the templates are no longer linear enough to rank positions."""
+
+BRIGHT_CONTRASTS = (0.15, 0.3, 0.6, 1.0)
+
+
+def default_separation(likelihood: Likelihood) -> tuple[float, float]:
+    """Range of separations the data can see: λ/2B_max to λ/B_min, mas."""
+    frequency = likelihood.samples.frequency
+    return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
+
+
+def resolution_mas(likelihood: Likelihood) -> float:
+    """λ/B of the longest baseline in wavelengths, mas."""
+    return float(1.0 / likelihood.samples.frequency.max() / MAS)
+
+
+def resolves_stars(likelihood: Likelihood) -> bool:
+    """Whether V² would notice a disc of 0.3 mas: by 1 % at the longest baseline, (πθB/λ)²/4."""
+    z = np.pi * 0.3 * MAS * likelihood.samples.frequency.max()
+    return likelihood.observables.n_vis2 > 0 and bool(z * z / 4.0 > 0.01)
+
+
+def search(
+    likelihood: Likelihood,
+    separation_mas: tuple[float, float] | None = None,
+) -> SearchResult:
+    """Find the companion that explains the data best.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With a model of one companion.
+    separation_mas : (inner, outer), optional
+        Annulus that is searched; by default `default_separation`.
+
+    Returns
+    -------
+    SearchResult
+
+    Raises
+    ------
+    DataError
+        Where there are not more independent data than free parameters.
+    UsageError
+        Where the annulus holds no position.
+    """
+    if likelihood.n_independent <= len(likelihood.parameters):
+        raise DataError(
+            f"holds {likelihood.n_independent} independent data for "
+            f"{len(likelihood.parameters)} parameters",
+            source=likelihood.observables.source,
+            remedy="free fewer parameters or give more data",
+        )
+    inner, outer = separation_mas or default_separation(likelihood)
+    fringe = resolution_mas(likelihood)
+    grid = make_grid(inner, outer, fringe / GRID_STEPS_PER_FRINGE)
+    if not len(grid):
+        raise UsageError(
+            f"no position between {inner:g} and {outer:g} mas on a grid of {grid.step_mas:.3g} mas",
+            source="--separation",
+            remedy="widen the range",
+        )
+    single, chi2_single = fit_single(likelihood)
+    bank = TemplateBank(likelihood, grid, single)
+    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    contrast, sigma = bank.scan(residuals)
+    box = Box(inner, outer, fringe, float(np.median(sigma)))
+    seeds = _seeds(likelihood, grid, contrast, sigma, single, box)
+    found = [refine(likelihood, theta, box, chi2_single) for theta in seeds]
+    check = global_check(likelihood, box, single, chi2_single)
+    modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
+    theta = np.array(modes[0].theta)
+    covariance = likelihood.errors(theta)
+    return SearchResult(
+        likelihood=likelihood,
+        companion=companion_of(theta, covariance),
+        theta=theta,
+        theta_covariance=covariance,
+        single_theta=single,
+        chi2_single=chi2_single,
+        chi2_binary=chi2_single - modes[0].delta_chi2,
+        ndof=likelihood.n_independent - len(likelihood.parameters),
+        modes=modes,
+        grid=grid,
+        bank_contrast=contrast,
+        bank_sigma=sigma,
+        global_check=check,
+        warnings=_doubts(modes, aliases, found, check),
+    )
+
+
+def _seeds(
+    likelihood: Likelihood,
+    grid: Grid,
+    contrast: FloatArray,
+    sigma: FloatArray,
+    single: FloatArray,
+    box: Box,
+) -> FloatArray:
+    """Starting points (n, n_dim): peaks of the linear map, and of the exact one if bright."""
+    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+    best = peaks(grid, gain, box.fringe_mas)
+    seeds = _thetas(grid, best, contrast[best], single)
+    if contrast[best].max(initial=0.0) < BRIGHT:
+        return seeds
+    chi2, brightness = _exact_map(likelihood, grid, single)
+    best = peaks(grid, chi2.max() - chi2, box.fringe_mas)
+    return np.vstack([seeds, _thetas(grid, best, brightness[best], single)])
+
+
+def _thetas(grid: Grid, at: IntArray, contrast: FloatArray, single: FloatArray) -> FloatArray:
+    rest = np.broadcast_to(single, (len(at), len(single)))
+    bounded = np.clip(contrast, 0.0, 1.0)
+    return np.column_stack([grid.east_mas[at], grid.north_mas[at], bounded, rest])
+
+
+def _exact_map(
+    likelihood: Likelihood, grid: Grid, single: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least χ² over a few bright contrasts, and that contrast, at every position."""
+    everywhere = np.arange(len(grid))
+    pieces = np.array_split(everywhere, 1 + len(grid) * len(likelihood.samples) // 1_000_000)
+    chi2 = np.array(
+        [
+            np.concatenate(
+                [likelihood.chi2(_thetas(grid, p, np.full(len(p), c), single)) for p in pieces]
+            )
+            for c in BRIGHT_CONTRASTS
+        ]
+    )
+    return chi2.min(axis=0), np.array(BRIGHT_CONTRASTS)[chi2.argmin(axis=0)]
+
+
+def peaks(grid: Grid, gain: FloatArray, fringe_mas: float) -> IntArray:
+    """Positions of the highest distinct local maxima of a map, best first.
+
+    At least `FEWEST_SEEDS` (if there are as many), further ones while within
+    `MODE_LIMIT` of the best, at most `MOST_SEEDS`.
+    """
+    image = grid.image(gain)
+    lowest = np.where(np.isnan(image), -np.inf, image)
+    top = (lowest == maximum_filter(lowest, size=3, mode="constant", cval=-np.inf)) & (lowest > 0)
+    on_grid = top[grid.rows + grid.half_width, grid.columns + grid.half_width]
+    candidates = np.flatnonzero(on_grid)
+    candidates = candidates[np.argsort(-gain[candidates], kind="stable")]
+    chosen: list[int] = []
+    for i in candidates:
+        enough = len(chosen) >= FEWEST_SEEDS and gain[i] < gain[candidates[0]] - MODE_LIMIT
+        if enough or len(chosen) == MOST_SEEDS:
+            break
+        away = np.hypot(grid.columns[chosen] - grid.columns[i], grid.rows[chosen] - grid.rows[i])
+        if not (away * grid.step_mas < 0.5 * fringe_mas).any():
+            chosen.append(int(i))
+    return np.array(chosen, dtype=np.intp)
+
+
+def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]:
+    """Modes within `MODE_LIMIT` of the best, each at least λ/4B from a better one."""
+    kept: list[Mode] = []
+    for mode in sorted(modes, key=lambda m: -m.delta_chi2):
+        near = [
+            np.hypot(*np.subtract(mode.theta[:2], k.theta[:2])) < 0.25 * fringe_mas for k in kept
+        ]
+        if not any(near) and (not kept or mode.delta_chi2 > kept[0].delta_chi2 - MODE_LIMIT):
+            kept.append(mode)
+    return tuple(kept)
+
+
+def innermost_first(
+    likelihood: Likelihood, modes: Sequence[Mode], single: FloatArray
+) -> tuple[tuple[Mode, ...], tuple[Mode, ...]]:
+    """Put the innermost of the positions that the data cannot tell from the best one first.
+
+    A mask on a regular lattice (NIRISS) repeats itself on the sky: far positions predict
+    the same data as near ones but for the width of the band. Two modes are aliases where
+    their predictions differ by less than 3σ over all data, and by less than half of the
+    signal itself.
+
+    Returns
+    -------
+    modes : tuple of Mode
+    aliases : tuple of Mode
+        Those the first one cannot be told from.
+    """
+    thetas = np.array([m.theta for m in modes])
+    data = likelihood.observables.covariance.whiten(likelihood.predict(thetas))
+    none = single_likelihood(likelihood).predict(np.atleast_2d(single))
+    signal = data - likelihood.observables.covariance.whiten(none)
+    apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
+    alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
+    group = [m for m, same in zip(modes, alike, strict=True) if same]
+    first = min(group, key=lambda m: m.companion.separation_mas)
+    rest = [m for m in modes if m is not first]
+    return (first, *rest), tuple(m for m in group if m is not first)
+
+
+def _doubts(
+    modes: Sequence[Mode], aliases: Sequence[Mode], found: Sequence[Mode], check: Mode
+) -> tuple[str, ...]:
+    doubts = []
+    best_found = max((m.delta_chi2 for m in found), default=0.0)
+    if check.delta_chi2 > best_found + 0.1:
+        doubts.append(
+            f"the global optimiser found a better solution than the grid "
+            f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
+        )
+    if aliases:
+        far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in aliases)
+        doubts.append(
+            f"these baselines cannot tell the position from its alias(es) at {far} mas: "
+            "the innermost is reported"
+        )
+    rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
+    if rivals:
+        doubts.append(f"{len(rivals)} other position(s) fit within Δχ² 9: it is not unique")
+    return tuple(doubts)
