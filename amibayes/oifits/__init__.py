@@ -1,0 +1,6 @@
+"""OIFITS, versions 1 and 2, both ways, with every correlation."""
+
+from amibayes.oifits.reader import observables_of, read_oifits
+from amibayes.oifits.tables import OIFits, OITable, open_oifits
+
+__all__ = ["OIFits", "OITable", "observables_of", "open_oifits", "read_oifits"]

@@ -1,0 +1,327 @@
+"""Correlations that a file gives: OI_CORR, and the V2COV and CPCOV images of fouriever."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from amibayes.closure import closure_matrix, kernel_basis
+from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
+from amibayes.errors import DataError
+from amibayes.observables import BoolArray, IntArray, Measurements, closure_sets, kernel_blocks
+from amibayes.oifits.setups import integers, numbers, same
+from amibayes.oifits.tables import OIFits, OITable
+from amibayes.units import DEGREE, FloatArray
+
+REMEDY = "correct the correlations, or read the file with independent errors"
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Covariances of pairs of data, each pair once.
+
+    Parameters
+    ----------
+    first, second : (n,) int array
+        Places in the data vector.
+    covariance : (n,) float array
+    """
+
+    first: IntArray
+    second: IntArray
+    covariance: FloatArray
+
+
+def joined(parts: Sequence[Pairs]) -> Pairs:
+    """All pairs of several tables."""
+    empty = np.empty(0, dtype=np.intp)
+    return Pairs(
+        np.concatenate([empty, *(p.first for p in parts)]),
+        np.concatenate([empty, *(p.second for p in parts)]),
+        np.concatenate([np.empty(0), *(p.covariance for p in parts)]),
+    )
+
+
+def oi_corr_pairs(oifits: OIFits, table: OITable, index: IntArray, variance: FloatArray) -> Pairs:
+    """Covariances that one OI_CORR gives.
+
+    Parameters
+    ----------
+    index : (n,) int array
+        1-based index of each datum in this table, 0 for none.
+    variance : (n,) float array
+
+    Raises
+    ------
+    DataError
+        Where the table is inconsistent.
+    """
+    first, second, correlation, rest = _listed(oifits, table)
+    size = int(max(first.max(initial=0), second.max(initial=0), index.max(initial=0)))
+    where = np.full(size + 1, -1, dtype=np.intp)
+    numbered = np.flatnonzero(index > 0)
+    if len(np.unique(index[numbered])) != len(numbered):
+        raise DataError(
+            f"{table.label}: two data have the same place in the correlation matrix",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    where[index[numbered]] = numbered
+    a, b = where[first], where[second]
+    ours = (a >= 0) & (b >= 0) & (correlation != 0)
+    a, b, correlation, rest = a[ours], b[ours], correlation[ours], rest[ours]
+    return Pairs(a, b, pair_covariance(correlation, variance[a], variance[b]) + rest)
+
+
+def pair_covariance(
+    correlation: FloatArray, first_variance: FloatArray, second_variance: FloatArray
+) -> FloatArray:
+    """CORR σᵢσⱼ, in the one order of operations that reading and writing share."""
+    return np.asarray(correlation * (np.sqrt(first_variance) * np.sqrt(second_variance)))
+
+
+def _listed(oifits: OIFits, table: OITable) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    first, second = (integers(oifits, table, c, 1)[:, 0] for c in ("IINDX", "JINDX"))
+    correlation = numbers(oifits, table, "CORR").reshape(-1)
+    rest = table.columns.get("NS_CORR_REST", np.zeros(len(correlation))).astype(float).reshape(-1)
+    off = first != second
+    first, second, correlation, rest = first[off], second[off], correlation[off], rest[off]
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    fault = ""
+    if len(low) and low.min() < 1:
+        fault = "an index below 1"
+    elif not (np.abs(correlation) <= 1 + 1e-9).all():
+        fault = "a correlation that is not between -1 and 1"
+    if fault:
+        raise DataError(f"{table.label} has {fault}", source=oifits.path, remedy=REMEDY)
+    order = np.lexsort((high, low))
+    low, high, correlation, rest = low[order], high[order], correlation[order], rest[order]
+    again = (np.diff(low) == 0) & (np.diff(high) == 0)
+    if (again & (np.diff(correlation) != 0)).any():
+        raise DataError(
+            f"{table.label} gives two values for one correlation",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    keep = np.concatenate([[True], ~again])[: len(low)]
+    return low[keep], high[keep], correlation[keep], rest[keep]
+
+
+def image_pairs(
+    oifits: OIFits, table: OITable, entries: IntArray, variance: FloatArray, n_channels: int
+) -> tuple[Pairs, FloatArray, str]:
+    """Covariances of fouriever's V2COV or CPCOV: one matrix per exposure.
+
+    The rows of the data tables come exposure by exposure, and inside a matrix the channels
+    run fastest (or, where that is what fits the errors, the baselines); closure phases are in
+    radians (or degrees). Both are found by comparing the diagonal with the errors.
+
+    Parameters
+    ----------
+    entries : (n,) int array
+        Places in the data vector of every row and channel of the instrument, in file order.
+    variance : (n,) float array
+        Squared errors of ``entries``.
+    n_channels : int
+
+    Returns
+    -------
+    pairs : Pairs
+    variance : (n,) float array
+        The diagonal, for ``entries``.
+    note : str
+
+    Raises
+    ------
+    DataError
+        Where the shape does not fit the data, or the diagonal fits the errors in no order.
+    """
+    image = table.image
+    if image is None or image.ndim not in (2, 3) or image.shape[-1] != image.shape[-2]:
+        raise DataError(f"{table.label} is no stack of matrices", source=oifits.path, remedy=REMEDY)
+    stack = np.asarray(image, dtype=float).reshape(-1, *image.shape[-2:])
+    n_exposures, size = stack.shape[:2]
+    if n_exposures * size != len(entries) or size % n_channels:
+        raise DataError(
+            f"{table.label} is for {n_exposures * size} data, the tables hold {len(entries)}",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    cells = np.arange(len(entries)).reshape(n_exposures, size // n_channels, n_channels)
+    diagonal = np.diagonal(stack, axis1=1, axis2=2)
+    trials = [
+        (f"{order}, {unit}", grid.reshape(n_exposures, size), scale)
+        for order, grid in (
+            ("channels fastest", cells),
+            ("baselines fastest", cells.swapaxes(1, 2)),
+        )
+        for unit, scale in (("radians", 1.0), ("degrees", DEGREE**2))
+        if unit == "radians" or table.name == "CPCOV"
+    ]
+    misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
+    best = int(np.argmin(misfit))
+    name, grid, scale = trials[best]
+    if not misfit[best] < 0.5:
+        raise DataError(
+            f"the diagonal of {table.label} does not fit the errors of the data",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    out = np.empty(len(entries))
+    out[grid.ravel()] = (diagonal * scale).ravel()
+    i, j = np.triu_indices(size, 1)
+    pairs = Pairs(
+        entries[grid[:, i]].ravel(), entries[grid[:, j]].ravel(), (stack[:, i, j] * scale).ravel()
+    )
+    used = pairs.covariance != 0
+    return (
+        Pairs(pairs.first[used], pairs.second[used], pairs.covariance[used]),
+        out,
+        f"{table.label}: covariances taken ({name})",
+    )
+
+
+def _misfit(diagonal: FloatArray, variance: FloatArray) -> float:
+    """Median departure of the logarithm of the ratio from 0."""
+    with np.errstate(all="ignore"):
+        ratio = np.log(diagonal / variance)
+    usable = np.isfinite(ratio)
+    return float(np.median(np.abs(ratio[usable]))) if usable.any() else np.inf
+
+
+def image_table(oifits: OIFits, name: str, insname: str) -> OITable | None:
+    """The V2COV or CPCOV of an instrument."""
+    found = [t for t in oifits.named(name) if t.image is not None]
+    alike = [t for t in found if same(t.keyword("INSNAME"), insname)]
+    unnamed = [t for t in found if not t.keyword("INSNAME")]
+    return next(iter(alike or unnamed), None)
+
+
+def given_covariance(
+    variance: FloatArray,
+    pairs: Pairs,
+    closure_phase: Measurements,
+    *,
+    covered: BoolArray,
+    independent: BoolArray,
+) -> Covariance:
+    """Covariance of unflagged data, some of whose correlations are given.
+
+    Parameters
+    ----------
+    variance : (n,) float array
+        V² first, then closure phases.
+    pairs : Pairs
+    closure_phase : Measurements
+        Unflagged; the last entries of the data vector.
+    covered : (n,) bool array
+        Where the absence of a correlation means that there is none. A closure set that is
+        neither covered nor in a pair gets the covariance of independent baseline phases.
+    independent : (n,) bool array
+        Closure phases without kernel basis: every triangle counts as independent.
+
+    Raises
+    ------
+    DataError
+        Where the matrix is not positive definite on the kernel basis.
+    """
+    n, shift = len(variance), len(variance) - len(closure_phase)
+    sets = [entries + shift for entries in closure_sets(closure_phase)]
+    sets = [s for s in sets if not independent[s].all()]
+    paired = np.zeros(n, dtype=bool)
+    paired[pairs.first] = paired[pairs.second] = True
+    assumed = [s for s in sets if not (paired[s] | covered[s]).any()]
+    given = [s for s in sets if (paired[s] | covered[s]).any()]
+    blocks = _assumed_blocks(closure_phase, variance, assumed, shift)
+    single = np.ones(n, dtype=bool)
+    single[[i for s in assumed for i in s]] = False
+    blocks += _given_blocks(variance, pairs, closure_phase, given, single)
+    if not pairs.first.size and not sets:
+        return DiagonalCovariance(variance)
+    return BlockCovariance(n, blocks)
+
+
+def _assumed_blocks(
+    closure_phase: Measurements, variance: FloatArray, sets: list[IntArray], shift: int
+) -> list[Block]:
+    if not sets:
+        return []
+    chosen = np.sort(np.concatenate(sets))
+    few = closure_phase.select(chosen - shift)
+    return [
+        Block(chosen[block.index], block.matrix, block.basis)
+        for block in kernel_blocks(few, np.sqrt(variance[chosen]))
+    ]
+
+
+def _given_blocks(
+    variance: FloatArray,
+    pairs: Pairs,
+    closure_phase: Measurements,
+    sets: list[IntArray],
+    available: BoolArray,
+) -> list[Block]:
+    """One block per group of entries tied by a correlation or by shared baselines."""
+    n = len(variance)
+    chained = [(s[:-1], s[1:]) for s in sets]
+    first = np.concatenate([pairs.first, *(a for a, _ in chained)])
+    second = np.concatenate([pairs.second, *(b for _, b in chained)])
+    links = coo_array((np.ones(len(first)), (first, second)), shape=(n, n))
+    label = connected_components(links, directed=False)[1]
+    members = _groups(label, np.flatnonzero(available))
+    inside = np.empty(n, dtype=np.intp)
+    matrices = {}
+    for key, entries in members.items():
+        inside[entries] = np.arange(len(entries))
+        matrices[key] = np.diag(variance[entries])
+    for key, which in _groups(label[pairs.first], np.arange(len(pairs.first))).items():
+        i, j = inside[pairs.first[which]], inside[pairs.second[which]]
+        matrices[key][i, j] = matrices[key][j, i] = pairs.covariance[which]
+    bases = _bases(closure_phase, sets, label, members, inside, n)
+    return [Block(members[key], matrices[key], bases.get(key)) for key in members]
+
+
+def _groups(label: IntArray, entries: IntArray) -> dict[int, IntArray]:
+    """Entries by label, in order."""
+    if not len(entries):
+        return {}
+    by_label = entries[np.argsort(label[entries], kind="stable")]
+    cuts = np.flatnonzero(np.diff(label[by_label])) + 1
+    return {int(label[part[0]]): part for part in np.split(by_label, cuts)}
+
+
+def _bases(
+    closure_phase: Measurements,
+    sets: list[IntArray],
+    label: IntArray,
+    members: dict[int, IntArray],
+    inside: IntArray,
+    n: int,
+) -> dict[int, FloatArray]:
+    """Basis of each group: kernel basis of its closure sets, everything else as it is."""
+    shift = n - len(closure_phase)
+    parts: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+    kernels: dict[bytes, FloatArray] = {}
+    for entries in sets:
+        triangles = closure_phase.stations[entries - shift]
+        key = triangles.tobytes()
+        if key not in kernels:
+            kernels[key] = kernel_basis(closure_matrix(triangles)[0])
+        parts.setdefault(int(label[entries[0]]), []).append((inside[entries], kernels[key]))
+    return {group: _basis(len(members[group]), own) for group, own in parts.items()}
+
+
+def _basis(size: int, parts: list[tuple[IntArray, FloatArray]]) -> FloatArray:
+    in_sets = np.concatenate([place for place, _ in parts])
+    others = np.setdiff1d(np.arange(size), in_sets)
+    basis = np.zeros((size, len(others) + sum(kernel.shape[1] for _, kernel in parts)))
+    basis[others, np.arange(len(others))] = 1.0
+    column = len(others)
+    for place, kernel in parts:
+        basis[place, column : column + kernel.shape[1]] = kernel
+        column += kernel.shape[1]
+    return basis

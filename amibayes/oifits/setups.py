@@ -1,0 +1,269 @@
+"""Targets, stations and channels of a file: what a row of data refers to by number or name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes.errors import DataError
+from amibayes.observables import IntArray, Setup
+from amibayes.oifits.scales import ANGLE, LENGTH, scale_of
+from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, plain
+from amibayes.units import DEGREE, FloatArray
+
+DATA_TABLES = ("OI_VIS2", "OI_T3")
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A line of OI_TARGET."""
+
+    name: str
+    right_ascension_deg: float = 0.0
+    declination_deg: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Stations:
+    """A table OI_ARRAY, and the stations that only the data tables know."""
+
+    names: tuple[str, ...]
+    index: IntArray
+    xyz_m: FloatArray | None
+    diameter_m: FloatArray | None
+
+    def position(self, index: IntArray) -> IntArray:
+        """Places in ``names`` of stations given by STA_INDEX."""
+        order = np.argsort(self.index, kind="stable")
+        return np.asarray(order[np.searchsorted(self.index[order], index)])
+
+
+def column(oifits: OIFits, table: OITable, name: str) -> NDArray[Any]:
+    """A column that has to be there.
+
+    Raises
+    ------
+    DataError
+        Where it is not.
+    """
+    if name not in table.columns:
+        raise DataError(
+            f"{table.label} has no column {name}",
+            source=oifits.path,
+            remedy="write the file again with the columns that OIFITS requires",
+        )
+    return table.columns[name]
+
+
+def numbers(oifits: OIFits, table: OITable, name: str) -> FloatArray:
+    """A required column as float64.
+
+    Raises
+    ------
+    DataError
+        Where the column is absent or holds no numbers.
+    """
+    values = column(oifits, table, name)
+    if values.dtype.kind not in "iufb":
+        raise DataError(f"{table.label}: column {name} holds no numbers", source=oifits.path)
+    return values.astype(float)
+
+
+def integers(oifits: OIFits, table: OITable, name: str, width: int) -> IntArray:
+    """A required column of whole numbers, (rows, width).
+
+    Raises
+    ------
+    DataError
+        Where it is absent, holds no numbers or has another width.
+    """
+    values = numbers(oifits, table, name)
+    if values.size != len(table) * width or not np.isfinite(values).all():
+        raise DataError(
+            f"{table.label}: column {name} does not hold {width} number(s) in each row",
+            source=oifits.path,
+        )
+    return values.reshape(len(table), width).astype(np.intp)
+
+
+def targets_of(oifits: OIFits) -> dict[int, Target]:
+    """Targets by TARGET_ID; a file without OI_TARGET has none."""
+    found: dict[int, Target] = {}
+    for table in oifits.named("OI_TARGET"):
+        ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
+        names = [plain(name) for name in column(oifits, table, "TARGET")]
+        ra, dec = (_degrees(table, name) for name in ("RAEP0", "DECEP0"))
+        for i, (number, name) in enumerate(zip(ids, names, strict=True)):
+            found.setdefault(int(number), Target(name or f"target {number}", ra[i], dec[i]))
+    return found
+
+
+def _degrees(table: OITable, name: str) -> list[float]:
+    values = table.columns.get(name)
+    if values is None or values.dtype.kind not in "fiu" or values.ndim != 1:
+        return [0.0] * len(table)
+    scale, _ = scale_of(table.units[name], ANGLE, "deg")
+    # Degrees are the standard's unit: they pass unchanged, bit for bit.
+    degrees = values.astype(float) * (1.0 if scale == DEGREE else scale / DEGREE)
+    return [float(x) if np.isfinite(x) else 0.0 for x in degrees]
+
+
+def same(a: str, b: str) -> bool:
+    """Whether two names are one, whatever their padding and case."""
+    return plain(a).casefold() == plain(b).casefold()
+
+
+def array_table(oifits: OIFits, table: OITable) -> OITable | None:
+    """The OI_ARRAY that a data table refers to; the only one, where it names none."""
+    arrays = oifits.named("OI_ARRAY")
+    name = table.keyword("ARRNAME")
+    if not name:
+        return arrays[0] if len(arrays) == 1 else None
+    return next((a for a in arrays if same(a.keyword("ARRNAME"), name)), None)
+
+
+def stations_of(oifits: OIFits, array: OITable | None, used: IntArray) -> Stations:
+    """Stations of an array, completed by those of the data tables that it does not list."""
+    if array is None:
+        return Stations(tuple(f"station {i}" for i in used), used, None, None)
+    count = len(array)
+    listed = _listed_index(oifits, array, used)
+    unlisted = used[~np.isin(used, listed)]
+    names = [*_station_names(array, listed), *(f"station {i}" for i in unlisted)]
+    xyz = _padded(array, "STAXYZ", (count, 3), len(unlisted))
+    diameter = _padded(array, "DIAMETER", (count,), len(unlisted))
+    return Stations(tuple(names), np.concatenate([listed, unlisted]), xyz, diameter)
+
+
+def _listed_index(oifits: OIFits, array: OITable, used: IntArray) -> IntArray:
+    if "STA_INDEX" in array.columns:
+        return integers(oifits, array, "STA_INDEX", 1)[:, 0]
+    # Without STA_INDEX the rows are numbered from 1, or from 0 where the data say so.
+    return np.arange(len(array)) + int(not (used == 0).any())
+
+
+def _station_names(array: OITable, index: IntArray) -> list[str]:
+    names = [""] * len(array)
+    for candidate in ("STA_NAME", "TEL_NAME"):
+        given = array.columns.get(candidate)
+        if given is not None and given.dtype.kind == "U":
+            names = [name or plain(new) for name, new in zip(names, given, strict=True)]
+    names = [name or f"station {i}" for name, i in zip(names, index, strict=True)]
+    return [
+        name if names.count(name) == 1 else f"{name}#{i}"
+        for name, i in zip(names, index, strict=True)
+    ]
+
+
+def _padded(table: OITable, name: str, shape: tuple[int, ...], extra: int) -> FloatArray | None:
+    values = table.columns.get(name)
+    if values is None or values.dtype.kind not in "fiu" or values.size != np.prod(shape):
+        return None
+    scale, _ = scale_of(table.units[name], LENGTH, "m")
+    metres = values.reshape(shape).astype(float) * scale
+    rest = table.columns.get(f"NS_{name}_REST")
+    if rest is not None and rest.shape == metres.shape:
+        metres = metres + rest
+    return np.concatenate([metres, np.full((extra, *shape[1:]), np.nan)])
+
+
+def wavelength_table(oifits: OIFits, table: OITable, n_channels: int) -> OITable:
+    """The OI_WAVELENGTH that a data table refers to.
+
+    Raises
+    ------
+    DataError
+        Where there is none of its INSNAME with its number of channels.
+    """
+    everyone = oifits.named("OI_WAVELENGTH")
+    name = table.keyword("INSNAME")
+    alike = [w for w in everyone if same(w.keyword("INSNAME"), name)]
+    if not alike and not name and len(everyone) == 1:
+        alike = list(everyone)
+    if not alike:
+        raise DataError(
+            f"{table.label} refers to the wavelengths of {name or 'no instrument'!r}, "
+            "and no OI_WAVELENGTH has that INSNAME",
+            source=oifits.path,
+            remedy="write the file again with its OI_WAVELENGTH",
+        )
+    fitting = [w for w in alike if len(w) == n_channels]
+    if not fitting:
+        raise DataError(
+            f"{table.label} has {n_channels} channel(s) in a row, "
+            f"its OI_WAVELENGTH {name!r} has {len(alike[0])}",
+            source=oifits.path,
+            remedy="write the file again with matching tables",
+        )
+    return next((w for w in fitting if w.extver == table.extver), fitting[0])
+
+
+def channels_of(oifits: OIFits, table: OITable) -> tuple[FloatArray, FloatArray]:
+    """(wavelength, width) of each channel in metres.
+
+    Raises
+    ------
+    DataError
+        Where the wavelengths are no wavelengths of light.
+    """
+    wavelength = _metres(oifits, table, "EFF_WAVE")
+    band = np.zeros(len(table))
+    if "EFF_BAND" in table.columns:
+        band = np.nan_to_num(_metres(oifits, table, "EFF_BAND"))
+    usable = wavelength[np.isfinite(wavelength) & (wavelength > 0)]
+    if not len(usable) or usable.max() > 1e-2:
+        raise DataError(
+            f"{table.label}: EFF_WAVE is no wavelength in metres",
+            source=oifits.path,
+            remedy="give the unit of EFF_WAVE in its TUNIT",
+        )
+    return wavelength, np.abs(band)
+
+
+def _metres(oifits: OIFits, table: OITable, name: str) -> FloatArray:
+    values = numbers(oifits, table, name)
+    if values.shape != (len(table),):
+        raise DataError(f"{table.label}: {name} is not one number a row", source=oifits.path)
+    metres = values * scale_of(table.units[name], LENGTH, "m")[0]
+    rest = table.columns.get(f"NS_{name}_REST")
+    return metres if rest is None or rest.shape != metres.shape else metres + rest
+
+
+def setup_name(table: OITable, keyword: str) -> str:
+    """INSNAME or ARRNAME as it was before the writer had to tell two of one name apart."""
+    original = table.header.get(f"{OWN_KEY} {keyword}")
+    return plain(original) if original else table.keyword(keyword)
+
+
+def make_setup(
+    oifits: OIFits,
+    wavelengths: OITable,
+    array: OITable | None,
+    stations: Stations,
+    target: Target,
+) -> Setup:
+    """Put one instrument configuration together."""
+    wavelength, band = channels_of(oifits, wavelengths)
+    return Setup(
+        insname=setup_name(wavelengths, "INSNAME"),
+        arrname="" if array is None else setup_name(array, "ARRNAME"),
+        target=target.name,
+        stations=stations.names,
+        station_index=stations.index,
+        wavelength_m=wavelength,
+        band_m=band,
+        station_xyz_m=stations.xyz_m,
+        station_diameter_m=stations.diameter_m,
+        source=oifits.path,
+        right_ascension_deg=target.right_ascension_deg,
+        declination_deg=target.declination_deg,
+    )
+
+
+def listing(names: Sequence[str]) -> str:
+    """Names for an error message, each once."""
+    return ", ".join(dict.fromkeys(names))
