@@ -141,6 +141,29 @@ class TemplateBank:
             norm[index] = self._norm(even, odd)
         return match / norm, 1.0 / np.sqrt(norm)
 
+    def largest_gain(self, data: NDArray[np.float32]) -> FloatArray:
+        """Largest gain in χ² over the bank, for positive contrast, of many data sets.
+
+        Parameters
+        ----------
+        data : (n_data, n) float32 array
+            Whitened, nuisance directions taken out.
+
+        Returns
+        -------
+        (n,) float array
+        """
+        best = np.zeros(data.shape[1], dtype=np.float32)
+        data_even = np.ascontiguousarray(data[self._even.rows].T)
+        data_odd = np.ascontiguousarray(data[self._odd.rows].T)
+        for index, even, odd in self._halves():
+            scale = (1.0 / np.sqrt(self._norm(even, odd))).astype(np.float32)
+            here, there = scale[: len(index) // 2], scale[len(index) // 2 :]
+            shared = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
+            np.maximum(best, ((shared[0] + shared[1]) * here).max(axis=1), out=best)
+            np.maximum(best, ((shared[0] - shared[1]) * there).max(axis=1), out=best)
+        return np.asarray(best, dtype=float) ** 2
+
     def matched_filter(self, residuals: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
 
