@@ -13,20 +13,40 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
+    from amibayes.oifits import (
+        OIFits,
+        OITable,
+        observables_of,
+        open_oifits,
+        read_oifits,
+        write_oifits,
+    )
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
     "DataError": "amibayes.errors",
     "RunError": "amibayes.errors",
     "UsageError": "amibayes.errors",
+    "OIFits": "amibayes.oifits",
+    "OITable": "amibayes.oifits",
+    "observables_of": "amibayes.oifits",
+    "open_oifits": "amibayes.oifits",
+    "read_oifits": "amibayes.oifits",
+    "write_oifits": "amibayes.oifits",
 }
 
 __all__ = [
     "AmibayesError",
     "DataError",
+    "OIFits",
+    "OITable",
     "RunError",
     "UsageError",
     "__version__",
+    "observables_of",
+    "open_oifits",
+    "read_oifits",
+    "write_oifits",
 ]
 
 

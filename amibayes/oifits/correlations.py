@@ -13,9 +13,12 @@ from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
 from amibayes.errors import DataError
 from amibayes.observables import BoolArray, IntArray, Measurements, closure_sets, kernel_blocks
-from amibayes.oifits.setups import integers, numbers, same
+from amibayes.oifits.setups import integers, numbers, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, FloatArray
+
+LARGEST_MISFIT = 0.5
+"""Median departure of ln(variance ratio) past which a covariance is not that of the errors."""
 
 REMEDY = "correct the correlations, or read the file with independent errors"
 
@@ -87,7 +90,7 @@ def pair_covariance(
 def _listed(oifits: OIFits, table: OITable) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     first, second = (integers(oifits, table, c, 1)[:, 0] for c in ("IINDX", "JINDX"))
     correlation = numbers(oifits, table, "CORR").reshape(-1)
-    rest = table.columns.get("NS_CORR_REST", np.zeros(len(correlation))).astype(float).reshape(-1)
+    rest = rest_of(table, "CORR", correlation.shape)
     off = first != second
     first, second, correlation, rest = first[off], second[off], correlation[off], rest[off]
     low, high = np.minimum(first, second), np.maximum(first, second)
@@ -140,49 +143,61 @@ def image_pairs(
     DataError
         Where the shape does not fit the data, or the diagonal fits the errors in no order.
     """
-    image = table.image
-    if image is None or image.ndim not in (2, 3) or image.shape[-1] != image.shape[-2]:
-        raise DataError(f"{table.label} is no stack of matrices", source=oifits.path, remedy=REMEDY)
-    stack = np.asarray(image, dtype=float).reshape(-1, *image.shape[-2:])
-    n_exposures, size = stack.shape[:2]
-    if n_exposures * size != len(entries) or size % n_channels:
-        raise DataError(
-            f"{table.label} is for {n_exposures * size} data, the tables hold {len(entries)}",
-            source=oifits.path,
-            remedy=REMEDY,
-        )
-    cells = np.arange(len(entries)).reshape(n_exposures, size // n_channels, n_channels)
-    diagonal = np.diagonal(stack, axis1=1, axis2=2)
-    trials = [
-        (f"{order}, {unit}", grid.reshape(n_exposures, size), scale)
-        for order, grid in (
-            ("channels fastest", cells),
-            ("baselines fastest", cells.swapaxes(1, 2)),
-        )
-        for unit, scale in (("radians", 1.0), ("degrees", DEGREE**2))
-        if unit == "radians" or table.name == "CPCOV"
-    ]
-    misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
-    best = int(np.argmin(misfit))
-    name, grid, scale = trials[best]
-    if not misfit[best] < 0.5:
-        raise DataError(
-            f"the diagonal of {table.label} does not fit the errors of the data",
-            source=oifits.path,
-            remedy=REMEDY,
-        )
-    out = np.empty(len(entries))
-    out[grid.ravel()] = (diagonal * scale).ravel()
-    i, j = np.triu_indices(size, 1)
+    stack = _stack_of(oifits, table, len(entries), n_channels)
+    name, grid, scale = _order_and_unit(oifits, table, stack, variance, n_channels)
+    diagonal = np.empty(len(entries))
+    diagonal[grid] = np.diagonal(stack, axis1=1, axis2=2) * scale
+    i, j = np.triu_indices(stack.shape[1], 1)
     pairs = Pairs(
         entries[grid[:, i]].ravel(), entries[grid[:, j]].ravel(), (stack[:, i, j] * scale).ravel()
     )
     used = pairs.covariance != 0
     return (
         Pairs(pairs.first[used], pairs.second[used], pairs.covariance[used]),
-        out,
+        diagonal,
         f"{table.label}: covariances taken ({name})",
     )
+
+
+def _stack_of(oifits: OIFits, table: OITable, n_data: int, n_channels: int) -> FloatArray:
+    """The matrices, (n_exposures, size, size), where they are for the data."""
+    image = table.image
+    if image is None or image.ndim not in (2, 3) or image.shape[-1] != image.shape[-2]:
+        raise DataError(f"{table.label} is no stack of matrices", source=oifits.path, remedy=REMEDY)
+    stack = np.asarray(image, dtype=float).reshape(-1, *image.shape[-2:])
+    held = stack.shape[0] * stack.shape[1]
+    if held != n_data or stack.shape[1] % n_channels:
+        raise DataError(
+            f"{table.label} is for {held} data, the tables hold {n_data}",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    return stack
+
+
+def _order_and_unit(
+    oifits: OIFits, table: OITable, stack: FloatArray, variance: FloatArray, n_channels: int
+) -> tuple[str, IntArray, float]:
+    """Name, (exposures, size) places of the data and scale to radians² that fit the errors best."""
+    shape = stack.shape[:2]
+    cells = np.arange(shape[0] * shape[1]).reshape(shape[0], -1, n_channels)
+    diagonal = np.diagonal(stack, axis1=1, axis2=2)
+    orders = ("channels fastest", cells), ("baselines fastest", cells.swapaxes(1, 2))
+    units = [("radians", 1.0), ("degrees", DEGREE**2)][: 1 + (table.name == "CPCOV")]
+    trials = [
+        (f"{order}, {unit}" if len(units) > 1 else order, grid.reshape(shape), scale)
+        for order, grid in orders
+        for unit, scale in units
+    ]
+    misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
+    best = int(np.argmin(misfit))
+    if not misfit[best] < LARGEST_MISFIT:
+        raise DataError(
+            f"the diagonal of {table.label} does not fit the errors of the data",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    return trials[best]
 
 
 def _misfit(diagonal: FloatArray, variance: FloatArray) -> float:
