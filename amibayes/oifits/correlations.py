@@ -20,6 +20,9 @@ from amibayes.units import DEGREE, FloatArray
 LARGEST_MISFIT = 0.5
 """Median departure of ln(variance ratio) past which a covariance is not that of the errors."""
 
+OPPOSITE = -0.05
+"""Mean correlation, times the sign that shared baselines give it, below which it is wrong."""
+
 REMEDY = "correct the correlations, or read the file with independent errors"
 
 
@@ -223,8 +226,12 @@ def given_covariance(
     *,
     covered: BoolArray,
     independent: BoolArray,
-) -> Covariance:
-    """Covariance of unflagged data, some of whose correlations are given.
+) -> tuple[Covariance, tuple[str, ...]]:
+    """Covariance of unflagged data, some of whose correlations are given, and notes on it.
+
+    Correlations that contradict the baselines which the triangles share (the signs of
+    another order of triangles, say) would give some closure phase no noise at all; such
+    sets are taken as correlated through their shared baselines instead, and it is noted.
 
     Parameters
     ----------
@@ -254,10 +261,38 @@ def given_covariance(
     blocks = _assumed_blocks(closure_phase, variance, assumed, shift)
     single = np.ones(n, dtype=bool)
     single[[i for s in assumed for i in s]] = False
-    blocks += _given_blocks(variance, pairs, closure_phase, given, single)
     if not pairs.first.size and not sets:
-        return DiagonalCovariance(variance)
-    return BlockCovariance(n, blocks)
+        return DiagonalCovariance(variance), ()
+    kept, contradicted = [], np.zeros(n, dtype=bool)
+    for block in _given_blocks(variance, pairs, closure_phase, given, single):
+        if block.index.min() >= shift and _contradicts(block, closure_phase, shift):
+            contradicted[block.index] = True
+        else:
+            kept.append(block)
+    mended = [s for s in given if contradicted[s].all()]
+    blocks += kept + _assumed_blocks(closure_phase, variance, mended, shift)
+    return BlockCovariance(n, blocks), _mended_note(len(mended), len(sets))
+
+
+def _contradicts(block: Block, closure_phase: Measurements, shift: int) -> bool:
+    """Whether correlations have the opposite sign of what the shared baselines give."""
+    stations = closure_phase.stations[block.index - shift]
+    matrix, _ = closure_matrix(stations)
+    same_channel = closure_phase.channel[block.index - shift]
+    shared = np.sign(matrix @ matrix.T) * (same_channel[:, None] == same_channel)
+    scale = np.sqrt(np.diag(block.matrix))
+    agreement = shared * block.matrix / np.outer(scale, scale)
+    off = ~np.eye(len(scale), dtype=bool) & (shared != 0)
+    return bool(off.any() and agreement[off].mean() < OPPOSITE)
+
+
+def _mended_note(mended: int, total: int) -> tuple[str, ...]:
+    if not mended:
+        return ()
+    return (
+        f"the correlations given for {mended} of {total} sets of closure phases contradict the "
+        "baselines that their triangles share: taken as correlated through these instead",
+    )
 
 
 def _assumed_blocks(

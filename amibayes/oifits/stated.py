@@ -89,7 +89,7 @@ def stated_covariance(
     independent = np.concatenate([c.of_parts(c.independent).astype(bool) for c in content.both])
     independent = independent[~flag]
     try:
-        covariance = given_covariance(
+        covariance, mended = given_covariance(
             variance[~flag], pairs, closure, covered=covered, independent=independent
         )
     except DataError as error:
@@ -97,7 +97,7 @@ def stated_covariance(
     kind: CovarianceKind = "given" if len(pairs.first) else "assumed"
     if independent[len(independent) - len(closure) :].all() and kind == "assumed":
         kind = "diagonal"
-    return covariance, said or kind, _integrations(tables), notes
+    return covariance, said or kind, _integrations(tables), (*notes, *mended)
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:
