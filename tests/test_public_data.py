@@ -52,10 +52,13 @@ def test_ax_cir_without_smearing_and_with_closures_alone(data: Path) -> None:
 
 
 def test_ax_cir_with_the_covariances_of_the_file(data: Path) -> None:
-    """Fouriever: 0.934 ± 0.040 %, 0.816 mas."""
+    """Fouriever: 0.934 ± 0.040 %, 0.816 mas, with channels smeared 1.4 times too wide.
+
+    The file's closure correlations have the wrong sign in half of its exposures.
+    """
     result = searched(data / "oifits" / "axcir_pionier_cov.oifits", FREE, (0.6, 50.0))
-    assert result.likelihood.observables.covariance_kind == "given"
-    assert result.companion.contrast == pytest.approx(0.0093, abs=0.0006)
+    assert any("contradict" in note for note in result.likelihood.observables.notes)
+    assert result.companion.contrast == pytest.approx(0.0093, abs=0.0004)
     assert np.hypot(result.companion.east_mas - 6.24, result.companion.north_mas + 28.51) < 0.1
 
 

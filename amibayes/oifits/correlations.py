@@ -12,7 +12,14 @@ from scipy.sparse.csgraph import connected_components
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
 from amibayes.errors import DataError
-from amibayes.observables import BoolArray, IntArray, Measurements, closure_sets, kernel_blocks
+from amibayes.observables import (
+    BoolArray,
+    IntArray,
+    Measurements,
+    closure_sets,
+    exposure_labels,
+    kernel_blocks,
+)
 from amibayes.oifits.setups import integers, numbers, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, FloatArray
@@ -219,6 +226,53 @@ def image_table(oifits: OIFits, name: str, insname: str) -> OITable | None:
     return next(iter(alike or unnamed), None)
 
 
+def trusted_pairs(
+    pairs: Pairs, variance: FloatArray, closure_phase: Measurements
+) -> tuple[Pairs, str]:
+    """Set the correlations between closure phases aside where they cannot be right.
+
+    Two triangles of one exposure that share a baseline are correlated with the sign that
+    the baseline has in both. Correlations that on average have the opposite sign, in one
+    exposure at least, belong to another order of the triangles (fouriever's example of
+    AX Cir: half of its exposures); weighed with them, some combination would have no noise.
+
+    Returns
+    -------
+    pairs : Pairs
+    note : str
+        Empty where they were kept.
+    """
+    shift = len(variance) - len(closure_phase)
+    inner = (pairs.first >= shift) & (pairs.second >= shift)
+    i, j = pairs.first[inner] - shift, pairs.second[inner] - shift
+    exposure = exposure_labels(closure_phase)
+    same_set = (exposure[i] == exposure[j]) & (closure_phase.channel[i] == closure_phase.channel[j])
+    sign = np.where(same_set, shared_baseline_sign(closure_phase, i, j), 0.0)
+    scale = np.sqrt(variance[i + shift] * variance[j + shift])
+    tied = sign != 0
+    total = np.bincount(exposure[i[tied]], (sign * pairs.covariance[inner] / scale)[tied])
+    count = np.bincount(exposure[i[tied]])
+    wrong = int((total < OPPOSITE * count).sum())
+    if not wrong:
+        return pairs, ""
+    kept = Pairs(pairs.first[~inner], pairs.second[~inner], pairs.covariance[~inner])
+    return kept, (
+        f"the correlations given between closure phases contradict the baselines that the "
+        f"triangles share in {wrong} of {(count > 0).sum()} exposures: set aside, correlated "
+        "through shared baselines instead"
+    )
+
+
+def shared_baseline_sign(closure_phase: Measurements, i: IntArray, j: IntArray) -> FloatArray:
+    """Sign of the correlation that a shared baseline gives two closure phases; 0 for none."""
+    a, b, c = closure_phase.stations.T
+    legs = np.stack([np.stack(leg, axis=1) for leg in ((a, b), (b, c), (c, a))], axis=1)
+    one, other = legs[i][:, :, None], legs[j][:, None]
+    along = (one == other).all(axis=3).sum(axis=(1, 2))
+    against = (one == other[..., ::-1]).all(axis=3).sum(axis=(1, 2))
+    return np.asarray(np.sign(along - against), dtype=float)
+
+
 def given_covariance(
     variance: FloatArray,
     pairs: Pairs,
@@ -226,12 +280,8 @@ def given_covariance(
     *,
     covered: BoolArray,
     independent: BoolArray,
-) -> tuple[Covariance, tuple[str, ...]]:
-    """Covariance of unflagged data, some of whose correlations are given, and notes on it.
-
-    Correlations that contradict the baselines which the triangles share (the signs of
-    another order of triangles, say) would give some closure phase no noise at all; such
-    sets are taken as correlated through their shared baselines instead, and it is noted.
+) -> Covariance:
+    """Covariance of unflagged data, some of whose correlations are given.
 
     Parameters
     ----------
@@ -261,38 +311,10 @@ def given_covariance(
     blocks = _assumed_blocks(closure_phase, variance, assumed, shift)
     single = np.ones(n, dtype=bool)
     single[[i for s in assumed for i in s]] = False
+    blocks += _given_blocks(variance, pairs, closure_phase, given, single)
     if not pairs.first.size and not sets:
-        return DiagonalCovariance(variance), ()
-    kept, contradicted = [], np.zeros(n, dtype=bool)
-    for block in _given_blocks(variance, pairs, closure_phase, given, single):
-        if block.index.min() >= shift and _contradicts(block, closure_phase, shift):
-            contradicted[block.index] = True
-        else:
-            kept.append(block)
-    mended = [s for s in given if contradicted[s].all()]
-    blocks += kept + _assumed_blocks(closure_phase, variance, mended, shift)
-    return BlockCovariance(n, blocks), _mended_note(len(mended), len(sets))
-
-
-def _contradicts(block: Block, closure_phase: Measurements, shift: int) -> bool:
-    """Whether correlations have the opposite sign of what the shared baselines give."""
-    stations = closure_phase.stations[block.index - shift]
-    matrix, _ = closure_matrix(stations)
-    same_channel = closure_phase.channel[block.index - shift]
-    shared = np.sign(matrix @ matrix.T) * (same_channel[:, None] == same_channel)
-    scale = np.sqrt(np.diag(block.matrix))
-    agreement = shared * block.matrix / np.outer(scale, scale)
-    off = ~np.eye(len(scale), dtype=bool) & (shared != 0)
-    return bool(off.any() and agreement[off].mean() < OPPOSITE)
-
-
-def _mended_note(mended: int, total: int) -> tuple[str, ...]:
-    if not mended:
-        return ()
-    return (
-        f"the correlations given for {mended} of {total} sets of closure phases contradict the "
-        "baselines that their triangles share: taken as correlated through these instead",
-    )
+        return DiagonalCovariance(variance)
+    return BlockCovariance(n, blocks)
 
 
 def _assumed_blocks(

@@ -19,6 +19,7 @@ from amibayes.oifits.correlations import (
     image_table,
     joined,
     oi_corr_pairs,
+    trusted_pairs,
 )
 from amibayes.oifits.setups import same
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
@@ -84,12 +85,14 @@ def stated_covariance(
         set_aside = ("correlations of the file set aside",) if tables or notes else ()
         return DiagonalCovariance(variance[~flag]), "diagonal", None, set_aside
     pairs = _unflagged(joined([images, *_table_pairs(oifits, content, tables, variance)]), flag)
+    pairs, doubt = trusted_pairs(pairs, variance[~flag], closure)
+    notes += (doubt,) if doubt else ()
     said = _said_kind(tables)
     covered = _covered(content, tables if said else [])[~flag]
     independent = np.concatenate([c.of_parts(c.independent).astype(bool) for c in content.both])
     independent = independent[~flag]
     try:
-        covariance, mended = given_covariance(
+        covariance = given_covariance(
             variance[~flag], pairs, closure, covered=covered, independent=independent
         )
     except DataError as error:
@@ -97,7 +100,7 @@ def stated_covariance(
     kind: CovarianceKind = "given" if len(pairs.first) else "assumed"
     if independent[len(independent) - len(closure) :].all() and kind == "assumed":
         kind = "diagonal"
-    return covariance, said or kind, _integrations(tables), (*notes, *mended)
+    return covariance, said or kind, _integrations(tables), notes
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:
