@@ -18,6 +18,8 @@ from matplotlib.figure import Figure
 from amibayes.files import atomic_path
 
 WIDTH_IN = 6.4
+"""Type of 10 to 11 points on this width can still be read on a telephone."""
+
 DPI = 160
 
 BLACK, GREY, LIGHT_GREY = "#000000", "#6e6e6e", "#c8c8c8"
@@ -42,6 +44,7 @@ SETTINGS: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 11.0,
     "axes.titlesize": 11.0,
+    "figure.titlesize": 11.0,
     "axes.labelsize": 11.0,
     "xtick.labelsize": 10.0,
     "ytick.labelsize": 10.0,
@@ -67,8 +70,12 @@ def styled() -> Iterator[None]:
 def new_figure(
     height_in: float, width_in: float = WIDTH_IN, *, layout: str | None = "constrained"
 ) -> Figure:
-    """Make an empty figure on an Agg canvas."""
-    figure = Figure(figsize=(width_in, height_in), layout=layout)  # type: ignore[arg-type]
+    """Make an empty figure on an Agg canvas.
+
+    Square maps need a height that leaves the width as their limit: the constrained layout
+    does not count the labels of an axis that the aspect ratio has shortened.
+    """
+    figure = Figure(figsize=(width_in, height_in), layout=layout, dpi=DPI)  # type: ignore[arg-type]
     FigureCanvasAgg(figure)
     return figure
 
@@ -87,6 +94,11 @@ def save(figure: Figure, path: str | Path) -> None:
     RunError
         Where the file cannot be written.
     """
+    # The first pass settles the ticks, the second makes room for their labels; each pass
+    # would move the axes a little further, so that a figure keeps the layout it was saved with.
+    for _ in range(2):
+        figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
