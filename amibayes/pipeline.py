@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from amibayes.calibration import Calibration, calibrate
+from amibayes.calibration import Calibration, Method, calibrate
 from amibayes.errors import UsageError
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
-from amibayes.inference.posterior import Posterior, sample
+from amibayes.inference.posterior import Posterior, modes_to_sample, sample
 from amibayes.inference.priors import default_prior
 from amibayes.inference.results import SearchResult
-from amibayes.inference.search import resolves_stars, search
+from amibayes.inference.search import look_outside, resolves_stars, search
 from amibayes.inference.significance import ALPHA, Significance, significance
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits
@@ -46,8 +46,8 @@ class SearchOptions:
     smearing : bool
     closure_covariance : {"assumed", "diagonal"}
         For files that give errors and no correlations.
-    calibration : str, optional
-        Method; by default that of `amibayes.calibration.calibrate`.
+    calibration : {"hierarchical", "weighted"}, optional
+        By default hierarchical with 3 calibrators or more.
     clip : float
         Sigma clipping of the calibrators.
     insname, target : str, optional
@@ -68,7 +68,7 @@ class SearchOptions:
     background: float | Literal["free"] = 0.0
     smearing: bool = True
     closure_covariance: Literal["assumed", "diagonal"] = "assumed"
-    calibration: str | None = None
+    calibration: Method | None = None
     clip: float = 3.0
     insname: str | None = None
     target: str | None = None
@@ -88,6 +88,7 @@ class SearchReport:
     calibrators: tuple[str, ...]
     observables: Observables
     calibration: Calibration | None
+    references: tuple[Observables, ...]
     result: SearchResult
     significance: Significance | None
     posterior: Posterior | None
@@ -148,19 +149,24 @@ def search_companion(
     options = options or SearchOptions()
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
-    streams = np.random.SeedSequence(options.seed).spawn(3)
+    streams = np.random.SeedSequence(options.seed).spawn(4)
     clock = _Clock(announce)
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
         with clock.stage("read"):
             parts = [_read(path, options) for path in targets]
             references = [_read(path, options) for path in calibrators]
-        calibration = None
+        calibration, observables = None, join(parts)
         if references:
             with clock.stage("calibrate"):
-                calibration = calibrate(parts, references, **_calibration_options(options))
-                parts = list(calibration.targets)
-        observables = join([part.unflagged() for part in parts])
+                calibration = calibrate(
+                    parts,
+                    references,
+                    method=options.calibration,
+                    clip=options.clip,
+                    rng=np.random.default_rng(streams[3]),
+                )
+                observables = calibration.observables
         with clock.stage("search"):
             likelihood = Likelihood(observables.only(options.observables))
             likelihood = likelihood.with_model(_model(likelihood, options))
@@ -190,6 +196,7 @@ def search_companion(
         tuple(str(p) for p in calibrators),
         observables,
         calibration,
+        tuple(references),
         result,
         weight,
         posterior,
@@ -206,13 +213,6 @@ def _read(path: str | Path, options: SearchOptions) -> Observables:
         target=options.target,
         closure_covariance=options.closure_covariance,
     )
-
-
-def _calibration_options(options: SearchOptions) -> dict[str, object]:
-    chosen: dict[str, object] = {"clip": options.clip}
-    if options.calibration is not None:
-        chosen["method"] = options.calibration
-    return chosen
 
 
 def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
@@ -234,7 +234,8 @@ def _warnings(
     weight: Significance | None,
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
-    found = [*observables.notes, *result.warnings]
+    outside = look_outside(result)
+    found = [*([outside] if outside else []), *result.warnings, *observables.notes]
     reduced = result.chi2_binary / result.ndof
     if reduced > 2.0:
         found.append(
@@ -247,6 +248,13 @@ def _warnings(
             f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "
             "is extrapolated"
         )
+    if posterior is not None and len(posterior.mode_probability) > 1:
+        share = posterior.mode_probability[0]
+        if share < 0.99 and len(modes_to_sample(result)) == 1:
+            found.append(
+                f"the posterior is that of the reported position, whose probability among "
+                f"{len(posterior.mode_probability)} modes is {share:.2f} (Laplace)"
+            )
     if posterior is not None and not posterior.converged:
         found.append(
             f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "

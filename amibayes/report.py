@@ -44,7 +44,7 @@ def result_json(report: SearchReport) -> Json:
         "data": _data(report),
         "fit": _fit(result),
         "significance": _significance(result, report.significance, report.options.alpha),
-        "modes": [_mode(mode) for mode in result.modes],
+        "modes": _modes(report),
         "posterior": None if report.posterior is None else _posterior(report.posterior),
         "calibration": _calibration(report),
         "limits": None if report.limits is None else limits_json(report.limits),
@@ -132,6 +132,14 @@ def _significance(result: SearchResult, weight: Significance | None, alpha: floa
             },
         }
     return out
+
+
+def _modes(report: SearchReport) -> list[Json]:
+    modes = [_mode(mode) for mode in report.result.modes]
+    if report.posterior is not None:
+        for mode, probability in zip(modes, report.posterior.mode_probability, strict=True):
+            mode["probability"] = float(probability)
+    return modes
 
 
 def _mode(mode: Mode) -> Json:
@@ -260,12 +268,13 @@ def _nuisance_lines(result: SearchResult) -> list[str]:
 
 
 def _limit_lines(limits: DetectionLimit) -> list[str]:
-    delta = limits.delta_mag[np.isfinite(limits.delta_mag)]
+    usable = np.isfinite(limits.delta_mag)
+    delta, rho = limits.delta_mag[usable], limits.separation_mas[usable]
     if not len(delta):
         return ["limits      no injected companion is recovered reliably in this field"]
     return [
-        f"limits      delta mag {delta.min():.2f} to {delta.max():.2f} over the field "
-        f"({limits.completeness:.0%} recovered, false-positive rate "
+        f"limits      delta mag {delta.min():.2f} to {delta.max():.2f} at {rho.min():.0f} to "
+        f"{rho.max():.0f} mas ({limits.completeness:.0%} recovered, false-positive rate "
         f"{limits.false_positive_rate:.2g})"
     ]
 

@@ -32,8 +32,9 @@ LAYERS = [
     "planning",
     "validation",
     "plots",
-    "report",
     "pipeline",
+    "pictures",
+    "report",
     "cli",
     "__main__",
 ]

@@ -96,6 +96,18 @@ def test_posterior_of_noise_fills_the_prior_at_faint_contrast() -> None:
     assert posterior.column("separation_mas").min() >= 50.0
 
 
+def test_strong_aliases_are_weighed_and_the_reported_one_is_sampled() -> None:
+    data = simulated(niriss(), [150.0, -80.0, 0.01], np.random.default_rng(1))
+    found = search(Likelihood(data))
+    assert len(found.modes) > 1
+    prior = default_prior(found.likelihood, found.grid.inner_mas, found.grid.outer_mas)
+    posterior = sample(found, prior, np.random.default_rng(3))
+    assert posterior.converged
+    assert posterior.column("separation_mas").std() < 10.0
+    assert posterior.mode_probability.sum() == pytest.approx(1.0)
+    assert posterior.mode_probability[0] < 0.9
+
+
 def test_prior_is_normalised(rng) -> None:
     """Its integral over a box around it is 1 (Monte Carlo, 5 sigma)."""
     prior = Prior(50.0, 400.0, 1e-4, 0.5, nuisance=((0.0, 2.0),))

@@ -28,6 +28,9 @@ class Parser(argparse.ArgumentParser):
 
     def _suggestion(self, message: str) -> str:
         known = [*self._option_string_actions, *COMMANDS]
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                known += [o for p in action.choices.values() for o in p._option_string_actions]
         words = [word.strip("'\"").split("=")[0] for word in message.split()]
         for word in words:
             if word not in known and (close := difflib.get_close_matches(word, known, n=1)):

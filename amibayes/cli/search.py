@@ -39,6 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="null searches for the false-alarm probability; 0: none (default: %(default)s)",
     )
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
+    stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
     stages.add_argument(
         "--resume", action="store_true", help="go on with a posterior that was cut off"
     )
@@ -112,30 +113,31 @@ def run(arguments: argparse.Namespace) -> int:
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.files import output_folder
 
+    options = _options(arguments)
     overwrite = arguments.overwrite or arguments.resume
-    folder = output_folder(arguments.out, _names(arguments), overwrite=overwrite)
-    report = _search(arguments, folder)
+    folder = output_folder(arguments.out, _names(arguments, options), overwrite=overwrite)
+    report = _search(arguments, options, folder)
     _write(report, folder)
     common.finish(arguments, _json(report), lambda: _summary(report, folder))
     return 0
 
 
-def _names(arguments: argparse.Namespace) -> list[str]:
-    from amibayes.plots.search import picture_names
+def _names(arguments: argparse.Namespace, options: SearchOptions) -> list[str]:
+    from amibayes.pictures import picture_names
 
-    names = [RESULT, *picture_names(posterior=not arguments.no_posterior, cal=bool(arguments.cal))]
-    names += [] if arguments.no_posterior else [CHAIN]
+    names = [RESULT, *picture_names(options, calibrated=bool(arguments.cal))]
+    names += [CHAIN] if options.posterior else []
     return [*names, CALIBRATED] if arguments.cal else names
 
 
-def _search(arguments: argparse.Namespace, folder: Path) -> SearchReport:
+def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path) -> SearchReport:
     from amibayes.pipeline import search_companion
 
     with common.Progress(quiet=arguments.quiet) as progress:
         return search_companion(
             arguments.targets,
             arguments.cal,
-            _options(arguments),
+            options,
             chain=folder / CHAIN,
             resume=arguments.resume,
             announce=progress.stage,
@@ -169,7 +171,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
 def _write(report: SearchReport, folder: Path) -> None:
     from amibayes.files import write_json
     from amibayes.oifits import write_oifits
-    from amibayes.plots.search import save_pictures
+    from amibayes.pictures import save_pictures
 
     if report.calibration is not None:
         write_oifits(folder / CALIBRATED, report.observables, overwrite=True)

@@ -32,6 +32,9 @@ ENOUGH = 50.0
 
 GOOD_RHAT = 1.02
 
+STRONG = 30.0
+"""Δχ² above which a mode is an island: no chain leaves it."""
+
 GROUP = "mcmc"
 """Name of the HDF5 group, as emcee's own backend has it."""
 
@@ -49,6 +52,8 @@ class Posterior:
     samples : (n, n_dim) float array
         Thinned, burn-in removed; contrast as a flux ratio.
     log_prob : (n,) float array
+    chain : (n_steps, n_walkers, n_dim) float array
+        All of it, burn-in included.
     autocorrelation_time : float
         Longest of the parameters', in steps.
     n_steps, n_burn : int
@@ -59,11 +64,15 @@ class Posterior:
         Mean fraction of accepted proposals.
     converged : bool
         Longer than 50 autocorrelation times and split-R̂ below 1.02.
+    prior : Prior
+    mode_probability : (n_modes,) float array
+        Probability of each mode of the search (Laplace), in their order.
     """
 
     names: tuple[str, ...]
     samples: FloatArray
     log_prob: FloatArray
+    chain: FloatArray
     autocorrelation_time: float
     n_steps: int
     n_burn: int
@@ -72,6 +81,7 @@ class Posterior:
     acceptance: float
     converged: bool
     prior: Prior
+    mode_probability: FloatArray
 
     @property
     def n_effective(self) -> int:
@@ -155,7 +165,7 @@ def sample(
             _save(sampler, path, digest)
         if progress:
             progress(sampler.iteration, int(ENOUGH * _time(sampler)))
-    return _posterior(sampler, likelihood, prior, done)
+    return _posterior(sampler, result, prior, done)
 
 
 def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray], FloatArray]:
@@ -176,22 +186,40 @@ def _physical(x: FloatArray) -> FloatArray:
     return theta
 
 
+def mode_probabilities(result: SearchResult, prior: Prior) -> FloatArray:
+    """Probability of each mode among the modes, by Laplace's approximation, (n_modes,)."""
+    log_weight = np.array([_laplace(result.likelihood, m, prior)[2] for m in result.modes])
+    weight = np.exp(log_weight - log_weight.max())
+    return np.asarray(weight / weight.sum())
+
+
+def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
+    """Choose the modes that one chain explores.
+
+    A chain never passes between modes that are both strong: then it is that of the
+    reported one. Weak ones are joined by the sea of noise around them.
+    """
+    strong = result.modes[0].delta_chi2 > STRONG
+    return result.modes[:1] if strong else result.modes
+
+
 def _start(result: SearchResult, prior: Prior, rng: np.random.Generator) -> FloatArray:
     """Walkers (n, n_dim) around the modes, each by its own covariance, inside the prior."""
-    modes = [m for m in result.modes if m.theta[2] > prior.contrast_min] or [result.modes[0]]
-    laplace = [_laplace(result.likelihood, m, prior) for m in modes]
+    chosen = modes_to_sample(result)
+    laplace = [_laplace(result.likelihood, m, prior) for m in chosen]
     log_weight = np.array([w for _, _, w in laplace])
     weight = np.exp(log_weight - log_weight.max())
-    which = rng.choice(len(modes), size=1000 * N_WALKERS, p=weight / weight.sum())
-    trial = np.array(
-        [laplace[k][0] + laplace[k][1] @ rng.standard_normal(len(laplace[k][0])) for k in which]
-    )
+    n_dim, n_trials = len(laplace[0][0]), 100 * N_WALKERS
+    which = rng.choice(len(laplace), size=n_trials, p=weight / weight.sum())
+    centre = np.array([c for c, _, _ in laplace])[which]
+    scatter = np.array([s for _, s, _ in laplace])[which]
+    trial = centre + np.einsum("nij,nj->ni", scatter, rng.standard_normal((n_trials, n_dim)))
     inside = trial[np.isfinite(prior.log_density(trial))]
     if len(inside) < N_WALKERS:
         raise DataError(
             "the best fit lies outside the prior", source=result.likelihood.observables.source
         )
-    return inside[:N_WALKERS]
+    return np.asarray(inside[:N_WALKERS])
 
 
 def _laplace(
@@ -236,15 +264,16 @@ def _split_rhat(sampler: emcee.EnsembleSampler) -> float:
 
 
 def _posterior(
-    sampler: emcee.EnsembleSampler, likelihood: Likelihood, prior: Prior, converged: bool
+    sampler: emcee.EnsembleSampler, result: SearchResult, prior: Prior, converged: bool
 ) -> Posterior:
     time = _time(sampler)
     burn = sampler.iteration // 3
     thin = max(1, int(0.5 * time)) if np.isfinite(time) else 1
     return Posterior(
-        names=likelihood.parameters,
+        names=result.likelihood.parameters,
         samples=_physical(sampler.get_chain(discard=burn, thin=thin, flat=True)),
         log_prob=sampler.get_log_prob(discard=burn, thin=thin, flat=True),
+        chain=_physical(sampler.get_chain()),
         autocorrelation_time=time,
         n_steps=sampler.iteration,
         n_burn=burn,
@@ -253,6 +282,7 @@ def _posterior(
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=converged,
         prior=prior,
+        mode_probability=mode_probabilities(result, prior),
     )
 
 

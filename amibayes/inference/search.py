@@ -26,6 +26,9 @@ FEWEST_SEEDS, MOST_SEEDS = 5, 24
 MODE_LIMIT = 25.0
 """Modes within this Δχ² of the best one are left standing."""
 
+MOST_POSITIONS = 40_000
+"""Positions of the look around the field."""
+
 BRIGHT = 0.1
 """Above this contrast the templates are no longer linear enough to rank positions."""
 
@@ -41,6 +44,35 @@ def default_separation(likelihood: Likelihood) -> tuple[float, float]:
 def resolution_mas(likelihood: Likelihood) -> float:
     """λ/B of the longest baseline in wavelengths, mas."""
     return float(1.0 / likelihood.samples.frequency.max() / MAS)
+
+
+def look_outside(result: SearchResult) -> str:
+    """Say where outside the field a companion would fit much better; empty where nowhere.
+
+    The scan reaches to where the width of the channels smears a companion out, or as far
+    as `MOST_POSITIONS` positions go. It is coarse: half the field's sampling.
+    """
+    likelihood, grid = result.likelihood, result.grid
+    smallest_band = float(likelihood.samples.relative_band.min())
+    reach = resolution_mas(likelihood) / max(smallest_band, 1e-6)
+    step = 2.0 * grid.step_mas
+    farthest = min(reach, float(np.hypot(grid.outer_mas, step * np.sqrt(MOST_POSITIONS / np.pi))))
+    around = make_grid(grid.outer_mas, farthest, step)
+    if not len(around):
+        return ""
+    bank = TemplateBank(likelihood, around, result.single_theta)
+    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
+    contrast, sigma = bank.scan(residuals)
+    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+    inside = float(result.bank_delta_chi2.max())
+    best = int(gain.argmax())
+    if gain[best] < inside + max(MODE_LIMIT, 0.1 * inside):
+        return ""
+    place = float(np.hypot(around.east_mas[best], around.north_mas[best]))
+    return (
+        f"a companion near {place:.1f} mas, outside the field, fits better by Δχ² "
+        f"{gain[best] - inside:.0f}: search with a wider --separation"
+    )
 
 
 def resolves_stars(likelihood: Likelihood) -> bool:

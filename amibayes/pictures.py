@@ -1,0 +1,133 @@
+"""The pictures of the main job, by file name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from amibayes.pipeline import SearchOptions, SearchReport
+from amibayes.plots.calibration import calibrator_plot
+from amibayes.plots.chains import trace_plot
+from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
+from amibayes.plots.corner_plot import corner_plot
+from amibayes.plots.coverage import coverage_plot
+from amibayes.plots.fit import fit_plot
+from amibayes.plots.maps import detection_map, save_maps_fits
+from amibayes.plots.null_plot import null_plot
+from amibayes.plots.residual_corr import correlation_plot
+from amibayes.plots.style import save
+from amibayes.units import contrast_to_delta_mag
+
+MAPS = "maps.fits"
+
+
+def picture_names(options: SearchOptions, *, calibrated: bool) -> list[str]:
+    """List the files that `save_pictures` will write for a job."""
+    names = ["map.png", "fit.png", "coverage.png", "correlation.png", MAPS]
+    names += ["null.png"] if options.null_draws else []
+    names += ["corner.png", "chains.png"] if options.posterior else []
+    names += ["limits.png", "completeness.png"] if options.limits and options.null_draws else []
+    return names + (["calibrators.png"] if calibrated else [])
+
+
+def save_pictures(report: SearchReport, folder: Path) -> list[Path]:
+    """Draw every picture of a report into a folder."""
+    drawn = []
+    for name, draw in pictures(report).items():
+        save(draw(), folder / name)
+        drawn.append(folder / name)
+    save_maps_fits(folder / MAPS, report.result)
+    return drawn
+
+
+def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
+    """Name the pictures of a report and the functions that draw them."""
+    result = report.result
+    out: dict[str, Callable[[], Figure]] = {
+        "map.png": lambda: detection_map(result, contrast="positive"),
+        "fit.png": lambda: fit_plot(result),
+        "coverage.png": lambda: coverage_plot(result.likelihood.observables),
+        "correlation.png": lambda: correlation_plot(result.likelihood.observables),
+    }
+    if report.calibration is not None:
+        out["calibrators.png"] = lambda: _calibrators(report)
+    if report.significance is not None:
+        out["null.png"] = lambda: _null(report)
+    if report.posterior is not None:
+        out["corner.png"] = lambda: _corner(report)
+        out["chains.png"] = lambda: _chains(report)
+    if report.limits is not None:
+        out["limits.png"] = lambda: _limits(report)
+        out["completeness.png"] = lambda: _completeness(report)
+    return out
+
+
+def _calibrators(report: SearchReport) -> Figure:
+    calibration = report.calibration
+    assert calibration is not None
+    return calibrator_plot(
+        report.references,
+        [c.kept for c in calibration.calibrators],
+        [Path(p).name for p in report.calibrators],
+    )
+
+
+def _null(report: SearchReport) -> Figure:
+    weight = report.significance
+    assert weight is not None
+    return null_plot(weight.null, weight.statistic, alpha=weight.alpha)
+
+
+def _corner(report: SearchReport) -> Figure:
+    posterior = report.posterior
+    assert posterior is not None
+    return corner_plot(
+        posterior.samples, posterior.names, best=[float(x) for x in report.result.theta]
+    )
+
+
+def _chains(report: SearchReport) -> Figure:
+    posterior = report.posterior
+    assert posterior is not None
+    return trace_plot(posterior.chain, posterior.names, posterior.n_burn)
+
+
+def _limits(report: SearchReport) -> Figure:
+    limits = report.limits
+    assert limits is not None
+    curves = {
+        f"{limits.completeness:.0%} recovered": Curve(limits.delta_mag),
+        "50% recovered": Curve(contrast_to_delta_mag(limits.contrast_50)),
+    }
+    weight = report.significance
+    found = report.result.companion if weight is not None and weight.detected else None
+    return limits_plot(limits.separation_mas, curves, found)
+
+
+def _completeness(report: SearchReport) -> Figure:
+    limits = report.limits
+    assert limits is not None
+    magnitude = np.linspace(
+        float(contrast_to_delta_mag(limits.level.max())),
+        float(contrast_to_delta_mag(limits.level.min())),
+        40,
+    )
+    share = limits.recovered / limits.trials
+    fraction = np.array(
+        [
+            np.interp(magnitude, mag, s, left=np.nan, right=np.nan)
+            for mag, s in zip(
+                contrast_to_delta_mag(limits.level)[:, ::-1], share[:, ::-1], strict=True
+            )
+        ]
+    )
+    return completeness_map(
+        limits.separation_mas,
+        magnitude,
+        fraction,
+        c50=contrast_to_delta_mag(limits.contrast_50),
+        c95=limits.delta_mag,
+    )

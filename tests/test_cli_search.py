@@ -1,0 +1,196 @@
+"""The main job from the command line: its files, its words, its exit status."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from helpers import niriss, simulated
+
+from amibayes.cli import main
+from amibayes.oifits import read_oifits, write_oifits
+
+TRUTH = [110.0, -75.0, 0.02]
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    path = tmp_path / "target.oifits"
+    write_oifits(path, simulated(niriss(), TRUTH, np.random.default_rng(1)))
+    return path
+
+
+@pytest.fixture
+def calibrators(tmp_path: Path) -> list[Path]:
+    paths = []
+    for k in range(3):
+        paths.append(tmp_path / f"cal{k}.oifits")
+        data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(10 + k))
+        write_oifits(paths[-1], data)
+    return paths
+
+
+def run(*words: object) -> int:
+    try:
+        return main(["search", *map(str, words)])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def error_of(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().split("\n")
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("amibayes")
+    return lines[0]
+
+
+KEYS = {
+    "amibayes", "seed", "inputs", "data", "fit", "significance", "modes", "posterior",
+    "calibration", "limits", "noise", "evidence", "warnings", "timing_s",
+}  # fmt: skip
+
+
+def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    words = (target, "--cal", *calibrators, "--out", out, "--separation", "50:400")
+    assert run(*words) == 0
+    summary = capsys.readouterr().out.strip().split("\n")
+    assert len(summary) <= 20
+    assert any("DETECTED" in line for line in summary)
+    result = json.loads((out / "result.json").read_text())
+    assert set(result) == KEYS
+    fit = result["fit"]
+    assert abs(fit["east_mas"] - TRUTH[0]) < 5 * fit["errors"]["east_mas"]
+    assert abs(fit["contrast"] - TRUTH[2]) < 5 * fit["errors"]["contrast"]
+    assert fit["chi2r_binary"] == pytest.approx(fit["chi2_binary"] / fit["ndof"])
+    assert result["significance"]["detected"] is True
+    assert result["significance"]["n_null_draws"] == 10_000
+    assert [c["kept"] for c in result["calibration"]["calibrators"]] == [True] * 3
+    assert result["calibration"]["method"] == "hierarchical"
+    assert result["posterior"]["converged"] is True
+    assert len(result["limits"]["separation_mas"]) == len(result["limits"]["delta_mag_3sigma"])
+    assert [i["role"] for i in result["inputs"]] == ["target"] + ["calibrator"] * 3
+    assert all(len(i["sha256"]) == 64 for i in result["inputs"])
+    for name in (
+        "map", "fit", "coverage", "correlation", "null", "corner", "chains", "limits",
+        "completeness", "calibrators",
+    ):  # fmt: skip
+        assert (out / f"{name}.png").stat().st_size > 5000, name
+    again = tmp_path / "again"
+    calibrated = out / "calibrated.oifits"
+    assert run(calibrated, "--out", again, "--separation", "50:400", "--null-draws", "0",
+               "--no-posterior") == 0  # fmt: skip
+    second = json.loads((again / "result.json").read_text())
+    assert second["fit"]["chi2_binary"] == pytest.approx(fit["chi2_binary"], rel=1e-10)
+    assert second["significance"]["detected"] is None
+    assert second["posterior"] is None
+
+
+def test_json_on_standard_output_is_the_file_and_the_seed_decides(target, tmp_path, capsys) -> None:
+    words = (target, "--separation", "50:400", "--null-draws", 500, "--json", "--no-limits")
+    results = []
+    for k in range(2):
+        assert run(*words, "--out", tmp_path / str(k)) == 0
+        text = capsys.readouterr().out
+        assert text == (tmp_path / str(k) / "result.json").read_text()
+        results.append(json.loads(text))
+        results[-1].pop("timing_s")
+    assert results[0] == results[1]
+    assert run(*words, "--out", tmp_path / "2", "--seed", 9) == 0
+    other = json.loads(capsys.readouterr().out)
+    assert other["significance"]["threshold"] != results[0]["significance"]["threshold"]
+    assert other["fit"] == results[0]["fit"]
+
+
+FAST = ("--null-draws", "0", "--no-posterior", "--no-limits")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--separation", "400:50"), "LOW < HIGH"),
+        (("--separation", "fifty"), "not LOW:HIGH"),
+        (("--observables", "vis"), "not vis2, cp"),
+        (("--diameter", "-1"), "negative"),
+        (("--null-draws", "-5"), "negative"),
+        (("--clip", "0"), "not a positive"),
+        (("--calibration", "weighted"), "needs calibrators"),
+        (("--seperation", "50:400"), "did you mean --separation"),
+        (("--separation", "100:100.0001"), "no position"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_status_2(words, message, target, tmp_path, capsys) -> None:
+    assert run(target, *FAST, "--out", tmp_path / "out", *words) == 2
+    assert message in error_of(capsys)
+
+
+def test_nothing_is_overwritten_and_no_file_is_taken_twice(target, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(target, *FAST, "--out", out) == 0
+    before = (out / "result.json").read_bytes()
+    capsys.readouterr()
+    assert run(target, *FAST, "--out", out) == 2
+    assert "is there already" in error_of(capsys)
+    assert (out / "result.json").read_bytes() == before
+    assert run(target, *FAST, "--out", out, "--overwrite", "--quiet") == 0
+    assert capsys.readouterr().out == ""
+    assert run(target, target, *FAST, "--out", tmp_path / "twice") == 2
+    assert "is given twice" in error_of(capsys)
+    assert run(target, "--cal", target, *FAST, "--out", tmp_path / "twice") == 2
+    assert "is given twice" in error_of(capsys)
+
+
+def bad_files(folder: Path, target: Path) -> dict[str, Path]:
+    files = {name: folder / f"{name}.fits" for name in ("empty", "text", "image", "flagged", "cut")}
+    files["empty"].write_bytes(b"")
+    files["text"].write_text("target,V2\nAX Cir,0.9\n")
+    fits.PrimaryHDU(np.zeros((4, 4))).writeto(files["image"])
+    data = read_oifits(target)
+    shutil.copy(target, files["flagged"])
+    with fits.open(files["flagged"], mode="update") as hdus:
+        for hdu in hdus:
+            if hdu.name in ("OI_VIS2", "OI_T3"):
+                hdu.data["FLAG"][:] = True
+    files["cut"].write_bytes(target.read_bytes()[:-4000])
+    files["directory"] = folder / "directory.fits"
+    files["directory"].mkdir()
+    files["missing"] = folder / "missing.fits"
+    assert data.n_vis2
+    return files
+
+
+@pytest.mark.parametrize(
+    "kind", ["empty", "text", "image", "flagged", "cut", "directory", "missing"]
+)
+def test_unreadable_data_are_one_line_and_status_3(kind, target, tmp_path, capsys) -> None:
+    path = bad_files(tmp_path, target)[kind]
+    assert run(path, *FAST, "--out", tmp_path / "out") == 3
+    line = error_of(capsys)
+    assert f"{kind}.fits" in line
+    assert not (tmp_path / "out" / "result.json").exists()
+
+
+def test_public_corrupted_file(data: Path, tmp_path, capsys) -> None:
+    path = data / "oifits" / "corrupted" / "truncated.fits"
+    assert run(path, *FAST, "--out", tmp_path / "out") == 3
+    assert "truncated.fits" in error_of(capsys)
+
+
+def test_folder_that_cannot_be_made(target, tmp_path, capsys) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert run(target, *FAST, "--out", tmp_path / "file" / "out") == 2
+    assert "cannot be made a folder" in error_of(capsys)
+
+
+def test_companion_outside_the_default_field_is_pointed_out(data: Path, tmp_path, capsys) -> None:
+    path = data / "oifits" / "axcir_pionier.oifits"
+    assert run(path, *FAST, "--out", tmp_path / "out", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert any("29." in w and "outside the field" in w for w in result["warnings"])
+    assert result["fit"]["diameter_mas"] > 0.5
