@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from amibayes.calibration import Calibration, calibrate
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.oifits import (
         OIFits,
@@ -24,9 +25,11 @@ if TYPE_CHECKING:
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
+    "Calibration": "amibayes.calibration",
     "DataError": "amibayes.errors",
     "RunError": "amibayes.errors",
     "UsageError": "amibayes.errors",
+    "calibrate": "amibayes.calibration",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
     "observables_of": "amibayes.oifits",
@@ -37,12 +40,14 @@ _HOME = {
 
 __all__ = [
     "AmibayesError",
+    "Calibration",
     "DataError",
     "OIFits",
     "OITable",
     "RunError",
     "UsageError",
     "__version__",
+    "calibrate",
     "observables_of",
     "open_oifits",
     "read_oifits",
