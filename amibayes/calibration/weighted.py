@@ -1,0 +1,119 @@
+"""Calibrators combined by inverse variance: the field's way, with its scatter and its clipping."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+from scipy.stats import chi2
+
+from amibayes.calibration.matching import Keys
+from amibayes.calibration.transfer import Transfer, kernel_projector
+from amibayes.observables import BoolArray
+from amibayes.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """The response of the instrument when the target was observed.
+
+    Parameters
+    ----------
+    value : (n_keys,) float array
+    covariance : (n_keys, n_keys) sparse array
+        Includes what the target, one more draw, may differ by.
+    known : (n_keys,) bool array
+    tau : (n_samples, 2) float array, optional
+        Posterior draws of the scatter between calibrators of V² and closure phase (radians);
+        NaN for a kind that is absent.
+    """
+
+    value: FloatArray
+    covariance: csr_array
+    known: BoolArray
+    tau: FloatArray | None = None
+
+
+def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:
+    """Leave out values that stand off those of the other calibrators.
+
+    A value is compared with the mean of the others, in units of its error, the scatter that
+    all keys of its type show between calibrators, and the error of that mean. The worst value
+    of a key goes while it stands off by more than ``clip``, as long as two remain: between two
+    that disagree there is no telling which is wrong.
+    """
+    value = np.array([t.value for t in transfers])
+    variance = np.array([t.variance for t in transfers])
+    seen = np.array([t.seen for t in transfers])
+    while True:
+        total = variance + _excess(value, variance, seen, keys.n_vis2)
+        off = np.where(seen & (seen.sum(axis=0) > 2), _standing_off(value, total, seen), 0.0)
+        worst = np.argmax(off, axis=0)
+        bad = np.flatnonzero(off.max(axis=0) > clip)
+        if not len(bad):
+            break
+        seen[worst[bad], bad] = False
+    return [replace(t, seen=s) for t, s in zip(transfers, seen, strict=True)]
+
+
+def _inverse(variance: FloatArray, seen: BoolArray) -> FloatArray:
+    """1/σ² of what is seen, 0 elsewhere."""
+    return np.divide(1.0, variance, out=np.zeros_like(variance), where=seen)
+
+
+def _standing_off(value: FloatArray, variance: FloatArray, seen: BoolArray) -> FloatArray:
+    """|value − mean of the others| in standard deviations, (n_calibrators, n_keys)."""
+    weight = _inverse(variance, seen)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        others = weight.sum(axis=0) - weight
+        mean = ((weight * value).sum(axis=0) - weight * value) / others
+        off = np.abs(value - mean) / np.sqrt(variance + 1.0 / others)
+    return np.asarray(np.nan_to_num(off))
+
+
+def _excess(value: FloatArray, variance: FloatArray, seen: BoolArray, n_vis2: int) -> FloatArray:
+    """Variance between calibrators beyond the errors, one number per type, (n_keys,).
+
+    From the median over the keys of a type, so that a few outliers do not hide themselves.
+    """
+    count = seen.sum(axis=0)
+    several = count >= 2
+    degrees = np.maximum(count - 1, 1)
+    mean = np.where(seen, value, 0.0).sum(axis=0) / np.maximum(count, 1)
+    scatter = np.where(seen, (value - mean) ** 2, 0.0).sum(axis=0) / degrees
+    # The median of χ²/ν is below 1: put the scatter on the scale of a variance.
+    scatter /= chi2.ppf(0.5, degrees) / degrees
+    expected = np.where(seen, variance, 0.0).sum(axis=0) / np.maximum(count, 1)
+    out = np.zeros(value.shape[1])
+    for part in (slice(0, n_vis2), slice(n_vis2, None)):
+        chosen = several[part]
+        if chosen.any():
+            out[part] = max(np.median((scatter - expected)[part][chosen]), 0.0)
+    return out
+
+
+def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> Response:
+    """Inverse-variance mean of calibrators, key by key, and its full covariance.
+
+    The error of a mean is that of its weights, or that of the scatter between calibrators
+    where it is larger; closure phases are then brought back to what baselines can make.
+    """
+    value = np.array([t.value for t in transfers])
+    seen = np.array([t.seen for t in transfers])
+    known = np.asarray(seen.any(axis=0))
+    raw = _inverse(np.array([t.variance for t in transfers]), seen)
+    weight = raw / np.where(known, raw.sum(axis=0), 1.0)
+    mean = (weight * value).sum(axis=0)
+    covariance = csr_array((len(keys), len(keys)))
+    for w, transfer in zip(weight, transfers, strict=True):
+        covariance = covariance + diags_array(w) @ transfer.covariance @ diags_array(w)
+    degrees = np.maximum(seen.sum(axis=0) - 1, 1)
+    birge = np.sqrt((raw * (value - mean) ** 2).sum(axis=0) / degrees)
+    inflate = kernel_projector(keys, known) @ diags_array(np.maximum(birge, 1.0))
+    return Response(
+        kernel_projector(keys, known) @ mean,
+        csr_array(inflate @ covariance @ inflate.T),
+        known,
+    )
