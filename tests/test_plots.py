@@ -32,7 +32,13 @@ from amibayes.plots.contrast_curve import Curve, completeness_map, contrast_mark
 from amibayes.plots.corner_plot import corner_plot, interval_text, label_of
 from amibayes.plots.coverage import coverage_plot
 from amibayes.plots.fit import fit_plot
-from amibayes.plots.maps import detection_map, local_n_sigma, save_maps_fits
+from amibayes.plots.maps import (
+    detection_map,
+    false_alarm_map,
+    local_n_sigma,
+    save_maps_fits,
+    sky_map,
+)
 from amibayes.plots.null_plot import null_plot
 from amibayes.plots.residual_corr import correlation_plot
 from amibayes.plots.style import save
@@ -113,6 +119,7 @@ PICTURES: dict[str, Callable[[SearchResult], Figure]] = {
     "map": detection_map,
     "map and signed contrast": lambda r: detection_map(r, quantity="delta_chi2", contrast="signed"),
     "map and contrast": lambda r: detection_map(r, contrast="positive"),
+    "n sigma": lambda r: sky_map(r, local_n_sigma(r), "Local nσ (σ)", vmin=0.0),
     "fit": fit_plot,
     "fit of closure phases": lambda r: fit_plot(
         by_hand(r.likelihood.observables.only(["cp"]), TRUTH)
@@ -137,8 +144,14 @@ PICTURES: dict[str, Callable[[SearchResult], Figure]] = {
     "completeness": lambda r: completeness_map(
         SEPARATION, np.linspace(3.0, 9.0, 13), fraction(), LIMIT, LIMIT - 0.9
     ),
+    "completeness, levels of their own": lambda r: completeness_map(
+        SEPARATION, LIMIT[:, None] + np.linspace(-1.0, 1.0, 13), fraction()
+    ),
     "null": lambda r: null_plot(null_maxima(), 31.0, tails(), 0.0013),
     "null, far": lambda r: null_plot(null_maxima(), 310.0, tails(), 0.0013),
+    "null, tail at a point": lambda r: null_plot(
+        null_maxima(), 24.0, {"Pareto": (np.array([24.0]), np.array([1e-5]))}, 0.0013
+    ),
     "null alone": lambda r: null_plot(null_maxima(), 7.0),
 }
 
@@ -252,6 +265,15 @@ def test_fits_maps_without_coordinates_are_offsets_in_mas(
     peak = int(np.argmax(found.bank_delta_chi2))
     assert east == pytest.approx(found.grid.east_mas[peak])
     assert north == pytest.approx(found.grid.north_mas[peak])
+
+
+def test_false_alarm_map_counts_the_draws_at_least_as_large(found: SearchResult) -> None:
+    null = np.array([9.0, 3.0, 5.0, 1e9])
+    gain = found.bank_delta_chi2
+    expected = [(1 + (null >= g).sum()) / 5.0 for g in gain]
+    np.testing.assert_allclose(false_alarm_map(found, null), expected)
+    tie = found.bank_delta_chi2[[7]]
+    assert false_alarm_map(found, tie)[7] == 1.0
 
 
 def test_a_map_of_another_size_is_refused(found: SearchResult, tmp_path: Path) -> None:
@@ -378,7 +400,8 @@ def test_survival_and_its_band_are_the_binomial_ones() -> None:
 
 def test_a_detection_far_beyond_the_draws_is_pointed_at() -> None:
     figure = null_plot(null_maxima(), 331.2, tails())
-    assert figure.axes[0].get_xlim()[1] < 40.0
+    left, right = figure.axes[0].get_xlim()
+    assert 0.0 < left + 5.0 < right < 40.0
     assert "331.2" in figure.axes[0].texts[0].get_text()
 
 

@@ -89,8 +89,8 @@ def completeness_map(
     ----------
     separation_mas : (n_sep,) float array
         Increasing.
-    delta_mag : (n_mag,) float array
-        Increasing.
+    delta_mag : (n_mag,) or (n_sep, n_mag) float array
+        Magnitude differences injected, increasing; the same at every separation or not.
     fraction : (n_sep, n_mag) float array
         Between 0 and 1; NaN where nothing was injected.
     c50, c95 : (n_sep,) float array, optional
@@ -102,19 +102,16 @@ def completeness_map(
     """
     figure = new_figure(5.0)
     ax = figure.subplots()
-    mesh = ax.pcolormesh(
-        _edges(separation_mas),
-        _edges(delta_mag),
-        np.ma.masked_invalid(fraction.T),
-        cmap=SEQUENTIAL,
-        vmin=0.0,
-        vmax=1.0,
-    )
+    rows = [_edges(row) for row in np.broadcast_to(delta_mag, fraction.shape)]
+    sides = _edges(separation_mas)
+    for i, (row, found) in enumerate(zip(rows, fraction, strict=True)):
+        cells = np.ma.masked_invalid(found[:, None])
+        mesh = ax.pcolormesh(sides[i : i + 2], row, cells, cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
     for values, dash, name in [(c50, "-", "50 % found"), (c95, "--", "95 % found")]:
         if values is not None:
             ax.plot(separation_mas, values, color="white", lw=4.0)
             ax.plot(separation_mas, values, color=BLACK, ls=dash, lw=2.0, label=name)
-    _magnitude_axis(ax, limits=(_edges(delta_mag)[0], _edges(delta_mag)[-1]))
+    _magnitude_axis(ax, limits=(float(np.min(rows)), float(np.max(rows))))
     figure.colorbar(
         mesh, ax=ax, label="Share of injected companions found", location="top", aspect=35
     )

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import corner
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray
@@ -39,8 +40,8 @@ def label_of(name: str) -> str:
 def corner_plot(
     samples: FloatArray,
     labels: Sequence[str],
-    truths: Sequence[float] | None = None,
-    best: Sequence[float] | None = None,
+    truths: ArrayLike | None = None,
+    best: ArrayLike | None = None,
 ) -> Figure:
     """Draw the corner plot of a posterior, with medians and 68 % intervals as titles.
 
@@ -49,7 +50,7 @@ def corner_plot(
     samples : (n, n_dim) float array
     labels : sequence of str
         Names of the parameters; those that amibayes knows get their unit.
-    truths, best : sequence of n_dim float, optional
+    truths, best : (n_dim,) float array, optional
         True values (dashed lines), best fit (solid lines with squares).
 
     Returns

@@ -77,6 +77,35 @@ def detection_map(
     return figure
 
 
+@styled()
+def sky_map(
+    result: SearchResult, values: FloatArray, label: str, *, vmin: float | None = None
+) -> Figure:
+    """Draw any quantity over the field with what the search found.
+
+    Parameters
+    ----------
+    result : SearchResult
+    values : (n_grid,) float array
+        One value per position of ``result.grid``, such as `local_n_sigma`.
+    label : str
+        Name of the quantity, with its unit.
+    vmin : float, optional
+        Lowest value of the colours.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = new_figure(6.6)
+    ax = figure.subplots()
+    _paint(figure, ax, result.grid, values, label, cmap=SEQUENTIAL, vmin=vmin)
+    _mark(ax, result)
+    figure.suptitle(_headline(result))
+    figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
 def _headline(result: SearchResult) -> str:
     c = result.companion
     return (
@@ -190,6 +219,24 @@ def local_n_sigma(result: SearchResult) -> FloatArray:
     """CANDID's nσ of the best positive contrast at every position of the grid, (n_grid,)."""
     chi2 = result.chi2_single - result.bank_delta_chi2
     return candid_n_sigma(result.chi2_single, chi2, result.ndof)
+
+
+def false_alarm_map(result: SearchResult, null: FloatArray) -> FloatArray:
+    """Probability that noise alone reaches the gain of each position somewhere in the field.
+
+    Parameters
+    ----------
+    result : SearchResult
+    null : (n_draws,) float array
+        Largest gain anywhere in the field of each null data set.
+
+    Returns
+    -------
+    (n_grid,) float array
+        (1 + number of draws at least as large) / (1 + number of draws).
+    """
+    below = np.searchsorted(np.sort(null), result.bank_delta_chi2, side="left")
+    return np.asarray((1.0 + len(null) - below) / (1.0 + len(null)))
 
 
 def save_maps_fits(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -46,7 +47,8 @@ def null_plot(
     observed : float
         The same statistic of the data.
     tails : mapping of str to (statistic, survival), optional
-        Fitted extreme-value tails: values, increasing, and the probability to exceed each.
+        Fitted extreme-value tails: values, increasing, and the probability to exceed each
+        (a single one is drawn as a point).
     alpha : float, optional
         False-alarm probability below which a companion counts as detected.
     statistic : str
@@ -64,24 +66,32 @@ def null_plot(
     upper.hist(null, bins="auto", color=SKY, edgecolor=BLUE, lw=0.5)
     upper.set_ylabel("Null data sets per bin")
     _survival(lower, null)
-    for (name, (x, p)), colour, dash in zip((tails or {}).items(), TAILS, DASHES[1:], strict=False):
-        lower.plot(x, p, color=colour, ls=dash, lw=2.0, label=name)
+    end = _point_at(upper, lower, observed, null)
+    seen = {name: (x, p) for name, (x, p) in (tails or {}).items() if (x <= end).any()}
+    _extrapolate(lower, seen, float(null[-1]), end)
     if alpha is not None:
         lower.axhline(alpha, color=BLACK, ls=":", lw=1.5, label=f"detection threshold, {alpha:g}")
     lower.set_yscale("log")
+    lower.set_ylim(_floor(len(null), alpha, seen, end), 1.5)
     lower.set_ylabel("Probability to exceed")
     lower.set_xlabel(statistic)
-    _point_at(upper, lower, observed, float(null[-1]))
-    end = lower.get_xlim()[1]
-    lower.set_ylim(_floor(len(null), alpha, tails or {}, end), 1.5)
-    if tails:
-        beyond = {"color": LIGHT_GREY, "alpha": 0.45, "lw": 0.0, "zorder": 0}
-        lower.axvspan(null[-1], end, **beyond, label="beyond the draws: extrapolated")
-        lower.set_xlim(right=end)
-    upper.set_title(f"{len(null)} null data sets; in the data: {observed:.4g}")
+    upper.set_title(f"{len(null)} null data sets; in the data: {observed:.1f}")
     handles, labels = lower.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
+
+
+def _extrapolate(
+    ax: Axes, tails: Mapping[str, tuple[FloatArray, FloatArray]], largest: float, end: float
+) -> None:
+    """Draw the fits, and shade where nothing but them says anything."""
+    for (name, (x, p)), colour, dash in zip(tails.items(), TAILS, DASHES[1:], strict=False):
+        marker = "D" if len(x) == 1 else ""
+        ax.plot(x, p, color=colour, ls=dash, lw=2.0, marker=marker, label=name)
+    if tails:
+        style: dict[str, Any] = {"color": LIGHT_GREY, "alpha": 0.45, "lw": 0.0, "zorder": 0}
+        ax.axvspan(largest, max(end, largest), **style, label="beyond the draws: extrapolated")
+    ax.set_xlim(right=end)
 
 
 def _survival(ax: Axes, null: FloatArray) -> None:
@@ -105,17 +115,21 @@ def _floor(
     return float(max(min([lowest, *fitted]), 1e-12))
 
 
-def _point_at(upper: Axes, lower: Axes, observed: float, largest: float) -> None:
-    """Mark the observed value by a line, or by an arrow where it lies far beyond the draws."""
-    label = f"data, {observed:.4g}"
+def _point_at(upper: Axes, lower: Axes, observed: float, null: FloatArray) -> float:
+    """Mark the observed value by a line, or by an arrow where it lies far beyond the draws.
+
+    Returns the end of the axis.
+    """
+    largest = float(null[-1])
+    room = 0.15 * (largest - float(null[0])) or 1.0
+    lower.set_xlim(left=null[0] - 0.3 * room)
     if observed <= FAR * largest:
         for ax in (upper, lower):
-            ax.axvline(observed, color=VERMILLION, lw=2.0, label=label)
-        return
-    lower.set_xlim(right=1.15 * largest)
+            ax.axvline(observed, color=VERMILLION, lw=2.0, label=f"data, {observed:.1f}")
+        return max(observed, largest) + room
     arrow = {"arrowstyle": "->", "color": VERMILLION, "lw": 2.0}
     upper.annotate(
-        f"data at {observed:.4g},\noff the scale",
+        f"data at {observed:.1f},\noff the scale",
         xy=(0.995, 0.5),
         xytext=(0.74, 0.5),
         xycoords="axes fraction",
@@ -125,3 +139,4 @@ def _point_at(upper: Axes, lower: Axes, observed: float, largest: float) -> None
         color=VERMILLION,
         arrowprops=arrow,
     )
+    return largest + room

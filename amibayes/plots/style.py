@@ -94,11 +94,12 @@ def save(figure: Figure, path: str | Path) -> None:
     RunError
         Where the file cannot be written.
     """
-    # The first pass settles the ticks, the second makes room for their labels; each pass
-    # would move the axes a little further, so that a figure keeps the layout it was saved with.
-    for _ in range(2):
-        figure.draw_without_rendering()
-    figure.set_layout_engine("none")
+    # The second pass makes room for the ticks that the first one has chosen. Every drawing
+    # would lay out anew and move the axes a little further: the figure keeps this layout.
+    if (engine := figure.get_layout_engine()) is not None:
+        for _ in range(2):
+            engine.execute(figure)
+        figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
 
