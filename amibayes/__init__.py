@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
+    from amibayes.instrument import Instrument, instrument_names, load_instrument
     from amibayes.oifits import (
         OIFits,
         OITable,
@@ -21,16 +22,26 @@ if TYPE_CHECKING:
         read_oifits,
         write_oifits,
     )
+    from amibayes.optics import FringeBasis, Wavefront, fringe_basis, psf
+    from amibayes.orientation import Orientation
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
     "DataError": "amibayes.errors",
-    "RunError": "amibayes.errors",
-    "UsageError": "amibayes.errors",
+    "FringeBasis": "amibayes.optics",
+    "Instrument": "amibayes.instrument",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
+    "Orientation": "amibayes.orientation",
+    "RunError": "amibayes.errors",
+    "UsageError": "amibayes.errors",
+    "Wavefront": "amibayes.optics",
+    "fringe_basis": "amibayes.optics",
+    "instrument_names": "amibayes.instrument",
+    "load_instrument": "amibayes.instrument",
     "observables_of": "amibayes.oifits",
     "open_oifits": "amibayes.oifits",
+    "psf": "amibayes.optics",
     "read_oifits": "amibayes.oifits",
     "write_oifits": "amibayes.oifits",
 }
@@ -38,13 +49,21 @@ _HOME = {
 __all__ = [
     "AmibayesError",
     "DataError",
+    "FringeBasis",
+    "Instrument",
     "OIFits",
     "OITable",
+    "Orientation",
     "RunError",
     "UsageError",
+    "Wavefront",
     "__version__",
+    "fringe_basis",
+    "instrument_names",
+    "load_instrument",
     "observables_of",
     "open_oifits",
+    "psf",
     "read_oifits",
     "write_oifits",
 ]
