@@ -22,8 +22,10 @@ if TYPE_CHECKING:
         read_oifits,
         write_oifits,
     )
-    from amibayes.optics import FringeBasis, Wavefront, fringe_basis, psf
+    from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
+    from amibayes.scene import Scene
+    from amibayes.scene_file import load_scene
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
@@ -33,16 +35,20 @@ _HOME = {
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
     "Orientation": "amibayes.orientation",
+    "PupilMap": "amibayes.optics",
     "RunError": "amibayes.errors",
+    "Scene": "amibayes.scene",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
     "fringe_basis": "amibayes.optics",
     "instrument_names": "amibayes.instrument",
     "load_instrument": "amibayes.instrument",
+    "load_scene": "amibayes.scene_file",
     "observables_of": "amibayes.oifits",
     "open_oifits": "amibayes.oifits",
     "psf": "amibayes.optics",
     "read_oifits": "amibayes.oifits",
+    "scene_image": "amibayes.optics",
     "write_oifits": "amibayes.oifits",
 }
 
@@ -54,17 +60,21 @@ __all__ = [
     "OIFits",
     "OITable",
     "Orientation",
+    "PupilMap",
     "RunError",
+    "Scene",
     "UsageError",
     "Wavefront",
     "__version__",
     "fringe_basis",
     "instrument_names",
     "load_instrument",
+    "load_scene",
     "observables_of",
     "open_oifits",
     "psf",
     "read_oifits",
+    "scene_image",
     "write_oifits",
 ]
 
