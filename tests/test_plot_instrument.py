@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.instrument import load_instrument
-from amibayes.plots.instrument import plot_instrument
+from amibayes.plots.instrument import instrument_picture
+from amibayes.plots.style import save
 
 
 def test_picture_shows_holes_baselines_and_image(tmp_path: Path) -> None:
     instrument = load_instrument("niriss", filter="F430M")
-    figure = plot_instrument(instrument)
+    figure = instrument_picture(instrument)
     mask, uv, image, _bar = figure.axes
     assert [len(c.get_paths()) for c in mask.collections] == [7]
     drawn = np.concatenate([line.get_xydata() for line in uv.lines if line.get_marker() != "None"])
@@ -25,5 +26,5 @@ def test_picture_shows_holes_baselines_and_image(tmp_path: Path) -> None:
     for axes in (mask, uv, image):
         assert "(" in axes.get_xlabel()
         assert "(" in axes.get_ylabel()
-    figure.savefig(tmp_path / "instrument.png")
+    save(figure, tmp_path / "instrument.png")
     assert (tmp_path / "instrument.png").stat().st_size > 10_000
