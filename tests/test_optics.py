@@ -230,9 +230,13 @@ def test_tilt_of_all_holes_and_slope_of_the_pupil_are_pointing() -> None:
     )
 
 
-def test_a_map_must_cover_the_mask() -> None:
+def test_a_wavefront_must_fit_the_mask() -> None:
     with pytest.raises(UsageError, match="does not cover the mask"):
         psf(niriss(), MONO, 8, wavefront=Wavefront(map=PupilMap(np.zeros((64, 64)), 5.0)))
+    with pytest.raises(UsageError, match="of 6 holes, mask of 7"):
+        psf(niriss(), MONO, 8, wavefront=Wavefront(piston_m=np.zeros(6)))
+    with pytest.raises(UsageError, match="tilt_rad needs one entry"):
+        Wavefront(tilt_rad=np.zeros((7, 3)))
     with pytest.raises(UsageError, match="not square"):
         PupilMap(np.zeros((3, 4)), 6.6)
 

@@ -13,10 +13,11 @@ from math import factorial
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.errors import UsageError
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.pupil import PupilMap
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, read_only
 
 ComplexArray = NDArray[np.complex128]
 
@@ -41,6 +42,14 @@ class Wavefront:
     piston_m: FloatArray | None = None
     tilt_rad: FloatArray | None = None
     map: PupilMap | None = None
+
+    def __post_init__(self) -> None:
+        for name, trailing in (("piston_m", ()), ("tilt_rad", (2,))):
+            if getattr(self, name) is None:
+                continue
+            read_only(self, name)
+            if getattr(self, name).shape[1:] != trailing:
+                raise UsageError(f"wavefront {name} needs one entry for each hole")
 
 
 def psf(
@@ -160,6 +169,9 @@ def amplitude(
     """
     fx, fy = x_rad / wavelength_m, y_rad / wavelength_m
     error = wavefront or Wavefront()
+    for given in (error.piston_m, error.tilt_rad):
+        if given is not None and len(given) != mask.n_holes:
+            raise UsageError(f"wavefront error of {len(given)} holes, mask of {mask.n_holes}")
     piston = np.zeros(mask.n_holes) if error.piston_m is None else error.piston_m
     phasor = np.exp(2j * np.pi / wavelength_m * np.asarray(piston))
     if error.map is not None:
