@@ -200,7 +200,15 @@ def _content(path: str, raw: bytes) -> OIFits:
         if end > len(raw) or (rest and b"XTENSION=".startswith(rest)):
             raise cut
         tables = tuple(_table(hdu, number) for number, hdu in enumerate(hdus[1:], 1))
-        return OIFits(path, hdus[0].header.copy(), tables, len(raw) - end)
+        return OIFits(path, _parsed(hdus[0].header), tables, len(raw) - end)
+
+
+def _parsed(header: fits.Header) -> fits.Header:
+    """A copy of which every card was read: astropy would find a damaged one only when asked."""
+    copy = header.copy()
+    for card in copy.cards:
+        _ = card.value
+    return copy
 
 
 def _table(hdu: Any, number: int) -> OITable:
@@ -218,12 +226,12 @@ def _table(hdu: Any, number: int) -> OITable:
             name,
             extver,
             number,
-            hdu.header.copy(),
+            _parsed(hdu.header),
             MappingProxyType(columns),
             MappingProxyType(units),
         )
     image = None if hdu.data is None else _native(hdu.data)
-    return OITable(name, extver, number, hdu.header.copy(), MappingProxyType({}), {}, image)
+    return OITable(name, extver, number, _parsed(hdu.header), MappingProxyType({}), {}, image)
 
 
 def _native(values: Any) -> NDArray[Any]:
