@@ -1,0 +1,21 @@
+"""Image cubes: what a detector recorded, with its errors, flags and orientation."""
+
+from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube, Orientation
+from amibayes.cube.read import CubeFile, open_cube, read_cube
+from amibayes.cube.stream import EmptyImage, FitsStream
+from amibayes.cube.write import cube_stream, write_cube
+
+__all__ = [
+    "DO_NOT_USE",
+    "JUMP",
+    "SATURATED",
+    "Cube",
+    "CubeFile",
+    "EmptyImage",
+    "FitsStream",
+    "Orientation",
+    "cube_stream",
+    "open_cube",
+    "read_cube",
+    "write_cube",
+]
