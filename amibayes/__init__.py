@@ -13,20 +13,39 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
+    from amibayes.instrument import Instrument, instrument_names, load_instrument
+    from amibayes.optics import FringeBasis, Wavefront, fringe_basis, psf
+    from amibayes.orientation import Orientation
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
     "DataError": "amibayes.errors",
+    "FringeBasis": "amibayes.optics",
+    "Instrument": "amibayes.instrument",
+    "Orientation": "amibayes.orientation",
     "RunError": "amibayes.errors",
     "UsageError": "amibayes.errors",
+    "Wavefront": "amibayes.optics",
+    "fringe_basis": "amibayes.optics",
+    "instrument_names": "amibayes.instrument",
+    "load_instrument": "amibayes.instrument",
+    "psf": "amibayes.optics",
 }
 
 __all__ = [
     "AmibayesError",
     "DataError",
+    "FringeBasis",
+    "Instrument",
+    "Orientation",
     "RunError",
     "UsageError",
+    "Wavefront",
     "__version__",
+    "fringe_basis",
+    "instrument_names",
+    "load_instrument",
+    "psf",
 ]
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,6 +14,14 @@ MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 
 DEGREE = np.pi / 180.0
 """One degree in radians."""
+
+
+def read_only(container: Any, *names: str) -> None:
+    """Replace array fields of a frozen dataclass by read-only float arrays (copies)."""
+    for name in names:
+        array = np.array(getattr(container, name), dtype=float)
+        array.flags.writeable = False
+        object.__setattr__(container, name, array)
 
 
 def contrast_to_delta_mag(contrast: ArrayLike) -> FloatArray:

@@ -12,9 +12,12 @@ PACKAGE = Path(__file__).resolve().parent.parent / "amibayes"
 LAYERS = [
     "__init__",
     "units",
+    "orientation",
     "errors",
     "files",
     "parallel",
+    "settings",
+    "spectrum",
     "instrument",
     "scene",
     "optics",

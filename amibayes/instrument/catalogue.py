@@ -1,0 +1,213 @@
+"""Instruments by name, or from a user's own TOML file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from astropy import constants
+
+from amibayes.errors import DataError, UsageError
+from amibayes.instrument.bandpass import Bandpass
+from amibayes.instrument.mask import SHAPES, Mask
+from amibayes.settings import Section, read_toml
+from amibayes.spectrum import Spectrum
+from amibayes.units import DEGREE, MAS, FloatArray
+
+_JANSKY = 1e-26
+_PLANCK = float(constants.h.value)
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """A mask, a filter and a detector's pixel scale.
+
+    Parameters
+    ----------
+    name : str
+        What it is called.
+    mask : Mask
+        The aperture mask.
+    bandpass : Bandpass
+        The filter in use.
+    pixel_scale_rad : float
+        Angle of a pixel, radians.
+    n_pixels : int
+        Side of the usual subarray.
+    """
+
+    name: str
+    mask: Mask
+    bandpass: Bandpass
+    pixel_scale_rad: float
+    n_pixels: int = 80
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.pixel_scale_rad < 1.0:
+            raise DataError(f"instrument {self.name} has a pixel of {self.pixel_scale_rad:g} rad")
+
+    @property
+    def resolution_rad(self) -> float:
+        """λ/2B of the longest baseline at the pivot wavelength, radians."""
+        return 0.5 * self.bandpass.pivot_m / self.mask.longest_m
+
+    @property
+    def field_rad(self) -> float:
+        """λ/B of the shortest baseline, the widest separation free of ambiguity, radians."""
+        return self.bandpass.pivot_m / self.mask.shortest_m
+
+    def splodges_px(self, n_pixels: int) -> FloatArray:
+        """Place of each baseline's splodge in the Fourier transform of an image.
+
+        Returns
+        -------
+        (n_baselines, 2) array
+            Offsets (x, y) from zero frequency, in cells of an ``n_pixels``-wide transform.
+        """
+        cell = self.pixel_scale_rad * n_pixels / self.bandpass.pivot_m
+        return np.asarray(self.mask.uv_m * cell)
+
+    def count_rate(
+        self, spectrum: Spectrum, magnitude: float, reference: Bandpass | None = None
+    ) -> float:
+        """Electrons per second of a star through all holes.
+
+        Parameters
+        ----------
+        spectrum : Spectrum
+            Shape of the star's spectrum.
+        magnitude : float
+            Vega magnitude in the filter ``reference``.
+        reference : Bandpass, optional
+            Filter in which the magnitude is; this instrument's own unless given.
+
+        Raises
+        ------
+        UsageError
+            Where the reference filter has no zero point.
+        """
+        band = reference or self.bandpass
+        if band.vega_flux_jy is None:
+            raise UsageError(
+                f"filter {band.name} of {self.name} has no zero point",
+                remedy="give 'vega_flux_jy' in the instrument's TOML, or a count rate",
+            )
+        vega = band.vega_flux_jy * _JANSKY / _PLANCK * band.photon_integral(_FlatInFrequency())
+        colour = self.bandpass.photon_integral(spectrum) / band.photon_integral(spectrum)
+        return float(self.mask.area_m2 * 10.0 ** (-0.4 * magnitude) * vega * colour)
+
+    def with_mask(self, mask: Mask) -> Instrument:
+        """Return the same instrument behind another mask."""
+        return replace(self, mask=mask)
+
+
+@dataclass(frozen=True, eq=False)
+class _FlatInFrequency:
+    """Constant F_ν: 1/λ photons per unit of wavelength."""
+
+    name: str = "flat in frequency"
+
+    def photon_density(self, wavelength_m: FloatArray) -> FloatArray:
+        return np.asarray(1.0 / wavelength_m)
+
+
+def instrument_names() -> list[str]:
+    """Names of the instruments that come with the package."""
+    folder = resources.files("amibayes.instrument") / "data"
+    return sorted(Path(entry.name).stem for entry in folder.iterdir() if ".toml" in entry.name)
+
+
+def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
+    """Load an instrument that comes with the package, or from a TOML file.
+
+    Parameters
+    ----------
+    name : str or path
+        ``"niriss"``, ``"sphere"``, ``"gpi"``, ``"visir"``, or the path of a TOML file
+        (the files in ``amibayes/instrument/data`` are examples).
+    filter : str, optional
+        Name of the filter; may be left out where the instrument has only one.
+
+    Raises
+    ------
+    UsageError
+        Where no such instrument is known, or the filter is not among its own.
+    DataError
+        Where the file is wrong: it names the key and the fault.
+    """
+    top = read_toml(_path(name))
+    filters = top.section("filters")
+    chosen = _choose(filters, filter)
+    instrument = Instrument(
+        name=top.text("name"),
+        mask=_mask(top.section("mask")),
+        bandpass=_bandpass(chosen, filters.section(chosen)),
+        pixel_scale_rad=top.number("pixel_scale_mas", above=0.0) * MAS,
+        n_pixels=int(top.number("n_pixels", 80, at_least=2)),
+    )
+    top.refuse_unknown(("source", "note"))
+    return instrument
+
+
+def _path(name: str | Path) -> Path:
+    text = str(name)
+    if text.lower() in instrument_names():
+        return Path(str(resources.files("amibayes.instrument") / "data" / f"{text.lower()}.toml"))
+    if Path(text).suffix != ".toml" and not Path(text).exists():
+        known = ", ".join(instrument_names())
+        raise UsageError(
+            f"instrument '{text}' is not known", remedy=f"choose from {known}, or give a TOML file"
+        )
+    return Path(text)
+
+
+def _choose(filters: Section, wanted: str | None) -> str:
+    names = filters.keys()
+    if not names:
+        raise DataError("holds no filter", source=filters.source, remedy="add [filters.NAME]")
+    if wanted is None and len(names) == 1:
+        return names[0]
+    match = [name for name in names if wanted is not None and name.lower() == wanted.lower()]
+    if not match:
+        what = "needs a filter" if wanted is None else f"has no filter '{wanted}'"
+        raise UsageError(what, source=filters.source, remedy=f"choose from {', '.join(names)}")
+    return match[0]
+
+
+def _mask(section: Section) -> Mask:
+    scale = section.number("scale", 1.0, above=0.0)
+    arguments = {
+        "name": section.text("name"),
+        "holes_m": scale * section.numbers("holes_m", columns=2),
+        "shape": section.text("shape", choices=SHAPES),
+        "size_m": scale * section.number("size_m", above=0.0),
+        "orientation_rad": section.number("orientation_deg", 0.0) * DEGREE,
+    }
+    section.refuse_unknown(("source", "note"))
+    return _build(Mask, section, arguments)
+
+
+def _bandpass(name: str, section: Section) -> Bandpass:
+    vega = section.number("vega_flux_jy", above=0.0) if "vega_flux_jy" in section else None
+    arguments = {
+        "name": name,
+        "wavelength_m": 1e-6 * section.numbers("wavelength_um"),
+        "throughput": section.numbers("throughput"),
+        "vega_flux_jy": vega,
+    }
+    section.refuse_unknown(("source", "note"))
+    return _build(Bandpass, section, arguments)
+
+
+_Container = TypeVar("_Container")
+
+
+def _build(kind: type[_Container], section: Section, arguments: dict[str, Any]) -> _Container:
+    """Make the container; a fault that it finds is one of the file."""
+    try:
+        return kind(**arguments)
+    except DataError as error:
+        raise DataError(f"table [{section.name}]: {error.what}", source=section.source) from None
