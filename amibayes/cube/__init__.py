@@ -1,6 +1,6 @@
 """Image cubes: what a detector recorded, with its errors, flags and orientation."""
 
-from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube, Orientation
+from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube
 from amibayes.cube.read import CubeFile, open_cube, read_cube
 from amibayes.cube.stream import EmptyImage, FitsStream
 from amibayes.cube.write import cube_stream, write_cube
@@ -13,7 +13,6 @@ __all__ = [
     "CubeFile",
     "EmptyImage",
     "FitsStream",
-    "Orientation",
     "cube_stream",
     "open_cube",
     "read_cube",

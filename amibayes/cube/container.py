@@ -1,17 +1,18 @@
-"""The containers: a cube of images and how its pixels lie on the sky."""
+"""The container: images of one exposure, with what is known of every pixel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from amibayes.errors import DataError
-from amibayes.units import DEGREE, FloatArray
+from amibayes.orientation import Orientation
+from amibayes.units import FloatArray
 
 DO_NOT_USE = 1
 """Flag of a pixel that is not to be used (JWST data quality, bit 0)."""
@@ -21,45 +22,6 @@ SATURATED = 2
 
 JUMP = 4
 """Flag of a pixel whose ramp was cut at a cosmic ray (bit 2)."""
-
-
-@dataclass(frozen=True)
-class Orientation:
-    """How the image's axes lie on the sky.
-
-    Parameters
-    ----------
-    position_angle_rad : float
-        Position angle of the image's +y axis, east of north.
-    parity : int
-        −1 where +x is 90° west of +y (north up, east left; JWST's ``VPARITY``), +1 where
-        the image is mirrored.
-
-    Notes
-    -----
-    For a JWST image the angle is ``ROLL_REF`` + ``V3I_YANG``, the relation of the science
-    instrument aperture file (SIAF) between its ideal frame and V2, V3.
-    """
-
-    position_angle_rad: float = 0.0
-    parity: int = -1
-
-    def to_sky(self, x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(east, north) of an image offset (x, y), in the unit of its arguments."""
-        sideways = self.parity * np.asarray(x, dtype=float)
-        up = np.asarray(y, dtype=float)
-        c, s = np.cos(self.position_angle_rad), np.sin(self.position_angle_rad)
-        return np.asarray(up * s + sideways * c), np.asarray(up * c - sideways * s)
-
-    def to_image(self, east: ArrayLike, north: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """(x, y) of a sky offset (east, north), in the unit of its arguments."""
-        e, n = np.asarray(east, dtype=float), np.asarray(north, dtype=float)
-        c, s = np.cos(self.position_angle_rad), np.sin(self.position_angle_rad)
-        return np.asarray(self.parity * (e * c - n * s)), np.asarray(e * s + n * c)
-
-    def rolled(self, angle_rad: float) -> Orientation:
-        """Turn the telescope by ``angle_rad`` (east of north)."""
-        return replace(self, position_angle_rad=self.position_angle_rad + angle_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +117,3 @@ class Cube:
     def variance(self) -> FloatArray | None:
         """(n_int, ny, nx): square of the error, where there is one."""
         return None if self.error is None else self.error**2
-
-
-def orientation_from_degrees(position_angle_deg: float, parity: int = -1) -> Orientation:
-    """Make an orientation from the position angle of +y in degrees."""
-    return Orientation(position_angle_deg * DEGREE, parity)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from amibayes.cube.container import Orientation
 from amibayes.errors import DataError
+from amibayes.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
 Header = Mapping[str, Any]

@@ -17,9 +17,11 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
-from amibayes.cube.container import Cube, orientation_from_degrees
+from amibayes.cube.container import Cube
 from amibayes.errors import DataError
-from amibayes.units import FloatArray
+from amibayes.instrument import instrument_names, load_instrument
+from amibayes.orientation import Orientation
+from amibayes.units import DEGREE, FloatArray
 
 
 @dataclass(frozen=True)
@@ -217,25 +219,35 @@ def _merged(hdus: Any, science: Any) -> dict[str, Any]:
 def _template(header: dict[str, Any], science: Any, given: dict[str, Any], source: str) -> Cube:
     angle = given["position_angle_deg"]
     orientation = keys.orientation_of(header, source)
+    if angle is not None:
+        orientation = Orientation(angle * DEGREE, orientation.parity)
     scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source)
     instrument = given["instrument"] or keys.text(header, "INSTRUME")
     filter_ = given["filter"] or keys.text(header, "FILTER")
     for value, option in ((instrument, "instrument"), (filter_, "filter")):
         if value is None:
             raise DataError(f"does not say its {option}", source=source, remedy=f"give --{option}")
-    if scale is None:
-        raise DataError("does not say its pixel scale", source=source, remedy="give --pixel-scale")
+    scale = scale or _usual_pixel_scale(str(instrument), str(filter_), source)
     return Cube(
         images=np.empty((0, *science.shape[-2:])),
         pixel_scale_rad=scale,
         instrument=str(instrument),
         filter=str(filter_),
-        orientation=orientation if angle is None else orientation_from_degrees(angle),
+        orientation=orientation
+        if angle is None
+        else Orientation(angle * DEGREE, orientation.parity),
         unit=keys.unit_of(header),
         integration_time_s=keys.integration_time_of(header, source),
         header=MappingProxyType(header),
         source=source,
     )
+
+
+def _usual_pixel_scale(instrument: str, filter: str, source: str) -> float:
+    """Side of a pixel of an instrument that the package knows."""
+    if instrument.lower() in instrument_names() or instrument.endswith(".toml"):
+        return load_instrument(instrument, filter).pixel_scale_rad
+    raise DataError("does not say its pixel scale", source=source, remedy="give --pixel-scale")
 
 
 def _mid_times(hdus: Any, n: int, source: str) -> FloatArray | None:

@@ -127,4 +127,5 @@ def _count_good(
         return None
     if n_good is None:
         n_good = np.full(charge.shape, read, np.int16)
-    return np.add(n_good, below & (n_good == read), dtype=np.int16)
+    n_good[below & (n_good == read)] += 1
+    return n_good
