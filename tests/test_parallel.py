@@ -22,6 +22,7 @@ from amibayes.parallel import (
     Journal,
     ProcessExecutor,
     SerialExecutor,
+    child_seeds,
     digest,
     open_executor,
     progress_bar,
@@ -248,6 +249,13 @@ def test_seeds_depend_on_the_parent_seed_only() -> None:
     assert [s.generate_state(2).tolist() for s in first] == [
         s.generate_state(2).tolist() for s in again
     ]
+
+
+def test_children_of_a_seed_are_always_the_same() -> None:
+    seed = np.random.SeedSequence(4)
+    twice = [[c.generate_state(2).tolist() for c in child_seeds(seed, 3)] for _ in range(2)]
+    assert twice[0] == twice[1]
+    assert twice[0] == [c.generate_state(2).tolist() for c in seed.spawn(3)]
 
 
 def test_slices_cover_everything_once() -> None:

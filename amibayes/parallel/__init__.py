@@ -6,7 +6,15 @@ the same to the last bit for any number of workers, and after any interruption.
 """
 
 from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
-from amibayes.parallel.job import Executor, SerialExecutor, open_executor, run_job, slices, spawn
+from amibayes.parallel.job import (
+    Executor,
+    SerialExecutor,
+    child_seeds,
+    open_executor,
+    run_job,
+    slices,
+    spawn,
+)
 from amibayes.parallel.journal import Journal, digest
 from amibayes.parallel.processes import ProcessExecutor
 from amibayes.parallel.progress import Progress, progress_bar
@@ -19,6 +27,7 @@ __all__ = [
     "ProcessExecutor",
     "Progress",
     "SerialExecutor",
+    "child_seeds",
     "digest",
     "open_executor",
     "progress_bar",

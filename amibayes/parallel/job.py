@@ -148,3 +148,17 @@ def spawn(rng: np.random.Generator, n: int) -> list[np.random.SeedSequence]:
     if not isinstance(parent, np.random.SeedSequence):
         raise TypeError("rng was not made from a SeedSequence (use numpy.random.default_rng)")
     return parent.spawn(n)
+
+
+def child_seeds(seed: np.random.SeedSequence, n: int) -> list[np.random.SeedSequence]:
+    """Give the first ``n`` children of a seed, the same ones however often asked.
+
+    ``SeedSequence.spawn`` counts its children and never gives one twice, so that a job
+    run again with the same seed would differ.
+    """
+    return [
+        np.random.SeedSequence(
+            seed.entropy, spawn_key=(*seed.spawn_key, k), pool_size=seed.pool_size
+        )
+        for k in range(n)
+    ]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.errors import UsageError
-from amibayes.parallel import Executor, Progress, run_job, slices
+from amibayes.parallel import Executor, Progress, child_seeds, run_job, slices
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.pointing import ShiftTable
 from amibayes.simulation.ramps import read_ramps
@@ -95,7 +95,7 @@ class Pointings:
 
 def draw_pointings(exposure: Exposure, pixel_rad: float, seed: np.random.SeedSequence) -> Pointings:
     """Draw dither and jitter, each from a stream of its own."""
-    of_dither, of_jitter = (np.random.default_rng(child) for child in seed.spawn(2))
+    of_dither, of_jitter = (np.random.default_rng(child) for child in child_seeds(seed, 2))
     return Pointings(
         exposure.dither_rad / pixel_rad * of_dither.standard_normal(2),
         exposure.jitter_rad / pixel_rad * of_jitter.standard_normal((exposure.n_integrations, 2)),
@@ -208,7 +208,8 @@ def record(
     parts = slices(recorder.exposure.n_integrations, PIECE)
     offsets = pointings.offsets_px
     pieces = [
-        (offsets[part], child) for part, child in zip(parts, seed.spawn(len(parts)), strict=True)
+        (offsets[part], child)
+        for part, child in zip(parts, child_seeds(seed, len(parts)), strict=True)
     ]
     results = run_job(recorder, pieces, executor, progress=progress)
     for part, result in zip(parts, results, strict=True):
