@@ -9,8 +9,8 @@ whitening is folded into one sparse matrix before any position is looked at.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,20 @@ from scipy.sparse import csr_array
 
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import disc
+from amibayes.inference.samples import Samples
 from amibayes.units import MAS, FloatArray
 
 IntArray = NDArray[np.intp]
 
 DENSE_ENOUGH = 0.15
 """Share of non-zeros above which a dense product is the faster one."""
+
+
+WIDTH = 128
+"""Most positions that are worked on at once: what fits a processor's cache."""
+
+NUDGE = 1e-7
+"""Radians; keeps sin(x)/x away from 0/0 at a relative cost below 1e-8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,54 +116,15 @@ class TemplateBank:
         self.n_data = likelihood.n_independent
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
-        self._real, self._imaginary, self._offset = _linear_response(likelihood, nuisance)
-        self.nuisance_basis = _nuisance_basis(likelihood, nuisance)
+        self._even, self._odd, self._offset = _linear_response(likelihood, nuisance)
+        self._basis = _nuisance_basis(likelihood, nuisance)
 
     def __len__(self) -> int:
         return len(self.grid)
 
-    def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield positions (m,) and their templates (n_data, m), all of the grid once."""
-        half = len(self.grid) // 2
-        n = self.grid.half_width
-        axis = np.linspace(-n, n, 2 * n + 1) * self.grid.step_mas
-        east = _Phase(self._samples.u, self._samples.relative_band, axis)
-        north = _Phase(self._samples.v, self._samples.relative_band, axis)
-        rows, columns = self.grid.rows[:half], self.grid.columns[:half] + self.grid.half_width
-        cuts = np.flatnonzero(np.diff(rows)) + 1
-        for index in np.split(np.arange(half), cuts) if half else []:
-            row = rows[index[:1]] + self.grid.half_width
-            cosine, sine = self._waves(east, _span(columns[index]), north, _span(row))
-            even = self._real @ cosine - self._offset[:, None]
-            odd = self._imaginary @ sine
-            both = np.concatenate([even + odd, even - odd], axis=1)
-            yield np.concatenate([index, index + half]), self._project(both)
-
-    def _waves(
-        self, east: _Phase, columns: slice | IntArray, north: _Phase, row: slice | IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Cosine and sine of 2π(uα + vδ), damped by the channel's width, (n_samples, m)."""
-        ca, sa = east.cosine[:, columns], east.sine[:, columns]
-        cb, sb = north.cosine[:, row], north.sine[:, row]
-        if self._smearing:
-            damping = _damping(east, columns, north, row)
-            ca, sa = ca * damping, sa * damping
-        return ca * cb - sa * sb, sa * cb + ca * sb
-
-    def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
-        """Templates (n_data, m) at any positions, on the lattice or off it."""
-        turns = np.outer(self._samples.u, east_mas) + np.outer(self._samples.v, north_mas)
-        angle = 2.0 * np.pi * MAS * turns
-        cosine, sine = np.cos(angle), np.sin(angle)
-        if self._smearing:
-            damping = np.sinc(0.5 * self._samples.relative_band[:, None] * angle / np.pi)
-            cosine, sine = cosine * damping, sine * damping
-        even = self._real @ cosine - self._offset[:, None]
-        return self._project(even + self._imaginary @ sine)
-
-    def _project(self, templates: FloatArray) -> FloatArray:
-        basis = self.nuisance_basis
-        return templates - basis @ (basis.T @ templates) if basis.size else templates
+    def project(self, data: FloatArray) -> FloatArray:
+        """Take the nuisance directions out of whitened data (n_data, …)."""
+        return data - self._basis @ (self._basis.T @ data) if self._basis.size else data
 
     def scan(self, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Best contrast and its error at every position, from whitened residuals (n_data,).
@@ -163,75 +132,203 @@ class TemplateBank:
         Returns
         -------
         contrast, sigma : (n_positions,) float array
-            t·r/t·t and 1/√(t·t).
+            t·r/t·t and 1/√(t·t), t the template without its nuisance part.
         """
-        projected = self._project(residuals[:, None])[:, 0]
+        data = self.project(residuals)
         match, norm = np.empty(len(self)), np.empty(len(self))
-        for index, templates in self.chunks():
-            norm[index] = np.einsum("dm,dm->m", templates, templates)
-            match[index] = projected @ templates
+        for index, even, odd in self._halves():
+            match[index] = _both(data[self._even.rows] @ even, data[self._odd.rows] @ odd)
+            norm[index] = self._norm(even, odd)
         return match / norm, 1.0 / np.sqrt(norm)
 
+    def largest_gain(self, data: NDArray[np.float32]) -> FloatArray:
+        """Largest gain in χ² over the bank, for positive contrast, of many data sets.
 
-class _Phase:
-    """Phase factors along one axis of the lattice, (n_samples, n_axis) each."""
+        Parameters
+        ----------
+        data : (n_data, n) float32 array
+            Whitened, nuisance directions taken out.
 
-    def __init__(self, frequency: FloatArray, relative_band: FloatArray, axis: FloatArray) -> None:
-        angle = 2.0 * np.pi * MAS * np.outer(frequency, axis)
-        self.half = 0.5 * relative_band[:, None] * angle
-        self.cosine, self.sine = np.cos(angle), np.sin(angle)
-        self.half_cosine, self.half_sine = np.cos(self.half), np.sin(self.half)
+        Returns
+        -------
+        (n,) float array
+        """
+        best = np.zeros(data.shape[1], dtype=np.float32)
+        data_even = np.ascontiguousarray(data[self._even.rows].T)
+        data_odd = np.ascontiguousarray(data[self._odd.rows].T)
+        for index, even, odd in self._halves():
+            scale = (1.0 / np.sqrt(self._norm(even, odd))).astype(np.float32)
+            here, there = scale[: len(index) // 2], scale[len(index) // 2 :]
+            shared = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
+            np.maximum(best, ((shared[0] + shared[1]) * here).max(axis=1), out=best)
+            np.maximum(best, ((shared[0] - shared[1]) * there).max(axis=1), out=best)
+        return np.asarray(best, dtype=float) ** 2
+
+    def matched_filter(self, residuals: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
+        """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
+
+        Contrasts below zero gain nothing.
+        """
+        data = self.project(residuals)
+        u, v = 2.0 * np.pi * MAS * self._samples.u, 2.0 * np.pi * MAS * self._samples.v
+        half = 0.5 * self._samples.relative_band * self._smearing / np.pi
+        data_even, data_odd = data[self._even.rows], data[self._odd.rows]
+
+        def best(position: FloatArray) -> tuple[float, float]:
+            angle = u * position[0] + v * position[1]
+            damping = np.sinc(half * angle)
+            even = self._even.matrix @ (np.cos(angle) * damping) - self._offset
+            odd = self._odd.matrix @ (np.sin(angle) * damping)
+            match = float(data_even @ even + data_odd @ odd)
+            norm = float(self._norm(even[:, None], odd[:, None])[0])
+            return match / norm, max(match, 0.0) ** 2 / norm
+
+        return best
+
+    def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
+        for index, even, odd in self._halves():
+            templates = np.zeros((self.n_data, len(index)))
+            templates[self._even.rows] = np.hstack([even, even])
+            templates[self._odd.rows] += np.hstack([odd, -odd])
+            yield index, self.project(templates) / np.sqrt(self._norm(even, odd))
+
+    def _halves(self) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Yield positions and their mirror images (2m,) with the parts that they share.
+
+        The template is even + odd at a position and even − odd opposite the star; only the
+        data that a part touches are kept, (n_rows, m).
+        """
+        half = len(self.grid) // 2
+        n = self.grid.half_width
+        axis = np.linspace(-n, n, 2 * n + 1) * self.grid.step_mas
+        waves = _Waves(self._samples, axis, self._smearing)
+        columns, rows = self.grid.columns[:half] + n, self.grid.rows[:half] + n
+        breaks = (np.diff(rows) != 0) | (np.diff(columns) != 1) | (columns[1:] % WIDTH == 0)
+        for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
+            span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
+            cosine, sine = waves(span, int(rows[index[0]]))
+            even = self._even.matrix @ cosine - self._offset[:, None]
+            yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
+
+    def _norm(self, even: FloatArray, odd: FloatArray) -> FloatArray:
+        """t·t at positions and their mirror images, (2m,), without the nuisance part."""
+        norm = np.einsum("dm,dm->m", even, even) + np.einsum("dm,dm->m", odd, odd)
+        common, i, j = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
+        cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(common) else 0.0 * norm
+        both = _both(norm, cross)
+        if self._basis.size:
+            along = _both(
+                self._basis[self._even.rows].T @ even, self._basis[self._odd.rows].T @ odd
+            )
+            both -= (along**2).sum(axis=0)
+        return both
 
 
-def _span(places: IntArray) -> slice | IntArray:
-    """A slice where the places are neighbours (no copy), the places themselves elsewhere."""
-    first, last = int(places[0]), int(places[-1])
-    return slice(first, last + 1) if last - first + 1 == len(places) else places
+class _Waves:
+    """Cosine and sine of 2π(uα + vδ) over rows of the lattice, damped by the channel's width.
+
+    Sums of angles become products of factors made once per axis. The half angles are moved
+    off zero by `NUDGE`, so that sin(x)/x needs no special case.
+    """
+
+    def __init__(self, samples: Samples, axis: FloatArray, smearing: bool) -> None:
+        self._smearing = smearing
+        angles = [2.0 * np.pi * MAS * np.outer(f, axis) for f in (samples.u, samples.v)]
+        self._east, self._north = [(np.cos(a), np.sin(a)) for a in angles]
+        half = [0.5 * samples.relative_band[:, None] * a for a in angles]
+        half[1] += NUDGE
+        self._half_east, self._half_north = [(h, np.cos(h), np.sin(h)) for h in half]
+        self._work = np.empty((4, len(samples) * min(WIDTH, len(axis))))
+
+    def __call__(self, columns: slice, row: int) -> tuple[FloatArray, FloatArray]:
+        width = columns.stop - columns.start
+        shape = (4, len(self._half_east[0]), width)
+        cosine, sine, damping, spare = self._work[:, : shape[1] * width].reshape(shape)
+        (ca, sa), (cb, sb) = self._east, self._north
+        _cosine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], cosine, spare)
+        _sine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], sine, spare)
+        if self._smearing:
+            (xa, ca, sa), (xb, cb, sb) = self._half_east, self._half_north
+            _sine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], damping, spare)
+            np.add(xa[:, columns], xb[:, [row]], out=spare)
+            damping /= spare
+            cosine *= damping
+            sine *= damping
+        return cosine, sine
 
 
-def _damping(
-    east: _Phase, columns: slice | IntArray, north: _Phase, row: slice | IntArray
-) -> FloatArray:
-    """sin(x)/x of half the phase change across the channel."""
-    x = east.half[:, columns] + north.half[:, row]
-    sine = east.half_sine[:, columns] * north.half_cosine[:, row]
-    sine += east.half_cosine[:, columns] * north.half_sine[:, row]
-    return np.asarray(np.divide(sine, x, out=np.ones_like(x), where=np.abs(x) > 1e-6))
+def _cosine_of_sum(
+    ca: FloatArray,
+    sa: FloatArray,
+    cb: FloatArray,
+    sb: FloatArray,
+    out: FloatArray,
+    spare: FloatArray,
+) -> None:
+    np.multiply(ca, cb, out=out)
+    np.multiply(sa, sb, out=spare)
+    out -= spare
+
+
+def _sine_of_sum(
+    ca: FloatArray,
+    sa: FloatArray,
+    cb: FloatArray,
+    sb: FloatArray,
+    out: FloatArray,
+    spare: FloatArray,
+) -> None:
+    np.multiply(sa, cb, out=out)
+    np.multiply(ca, sb, out=spare)
+    out += spare
+
+
+def _both(even: FloatArray, odd: FloatArray) -> FloatArray:
+    """Values at positions and at their mirror images, one after the other."""
+    return np.concatenate([even + odd, even - odd], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A matrix (n_rows, n_samples) and the data that its rows stand for."""
+
+    matrix: csr_array | FloatArray
+    rows: IntArray
+
+
+def _part(matrix: csr_array) -> _Part:
+    matrix = csr_array(matrix)
+    matrix.eliminate_zeros()
+    rows = np.flatnonzero(np.diff(matrix.indptr))
+    kept = matrix[rows]
+    dense = kept.nnz > DENSE_ENOUGH * kept.shape[0] * kept.shape[1]
+    return _Part(kept.toarray() if dense else kept, rows)
 
 
 def _linear_response(
     likelihood: Likelihood, nuisance: FloatArray
-) -> tuple[csr_array | FloatArray, csr_array | FloatArray, FloatArray]:
-    """Matrices A, B and offset a with template = A·Re(E) + B·Im(−E) − a.
+) -> tuple[_Part, _Part, FloatArray]:
+    """Matrices A, B and offset a with template = (A·Re(E) − a) + B·Im(−E).
 
     With V₀ = D/(1 + f) real, dV/dc = (E − V₀)/(1 + f), hence dV² = 2V₀ Re dV and
     dφ = Im dV / V₀.
     """
-    single = likelihood.model.__class__(
-        0, likelihood.model.diameter_mas, likelihood.model.background, likelihood.model.smearing
-    )
-    _, diameter, background = single.split(np.atleast_2d(nuisance))
+    model = replace(likelihood.model, companions=0)
+    _, diameter, background = model.split(np.atleast_2d(nuisance))
     scale = 1.0 / (1.0 + float(background[0]))
     primary = disc(likelihood.samples, diameter)[:, 0] * scale
     whitening = likelihood.observables.covariance.whitening
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
-    real = by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary)
-    imaginary = by_closure @ likelihood.samples.legs.multiply(-scale / primary)
-    offset = np.asarray(real @ primary)
-    return _fastest(real), _fastest(imaginary), offset
-
-
-def _fastest(matrix: csr_array) -> csr_array | FloatArray:
-    matrix = csr_array(matrix)
-    dense = matrix.nnz > DENSE_ENOUGH * matrix.shape[0] * matrix.shape[1]
-    return matrix.toarray() if dense else matrix
+    even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary))
+    odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale / primary))
+    return even, odd, np.asarray(even.matrix @ primary)
 
 
 def _nuisance_basis(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:
     """Orthonormal directions (n_data, k) in which the nuisance parameters move the data."""
-    model = likelihood.model
-    single = model.__class__(0, model.diameter_mas, model.background, model.smearing)
+    single = replace(likelihood.model, companions=0)
     if not single.parameters:
         return np.empty((likelihood.n_independent, 0))
     return np.asarray(np.linalg.qr(likelihood.with_model(single).jacobian(nuisance))[0])

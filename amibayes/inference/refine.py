@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import nlopt
 import numpy as np
 
+from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.results import Mode
 from amibayes.units import MAS, FloatArray
@@ -20,7 +21,7 @@ MAX_BACKGROUND = 10.0
 MAX_CONTRAST = 1.0
 """A companion brighter than its primary is the same binary seen from the other star."""
 
-GLOBAL_EVALUATIONS = 1000
+GLOBAL_EVALUATIONS = 3000
 
 CONVERGED = 1e-9
 """Relative change of χ² at which a local fit stops."""
@@ -74,40 +75,34 @@ def refine(likelihood: Likelihood, seed: FloatArray, box: Box, chi2_single: floa
     return Mode(tuple(float(x) for x in theta), chi2_single - chi2)
 
 
-def global_check(likelihood: Likelihood, box: Box, single: FloatArray, chi2_single: float) -> Mode:
+def global_check(
+    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, chi2_single: float
+) -> Mode:
     """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
 
-    At each trial position the contrast and the nuisance parameters are the best linear
-    ones and χ² is that of the full model; it shares neither the lattice, nor the
-    templates, nor the choice of peaks with the search.
+    It shares neither the lattice nor the choice of peaks with the search. A field of very
+    many fringes is more than it can cover; what it finds is a lower bound then.
     """
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    best_at = bank.matched_filter(residuals)
 
-    def theta_at(position: FloatArray) -> FloatArray:
-        start = np.concatenate([position, [0.0], single])
-        step = np.linalg.lstsq(likelihood.jacobian(start)[:, 2:], residuals, rcond=None)[0]
-        start[2:] += step
-        return np.asarray(np.clip(start, low, high))
+    def inside(position: FloatArray) -> bool:
+        return box.inner_mas <= float(np.hypot(*position)) <= box.outer_mas
 
-    def chi2_at(position: FloatArray, _: FloatArray) -> float:
-        if not box.inner_mas <= float(np.hypot(*position)) <= box.outer_mas:
-            return chi2_single
-        return float(likelihood.chi2(theta_at(position))[0])
+    def loss(position: FloatArray, _: FloatArray) -> float:
+        return -best_at(position)[1] if inside(position) else 0.0
 
-    low, high = np.array(
-        [(-np.inf, np.inf)] * 2 + [(0.0, MAX_CONTRAST), *nuisance_bounds(likelihood)]
-    ).T
     optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
     optimiser.set_lower_bounds([-box.outer_mas] * 2)
     # The box is a little lopsided so that its first trial is not the star itself.
     optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
-    optimiser.set_min_objective(chi2_at)
+    optimiser.set_min_objective(loss)
     optimiser.set_maxeval(GLOBAL_EVALUATIONS)
     start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
     position = np.asarray(optimiser.optimize(start))
-    if not box.inner_mas <= float(np.hypot(*position)) <= box.outer_mas:
-        position = start
-    return refine(likelihood, theta_at(position), box, chi2_single)
+    position = position if inside(position) else start
+    contrast = np.clip(best_at(position)[0], 0.0, MAX_CONTRAST)
+    return refine(likelihood, np.concatenate([position, [contrast], single]), box, chi2_single)
 
 
 def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:

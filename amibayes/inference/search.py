@@ -96,7 +96,7 @@ def search(
     box = Box(inner, outer, fringe, float(np.median(sigma)))
     seeds = _seeds(likelihood, grid, contrast, sigma, single, box)
     found = [refine(likelihood, theta, box, chi2_single) for theta in seeds]
-    check = global_check(likelihood, box, single, chi2_single)
+    check = global_check(likelihood, bank, box, single, chi2_single)
     modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
     theta = np.array(modes[0].theta)
     covariance = likelihood.errors(theta)

@@ -2,5 +2,6 @@
 
 from amibayes.oifits.reader import observables_of, read_oifits
 from amibayes.oifits.tables import OIFits, OITable, open_oifits
+from amibayes.oifits.writer import write_oifits
 
-__all__ = ["OIFits", "OITable", "observables_of", "open_oifits", "read_oifits"]
+__all__ = ["OIFits", "OITable", "observables_of", "open_oifits", "read_oifits", "write_oifits"]

@@ -190,9 +190,9 @@ def _chosen_target(
 def _parts(
     oifits: OIFits, tables: list[OITable], names: dict[int, str], target: Target
 ) -> tuple[tuple[Setup, ...], list[_Part]]:
-    setups: dict[tuple[int, int], Setup] = {}
+    setups: dict[tuple[int, int, int], Setup] = {}
     rows_so_far: dict[tuple[int, int], int] = {}
-    parts = []
+    parts: list[_Part] = []
     for table in tables:
         ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
         chosen = np.flatnonzero([same(names[int(i)], target.name) for i in ids])
@@ -201,7 +201,8 @@ def _parts(
         wavelengths = wavelength_table(oifits, table, channel_count(oifits, table))
         array = array_table(oifits, table)
         stations = stations_of(oifits, array, _stations_in_use(oifits, tables, array))
-        key = (wavelengths.number, 0 if array is None else array.number)
+        own = table.header.get(f"{OWN_KEY} SETUP", 0)
+        key = (wavelengths.number, 0 if array is None else array.number, own)
         if key not in setups:
             setups[key] = make_setup(oifits, wavelengths, array, stations, target)
         setup = setups[key]
@@ -209,10 +210,10 @@ def _parts(
         rows = read_rows(
             oifits, table, chosen, stations.position(index), (setup.wavelength_m, setup.band_m)
         )
-        k = 1 + (table.name == "OI_T3")
-        first = rows_so_far.get((list(setups).index(key), k), 0)
-        rows_so_far[list(setups).index(key), k] = first + len(chosen)
-        parts.append(_Part(k, _numbered(rows, list(setups).index(key), first, table)))
+        number, k = list(setups).index(key), 1 + (table.name == "OI_T3")
+        first = rows_so_far.get((number, k), 0)
+        rows_so_far[number, k] = first + len(chosen)
+        parts.append(_Part(k, _numbered(rows, number, first, table)))
     return tuple(setups.values()), parts
 
 

@@ -168,6 +168,8 @@ def _padded(table: OITable, name: str, shape: tuple[int, ...], extra: int) -> Fl
     rest = table.columns.get(f"NS_{name}_REST")
     if rest is not None and rest.shape == metres.shape:
         metres = metres + rest
+    if np.isnan(metres).all():
+        return None
     return np.concatenate([metres, np.full((extra, *shape[1:]), np.nan)])
 
 
@@ -235,8 +237,9 @@ def _metres(oifits: OIFits, table: OITable, name: str) -> FloatArray:
 
 def setup_name(table: OITable, keyword: str) -> str:
     """INSNAME or ARRNAME as it was before the writer had to tell two of one name apart."""
-    original = table.header.get(f"{OWN_KEY} {keyword}")
-    return plain(original) if original else table.keyword(keyword)
+    return table.keyword(f"{OWN_KEY} {keyword}") or (
+        "" if f"{OWN_KEY} {keyword}" in table.header else table.keyword(keyword)
+    )
 
 
 def make_setup(

@@ -1,0 +1,181 @@
+"""The chance that noise alone, anywhere in the field, looks as good as what was found.
+
+The statistic of the data and of every simulated null data set is one and the same: the
+largest gain in χ² over the template bank, for positive contrast, nuisance directions
+projected out. In whitened data a null set is a vector of independent unit normals, so ten
+thousand searches are two matrix products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from amibayes.inference.bank import TemplateBank
+from amibayes.units import FloatArray
+
+ALPHA = 0.0013
+"""Default false-alarm probability below which a companion counts as detected (3σ, one side)."""
+
+TAIL_FRACTION = 0.05
+"""Share of the null draws above the threshold of the generalised Pareto fit."""
+
+BOOTSTRAPS = 40
+
+LEAST_PROBABILITY = 1e-30
+"""Extrapolations below this are not told apart."""
+
+DRAWS_AT_ONCE = 2048
+"""Null data sets per matrix product: what keeps the product in cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tail:
+    """Extrapolation of the null distribution past its draws, by two families.
+
+    Parameters
+    ----------
+    generalised_pareto, extreme_value : float
+        Probability of the observed statistic by a generalised Pareto fit of the largest
+        `TAIL_FRACTION` of the draws, and by a generalised extreme-value fit of all.
+    log10_error : float
+        Half the 68 % bootstrap interval of log10 of the Pareto probability, dex.
+    """
+
+    generalised_pareto: float
+    extreme_value: float
+    log10_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Significance:
+    """Global false-alarm probability of a search.
+
+    Parameters
+    ----------
+    statistic : float
+        Largest gain in χ² over the bank, for the data.
+    null : (n_draws,) float array
+        The same for noise alone, sorted.
+    probability : float
+        (1 + number of draws at least as large) / (1 + number of draws).
+    interval : (float, float)
+        95 % Clopper–Pearson interval of the probability.
+    tail : Tail or None
+        Extrapolation, where the draws reach no further (fewer than 10 at least as large).
+    alpha : float
+        Detection means ``probability`` < ``alpha``.
+    """
+
+    statistic: float
+    null: FloatArray
+    probability: float
+    interval: tuple[float, float]
+    tail: Tail | None
+    alpha: float
+
+    @property
+    def n_draws(self) -> int:
+        """Number of null data sets."""
+        return len(self.null)
+
+    @property
+    def detected(self) -> bool:
+        """Whether the false-alarm probability is below alpha."""
+        return self.probability < self.alpha
+
+    def threshold(self, alpha: float | None = None) -> float:
+        """Statistic that noise alone exceeds with probability alpha."""
+        return float(np.quantile(self.null, 1.0 - (alpha or self.alpha)))
+
+
+def null_maxima(bank: TemplateBank, n_draws: int, rng: np.random.Generator) -> FloatArray:
+    """Largest gain in χ² over the bank for ``n_draws`` null data sets, (n_draws,).
+
+    Notes
+    -----
+    Products are done in single precision: a relative error of 1e-6 of the statistic,
+    against a scatter between draws of tens of per cent.
+    """
+    seeds = rng.bit_generator.seed_seq.spawn(-(-n_draws // DRAWS_AT_ONCE))  # type: ignore[attr-defined]
+    sizes = [min(DRAWS_AT_ONCE, n_draws - k * DRAWS_AT_ONCE) for k in range(len(seeds))]
+    noise = np.hstack(
+        [
+            np.random.default_rng(s).standard_normal((bank.n_data, size), dtype=np.float32)
+            for s, size in zip(seeds, sizes, strict=True)
+        ]
+    )
+    return bank.largest_gain(bank.project(noise.astype(float)).astype(np.float32))
+
+
+def significance(
+    bank: TemplateBank,
+    statistic: float,
+    n_draws: int,
+    rng: np.random.Generator,
+    alpha: float = ALPHA,
+) -> Significance:
+    """Simulate the null distribution of a search and place the observed statistic in it.
+
+    Parameters
+    ----------
+    bank : TemplateBank
+        Of the very search that was run.
+    statistic : float
+        Largest gain in χ² over that bank for the data.
+    n_draws : int
+        At least 1.
+    rng : numpy.random.Generator
+    alpha : float
+    """
+    null = np.sort(null_maxima(bank, n_draws, rng))
+    above = int((null >= statistic).sum())
+    tail = _tail(null, statistic, rng) if above < 10 <= n_draws * TAIL_FRACTION else None
+    return Significance(
+        statistic,
+        null,
+        (1 + above) / (1 + n_draws),
+        clopper_pearson(above, n_draws),
+        tail,
+        alpha,
+    )
+
+
+def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact binomial interval of a probability (Clopper & Pearson 1934)."""
+    rest = 0.5 * (1.0 - level)
+    low = stats.beta.ppf(rest, successes, trials - successes + 1) if successes else 0.0
+    high = stats.beta.isf(rest, successes + 1, trials - successes) if successes < trials else 1.0
+    return float(low), float(high)
+
+
+def _tail(null: FloatArray, statistic: float, rng: np.random.Generator) -> Tail:
+    pareto = _pareto_survival(null, statistic)
+    resampled: NDArray[np.float64] = np.array(
+        [
+            _pareto_survival(np.sort(rng.choice(null, len(null))), statistic)
+            for _ in range(BOOTSTRAPS)
+        ]
+    )
+    shape, location, scale = stats.genextreme.fit(null, 0.0, loc=null.mean(), scale=null.std())
+    logs = np.log10(np.maximum(resampled, LEAST_PROBABILITY))
+    low, high = np.quantile(logs, [0.16, 0.84])
+    extreme = float(stats.genextreme.sf(statistic, shape, location, scale))
+    return Tail(pareto, extreme, float(0.5 * (high - low)))
+
+
+def _pareto_survival(null: FloatArray, statistic: float) -> float:
+    """P(null ≥ statistic) by a generalised Pareto law over a high threshold.
+
+    Moments (Hosking & Wallis 1987) rather than maximum likelihood: they are explicit, and
+    stable near the exponential tail that the maximum of a χ² field has.
+    """
+    excess = null[int(len(null) * (1.0 - TAIL_FRACTION)) :]
+    threshold = excess[0]
+    mean, variance = (excess - threshold).mean(), (excess - threshold).var(ddof=1)
+    shape = 0.5 * (1.0 - mean * mean / variance)
+    scale = 0.5 * mean * (1.0 + mean * mean / variance)
+    return float(TAIL_FRACTION * stats.genpareto.sf(statistic - threshold, shape, scale=scale))
