@@ -115,6 +115,64 @@ class Tabulated:
         return np.asarray(np.interp(wavelength, table, self.flux_density) * wavelength * 1e6)
 
 
+_VEGA_JY = ((2.768, 432.6), (3.828, 235.1), (4.285, 190.1), (4.816, 153.3))
+"""µm, Jy of magnitude 0 in NIRISS's filters (the zero points of data/niriss.toml)."""
+
+_G2V_OVER_VEGA = ((2.16, 0.0), (3.35, 0.019), (4.60, 0.010))
+"""µm, magnitudes by which a G2V dwarf outshines an A0V one of equal Ks: from the mean
+colours Ks−W1 = 0.061, W1−W2 = −0.050 (G2V) and 0.042, −0.041 (A0V), E. Mamajek's table of
+dwarfs, version 2024.05.15 (Pecaut & Mamajek 2013, ApJS 208, 9)."""
+
+
+def g2v() -> Tabulated:
+    """Spectrum of a G2V dwarf over 2–5.6 µm: Vega's times the mean colours of its type.
+
+    Colours of a photosphere with its CO band, not the band itself: it is right to 1–2 % in
+    a filter, and smooth inside. (A blackbody of 5450 K is 3 and 5 % too bright in F430M and
+    F480M for its brightness in F380M.)
+    """
+    wavelength_um = np.linspace(2.0, 5.6, 721)
+    um, jansky = np.log(np.array(_VEGA_JY)).T
+    slope = np.diff(jansky)[[0, -1]] / np.diff(um)[[0, -1]]
+    ends = np.log(wavelength_um[[0, -1]])
+    outer = jansky[[0, -1]] + slope * (ends - um[[0, -1]])
+    vega = np.interp(np.log(wavelength_um), [ends[0], *um, ends[1]], [outer[0], *jansky, outer[1]])
+    excess_mag = np.interp(wavelength_um, *np.array(_G2V_OVER_VEGA).T)
+    flux = np.exp(vega) * 10.0 ** (0.4 * excess_mag) / wavelength_um**2
+    return Tabulated("G2V", wavelength_um * 1e-6, flux)
+
+
+def spectrum_named(name: str) -> Spectrum:
+    """Make the spectrum that a file or an option calls for.
+
+    Parameters
+    ----------
+    name : str
+        ``"flat"``, ``"G2V"``, ``"blackbody 5450"`` (kelvin), or the path of a table.
+
+    Raises
+    ------
+    UsageError, DataError
+        Where it is none of these, or the table is wrong.
+    """
+    words = name.split()
+    if name.lower() == "flat":
+        return Flat()
+    if name.lower() == "g2v":
+        return g2v()
+    if len(words) in (2, 3) and words[0].lower() == "blackbody":
+        try:
+            return Blackbody(float(words[1].rstrip("Kk")))
+        except ValueError:
+            raise UsageError(f"'{name}' has no temperature in kelvin") from None
+    if Path(name).exists():
+        return read_spectrum(name)
+    raise UsageError(
+        f"spectrum '{name}' is not known",
+        remedy="give 'flat', 'G2V', 'blackbody 5450' or a file of wavelength (µm) and flux",
+    )
+
+
 def read_spectrum(path: str | Path) -> Tabulated:
     """Read a two-column text file: wavelength in µm, F_λ on any scale.
 

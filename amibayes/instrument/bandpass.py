@@ -121,15 +121,16 @@ class Bandpass:
         wavelength, throughput = self._fine()
         return float(np.trapezoid(throughput * spectrum.photon_density(wavelength), wavelength))
 
-    def channels(self, spectrum: Spectrum | None = None, n: int = 15) -> Channels:
+    def channels(self, spectrum: Spectrum | None = None, n: int | None = None) -> Channels:
         """Wavelengths and weights that stand for the filter.
 
         Parameters
         ----------
         spectrum : Spectrum, optional
             Of the source; as many photons everywhere unless given.
-        n : int
-            How many wavelengths.
+        n : int, optional
+            How many wavelengths; enough for 1e-9 in V² over an 80 × 80 image of any NIRISS
+            filter unless given (9 for the medium filters, 22 for F277W; a test holds it).
 
         Returns
         -------
@@ -140,7 +141,9 @@ class Bandpass:
         photons = throughput * (spectrum or Flat()).photon_density(wavelength)
         cell = np.gradient(wavelength)
         cell[[0, -1]] *= 0.5
-        nodes, weight = _gauss(1.0 / wavelength, photons * cell, n)
+        low, high = self.half_power_m
+        enough = 5 + int(np.ceil(120.0 * (high - low) / (high + low)))
+        nodes, weight = _gauss(1.0 / wavelength, photons * cell, n or enough)
         return Channels(1.0 / nodes[::-1], weight[::-1])
 
 
