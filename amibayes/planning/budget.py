@@ -13,18 +13,18 @@ import math
 from dataclasses import dataclass, replace
 
 from amibayes.errors import UsageError
-from amibayes.instrument import Instrument
+from amibayes.instrument import Bandpass, Channels, Instrument
 from amibayes.optics import psf
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.exposure import MOST_INTEGRATIONS
-from amibayes.spectrum import Blackbody, Spectrum
+from amibayes.spectrum import Blackbody, Spectrum, g2v
 
 TABLE_1_RATES_E_S = {"F380M": 1999651.0, "F430M": 1279391.0, "F480M": 1137034.0}
 """Count rates of a G2V star of 6 mag behind the NIRISS mask (Soulain et al. 2020, Table 1)."""
 
 TABLE_1_MAGNITUDE = 6.0
 
-SUN_LIKE = Blackbody(5450.0)
+PAPER_TEMPERATURE_K = 5450.0
 """Temperature of the paper's G2V star."""
 
 MOST_GROUPS = 800
@@ -244,12 +244,25 @@ def _rate(instrument: Instrument, magnitude: float | None, rate: float | None) -
     known = table_1_rate(instrument.bandpass.name, magnitude)
     if instrument.name == "NIRISS" and known is not None:
         return known
-    return instrument.count_rate(SUN_LIKE, magnitude)
+    return instrument.count_rate(sun_like(instrument.bandpass), magnitude)
 
 
-def peak_fractions(instrument: Instrument, spectrum: Spectrum = SUN_LIKE) -> Peaks:
+def sun_like(bandpass: Bandpass) -> Spectrum:
+    """Spectrum of a G2V star, a blackbody where its table does not reach."""
+    table = g2v()
+    low, high = bandpass.wavelength_m[[0, -1]]
+    inside = table.wavelength_m[0] <= low and high <= table.wavelength_m[-1]
+    return table if inside else Blackbody(PAPER_TEMPERATURE_K)
+
+
+def star_channels(instrument: Instrument) -> Channels:
+    """Wavelengths that stand for the filter, for the planned star."""
+    return instrument.bandpass.channels(sun_like(instrument.bandpass), 5)
+
+
+def peak_fractions(instrument: Instrument) -> Peaks:
     """Share of the photons in the brightest pixel, by each way of counting."""
-    channels = instrument.bandpass.channels(spectrum, 5)
+    channels = star_channels(instrument)
     middle, corner = (
         float(psf(instrument, channels, 4, centre_px=(offset, offset)).max())
         for offset in (0.5, 0.0)

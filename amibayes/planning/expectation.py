@@ -20,7 +20,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
 from amibayes.observables import Observables
 from amibayes.optics import fringe_basis
-from amibayes.planning.budget import SUN_LIKE, Plan
+from amibayes.planning.budget import Plan, star_channels
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.slopes import electron_variance, slope_weights
 from amibayes.synthetic import point_source
@@ -114,8 +114,7 @@ def visibility_covariance(plan: Plan, detector: Detector) -> FloatArray:
     (1 + 2 n_baselines, 1 + 2 n_baselines) array
         Of the relative flux, then Re V and Im V of every baseline times that flux.
     """
-    channels = plan.instrument.bandpass.channels(SUN_LIKE, 5)
-    basis = fringe_basis(plan.instrument, channels)
+    basis = fringe_basis(plan.instrument, star_channels(plan.instrument))
     light = plan.count_rate_e_s * basis.image()
     timed = replace(detector, frame_time_s=plan.options.frame_time_s)
     electrons = electron_variance(light, timed)
@@ -137,7 +136,7 @@ def _observables(plan: Plan, detector: Detector) -> Observables:
     basis = block_diag(np.eye(mask.n_baselines), kernel_basis(closures))
     blank = point_source(
         mask.holes_m,
-        bandpass.channels(SUN_LIKE, 5).mean_m,
+        star_channels(plan.instrument).mean_m,
         bandpass.effective_width_m,
         vis2_error=1.0,
         closure_error_rad=1.0,
