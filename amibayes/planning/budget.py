@@ -274,8 +274,9 @@ def peak_fractions(instrument: Instrument) -> Peaks:
 
 
 def _groups(peaks: Peaks, rate: float, rules: PlanOptions) -> dict[str, int]:
+    paper_frame = rules.frame_time_s if rules.preset == "paper" else PAPER_FRAME_S
     per_frame = {
-        "paper": peaks.point_sampled * rate * PAPER_FRAME_S,
+        "paper": peaks.point_sampled * rate * paper_frame,
         "centred": peaks.centred * rate * rules.frame_time_s,
         "cornered": peaks.cornered * rate * rules.frame_time_s,
     }
