@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from amibayes.errors import UsageError
 from amibayes.instrument import Bandpass, Channels, Instrument
 from amibayes.optics import psf
-from amibayes.simulation import PRESETS, Detector
+from amibayes.simulation.detector import PRESETS, Detector
 from amibayes.simulation.exposure import MOST_INTEGRATIONS
 from amibayes.spectrum import Blackbody, Spectrum, g2v
 

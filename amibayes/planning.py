@@ -20,11 +20,13 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
 from amibayes.observables import Observables
 from amibayes.optics import fringe_basis
-from amibayes.planning.budget import Plan, star_channels
 from amibayes.simulation import PRESETS, Detector
+from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels
 from amibayes.simulation.slopes import electron_variance, slope_weights
 from amibayes.synthetic import point_source
 from amibayes.units import FloatArray, contrast_to_delta_mag
+
+__all__ = ["PAPER", "ContrastCurve", "Expectation", "Plan", "PlanOptions", "expect", "make_plan"]
 
 DELTA_CHI2 = 9.0
 """3σ of the contrast at a known position."""
