@@ -17,8 +17,7 @@ from amibayes.cli import main
 from amibayes.errors import UsageError
 from amibayes.instrument import load_instrument
 from amibayes.optics import fringe_basis, psf
-from amibayes.planning import PAPER, PlanOptions, expect, make_plan
-from amibayes.planning.expectation import visibility_covariance
+from amibayes.planning import PAPER, PlanOptions, expect, make_plan, visibility_covariance
 from amibayes.simulation import Detector
 
 TABLE_1 = {
