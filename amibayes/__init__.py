@@ -14,8 +14,10 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.instrument import Instrument, instrument_names, load_instrument
-    from amibayes.optics import FringeBasis, Wavefront, fringe_basis, psf
+    from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
+    from amibayes.scene import Scene
+    from amibayes.scene_file import load_scene
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
@@ -23,13 +25,17 @@ _HOME = {
     "FringeBasis": "amibayes.optics",
     "Instrument": "amibayes.instrument",
     "Orientation": "amibayes.orientation",
+    "PupilMap": "amibayes.optics",
     "RunError": "amibayes.errors",
+    "Scene": "amibayes.scene",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
     "fringe_basis": "amibayes.optics",
     "instrument_names": "amibayes.instrument",
     "load_instrument": "amibayes.instrument",
+    "load_scene": "amibayes.scene_file",
     "psf": "amibayes.optics",
+    "scene_image": "amibayes.optics",
 }
 
 __all__ = [
@@ -38,14 +44,18 @@ __all__ = [
     "FringeBasis",
     "Instrument",
     "Orientation",
+    "PupilMap",
     "RunError",
+    "Scene",
     "UsageError",
     "Wavefront",
     "__version__",
     "fringe_basis",
     "instrument_names",
     "load_instrument",
+    "load_scene",
     "psf",
+    "scene_image",
 ]
 
 

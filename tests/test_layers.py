@@ -20,6 +20,7 @@ LAYERS = [
     "spectrum",
     "instrument",
     "scene",
+    "scene_file",
     "optics",
     "cube",
     "simulation",

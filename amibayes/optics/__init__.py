@@ -1,6 +1,16 @@
 """Light through the mask: one model, used by simulation and by extraction."""
 
 from amibayes.optics.fringes import FringeBasis, fringe_basis
+from amibayes.optics.image import ShiftedImage, scene_image
 from amibayes.optics.psf import Wavefront, psf
+from amibayes.optics.pupil import PupilMap
 
-__all__ = ["FringeBasis", "Wavefront", "fringe_basis", "psf"]
+__all__ = [
+    "FringeBasis",
+    "PupilMap",
+    "ShiftedImage",
+    "Wavefront",
+    "fringe_basis",
+    "psf",
+    "scene_image",
+]
