@@ -53,9 +53,7 @@ class WavefrontErrors:
     def drifted(self, shared: Wavefront, n_holes: int, seed: np.random.SeedSequence) -> Wavefront:
         """Add one exposure's own part."""
         piston, tilt = _draw(n_holes, self.piston_drift_m, self.tilt_drift_rad, seed)
-        return Wavefront(
-            _sum(shared.piston_m, piston), _sum(shared.tilt_rad, tilt), shared.map
-        )
+        return Wavefront(_sum(shared.piston_m, piston), _sum(shared.tilt_rad, tilt), shared.map)
 
 
 PAPER_WAVEFRONT = WavefrontErrors()

@@ -10,12 +10,11 @@ another such matrix.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.units import FloatArray, read_only
+from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
 
@@ -32,28 +31,9 @@ _NODES = 8
 """Gauss–Legendre nodes across a pixel; the mask's fringes turn by 1.5 rad at most."""
 
 
-@dataclass(frozen=True, eq=False)
-class FineImage:
-    """Light on the focal plane, at points finer than pixels.
-
-    Parameters
-    ----------
-    rate_e_s : (n_fine, n_fine) array
-        Electrons per second in each fine cell, as the density at its centre has it.
-    oversample : int
-        Cells per detector pixel and axis; the middle of the array is that of the detector.
-    """
-
-    rate_e_s: FloatArray
-    oversample: int
-
-    def __post_init__(self) -> None:
-        read_only(self, "rate_e_s")
-
-
-def fine_sampling(pixel_rad: float, band_limit_per_rad: float) -> int:
-    """Cells per pixel that the interpolation needs for a band limit (cycles per radian)."""
-    return max(1, math.ceil(pixel_rad * band_limit_per_rad / LARGEST_FREQUENCY))
+def fine_sampling(band_limit_per_px: float) -> int:
+    """Cells per pixel and axis that a band limit (cycles per pixel) needs."""
+    return max(1, math.ceil(band_limit_per_px / LARGEST_FREQUENCY))
 
 
 def fine_size(n_pixels: int, oversample: int, reach_px: float) -> int:
@@ -63,16 +43,16 @@ def fine_size(n_pixels: int, oversample: int, reach_px: float) -> int:
 
 
 def pixel_operator(
-    n_pixels: int, fine: FineImage, shift_px: float, pixel_response: float = 0.0
+    n_pixels: int, n_fine: int, oversample: int, shift_px: float, pixel_response: float = 0.0
 ) -> FloatArray:
-    """Matrix from the fine cells along one axis to the signal of pixels.
+    """Matrix from fine cells along one axis to the signal of pixels.
 
     Parameters
     ----------
     n_pixels : int
-        Pixels of the detector along the axis, about the middle of the fine image.
-    fine : FineImage
-        What it will act on.
+        Pixels of the detector along the axis, about the middle of the fine cells.
+    n_fine, oversample : int
+        Fine cells, and how many to a pixel; each holds its centre's density times its width.
     shift_px : float
         The image moves by so many pixels.
     pixel_response : float
@@ -83,17 +63,27 @@ def pixel_operator(
     -------
     (n_pixels, n_fine) array
     """
+    nodes, response = pixel_weights(pixel_response)
+    pixel = np.arange(n_pixels) - 0.5 * (n_pixels - 1)
+    place = (pixel[:, None] + nodes - shift_px) * oversample + 0.5 * (n_fine - 1)
+    sample, weight = _interpolator(place)
+    operator = np.zeros((n_pixels, n_fine))
+    row = np.arange(n_pixels)[:, None, None]
+    np.add.at(operator, (row, sample), oversample * response[:, None] * weight)
+    return operator
+
+
+def pixel_transform(frequency_per_px: FloatArray, pixel_response: float = 0.0) -> FloatArray:
+    """Fourier transform of a pixel, 1 at zero frequency (cycles per pixel)."""
+    nodes, response = pixel_weights(pixel_response)
+    return np.asarray(np.cos(2.0 * np.pi * np.multiply.outer(frequency_per_px, nodes)) @ response)
+
+
+def pixel_weights(pixel_response: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Quadrature nodes across a pixel, −½ to ½, and weights that sum to 1."""
     nodes, weight = np.polynomial.legendre.leggauss(_NODES)
     response = weight * (1.0 - pixel_response * nodes**2)
-    response *= fine.oversample / response.sum()
-    size = len(fine.rate_e_s)
-    pixel = np.arange(n_pixels) - 0.5 * (n_pixels - 1)
-    place = (pixel[:, None] + 0.5 * nodes - shift_px) * fine.oversample + 0.5 * (size - 1)
-    sample, weight = _interpolator(place)
-    operator = np.zeros((n_pixels, size))
-    row = np.arange(n_pixels)[:, None, None]
-    np.add.at(operator, (row, sample), response[:, None] * weight)
-    return operator
+    return 0.5 * nodes, np.asarray(response / response.sum())
 
 
 def _interpolator(place: FloatArray) -> tuple[IntArray, FloatArray]:
