@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from amibayes.instrument import Channels, Instrument, load_instrument
-from amibayes.optics import psf
+from amibayes.optics import scene_image
 from amibayes.parallel import Executor, SerialExecutor
+from amibayes.scene import Scene
 from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
 from amibayes.simulation.exposure import (
     Exposure,
@@ -19,8 +20,6 @@ from amibayes.simulation.exposure import (
     make_recorder,
     record,
 )
-from amibayes.simulation.pointing import shift_table
-from amibayes.simulation.sampling import FineImage, fine_sampling, fine_size
 from amibayes.units import FloatArray
 
 
@@ -32,7 +31,6 @@ class Star:
     detector: Detector
     rate_e_s: float = 1279391.0
     seed: int = 7
-    centre_px: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def instrument(self) -> Instrument:
@@ -57,15 +55,18 @@ class Star:
 
     @cached_property
     def recorder(self) -> Recorder:
-        pixel = self.instrument.pixel_scale_rad
-        limit = self.instrument.mask.extent_m / self.channels.wavelength_m.min() * pixel
-        m = fine_sampling(1.0, limit)
-        n = self.exposure.n_pixels
-        size = fine_size(n, m, 2.0)
-        light = psf(self.instrument, self.channels, size, oversample=m, integrate=False)
-        fine = FineImage(self.rate_e_s * light, m)
-        table = shift_table(fine, n, self.pointings.offsets_px, limit, self.detector.pixel_response)
-        return make_recorder(table, self.pointings, self.exposure, self.detector, self.maps)
+        image = scene_image(
+            Scene(),
+            self.instrument,
+            self.channels,
+            self.exposure.n_pixels,
+            centre_px=tuple(self.pointings.dither_px),
+            reach_px=self.pointings.reach_px,
+            pixel_response=self.detector.pixel_response,
+        )
+        return make_recorder(
+            image, self.rate_e_s, self.pointings, self.exposure, self.detector, self.maps
+        )
 
     def take(self, executor: Executor | None = None) -> dict[str, FloatArray]:
         chunks = list(

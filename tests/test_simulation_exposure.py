@@ -61,7 +61,7 @@ def test_stated_errors_are_the_scatter(preset: str) -> None:
     assert good.mean() > 0.9
     scatter = taken["images"].var(axis=0, ddof=1, dtype=float)[good]
     stated = (taken["error"].astype(float) ** 2).mean(axis=0)[good]
-    light = star.recorder.table.images(np.zeros((1, 2)))[0][good]
+    light = star.recorder.light(np.zeros((1, 2)))[0][good]
     for low, high in ((0.0, 0.3), (0.3, 0.8), (0.8, 1.0)):
         inside = (light >= np.quantile(light, low)) & (light <= np.quantile(light, high))
         ratio = np.mean(scatter[inside] / stated[inside])
@@ -72,7 +72,7 @@ def test_variance_with_jitter_is_noise_plus_moving_light() -> None:
     n = 2000
     star = Star(Exposure(5, n, dither_rad=0.0, n_pixels=32), Detector(flat_error=0.0))
     images = star.take()["images"].astype(float)
-    light = star.recorder.table.images(star.pointings.offsets_px)
+    light = star.recorder.light(star.pointings.jitter_px)
     pull = (images - light - 0.165) / np.sqrt(star.recorder.fit.weights.variance)
     assert_unit_chi2(pull.mean(axis=0) * np.sqrt(n))
     moving = light.var(axis=0, ddof=1)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.errors import UsageError
+from amibayes.optics import ShiftedImage
 from amibayes.parallel import Executor, Progress, child_seeds, run_job, slices
 from amibayes.simulation.detector import Detector, DetectorMaps
-from amibayes.simulation.pointing import ShiftTable
 from amibayes.simulation.ramps import read_ramps
 from amibayes.simulation.slopes import SlopeFit
 from amibayes.units import MAS, FloatArray
@@ -88,9 +88,9 @@ class Pointings:
     jitter_px: FloatArray
 
     @property
-    def offsets_px(self) -> FloatArray:
-        """(n_int, 2) offset of each image from the middle of the array."""
-        return np.asarray(self.dither_px + self.jitter_px)
+    def reach_px(self) -> float:
+        """Largest jitter along an axis."""
+        return float(np.abs(self.jitter_px).max())
 
 
 def draw_pointings(exposure: Exposure, pixel_rad: float, seed: np.random.SeedSequence) -> Pointings:
@@ -124,8 +124,10 @@ class Recorder:
     ----------
     exposure, detector, maps : Exposure, Detector, DetectorMaps
         What is recorded, with what.
-    table : ShiftTable
-        Images (electrons per second) at any pointing.
+    image : ShiftedImage
+        Image of the scene at any jitter, per electron of the star.
+    rate_e_s : float
+        Electrons per second of the star.
     fit : SlopeFit
         Slopes from ramps.
     """
@@ -133,15 +135,19 @@ class Recorder:
     exposure: Exposure
     detector: Detector
     maps: DetectorMaps
-    table: ShiftTable
+    image: ShiftedImage
+    rate_e_s: float
     fit: SlopeFit
 
+    def light(self, jitter_px: FloatArray) -> FloatArray:
+        """(n, ny, nx) electrons per second at some pointings (n, 2)."""
+        return np.maximum(self.rate_e_s * self.image.at(jitter_px), 0.0)
+
     def __call__(self, piece: tuple[FloatArray, np.random.SeedSequence]) -> dict[str, Any]:
-        """Simulate the integrations at some pointings (n, 2), in pixels, with a seed."""
-        offsets, seed = piece
-        rate = self.table.images(offsets)
+        """Simulate the integrations of some jitters (n, 2), in pixels, with a seed."""
+        jitter, seed = piece
         rng = np.random.default_rng(seed)
-        ramps = read_ramps(rate, self.detector, self.exposure.n_groups, rng)
+        ramps = read_ramps(self.light(jitter), self.detector, self.exposure.n_groups, rng)
         slopes = self.fit(ramps)
         result = {
             "images": slopes.images.astype(np.float32),
@@ -154,7 +160,8 @@ class Recorder:
 
 
 def make_recorder(
-    table: ShiftTable,
+    image: ShiftedImage,
+    rate_e_s: float,
     pointings: Pointings,
     exposure: Exposure,
     detector: Detector,
@@ -167,7 +174,7 @@ def make_recorder(
     UsageError
         Where the brightest pixel saturates before its second group.
     """
-    expected = table.mean_image(pointings.offsets_px)
+    expected = np.maximum(rate_e_s * image.mean(pointings.jitter_px), 0.0)
     peak = float(expected.max()) * detector.frame_time_s
     if 2.0 * peak > detector.full_well_e:
         raise UsageError(
@@ -176,7 +183,7 @@ def make_recorder(
             remedy="a fainter star or a narrower filter",
         )
     fit = SlopeFit(expected, detector, maps, exposure.n_groups)
-    return Recorder(exposure, detector, maps, table, fit)
+    return Recorder(exposure, detector, maps, image, rate_e_s, fit)
 
 
 def record(
@@ -206,11 +213,9 @@ def record(
     Chunk
     """
     parts = slices(recorder.exposure.n_integrations, PIECE)
-    offsets = pointings.offsets_px
-    pieces = [
-        (offsets[part], child)
-        for part, child in zip(parts, child_seeds(seed, len(parts)), strict=True)
-    ]
+    jitter = pointings.jitter_px
+    children = child_seeds(seed, len(parts))
+    pieces = [(jitter[part], child) for part, child in zip(parts, children, strict=True)]
     results = run_job(recorder, pieces, executor, progress=progress)
     for part, result in zip(parts, results, strict=True):
         yield Chunk(
