@@ -32,6 +32,28 @@ COMMENTS = {
     "V3I_YANG": "[deg] angle from V3 to the image's y axis",
     "VPARITY": "-1: x is 90 deg west of y",
     "BUNIT": "unit of the images",
+    "ORIGIN": "simulated, not observed",
+    "TARGPROP": "name of the target",
+    "DATE-OBS": "UTC date at the start",
+    "TIME-OBS": "UTC time at the start",
+    "EXPSTART": "[d] UTC start, MJD",
+    "EXPMID": "[d] UTC middle, MJD",
+    "EXPEND": "[d] UTC end, MJD",
+    "EFFEXPTM": "[s] effective exposure time",
+    "DURATION": "[s] on the clock, resets included",
+    "IS_PSF": "the target is a calibrator",
+    "SEED": "of all random numbers",
+    "RATE": "[electron/s] of the star, true",
+    "SPECTRUM": "of the star",
+    "MAG": "Vega magnitude of the star",
+    "MAGFILT": "filter of the magnitude",
+    "DITHER_X": "[mas] true dither along x",
+    "DITHER_Y": "[mas] true dither along y",
+    "JITTER": "[mas] rms per axis",
+    "ZEROREAD": "the read after the reset is kept",
+    "RDNOISE": "[electron] CDS read noise",
+    "FLATERR": "rms relative error of the flat",
+    "N_SRC": "sources, see the table SCENE",
 }
 
 _IN_SCIENCE = ("BUNIT", "ROLL_REF", "V3I_YANG", "VPARITY", "PA_V3")
@@ -123,11 +145,17 @@ def write_cube(path: str | Path, cube: Cube) -> None:
 
 def _headers(cube: Cube, n: int) -> tuple[Any, Any]:
     """Split the keywords between the primary header and that of SCI, as JWST files do."""
-    primary, science = fits.Header(), fits.Header()
-    for key, value in (_kept(cube.header) | _essential(cube, n)).items():
-        header = science if key in _IN_SCIENCE else primary
+    both = _kept(cube.header) | _essential(cube, n)
+    science = {key: both.pop(key) for key in _IN_SCIENCE if key in both}
+    return header_of(both), header_of(science)
+
+
+def header_of(keywords: Mapping[str, Any]) -> Any:
+    """Make a FITS header, with comments where the keyword is known."""
+    header = fits.Header()
+    for key, value in keywords.items():
         header[key if len(key) <= 8 else f"HIERARCH {key}"] = (value, COMMENTS.get(key, ""))
-    return primary, science
+    return header
 
 
 def _kept(header: Mapping[str, Any]) -> dict[str, Any]:

@@ -206,7 +206,7 @@ def record(
     executor : Executor
         Where pieces are computed; it changes nothing in the result.
     progress : Progress, optional
-        Told after each piece.
+        Told, in integrations, after each piece.
 
     Yields
     ------
@@ -216,8 +216,18 @@ def record(
     jitter = pointings.jitter_px
     children = child_seeds(seed, len(parts))
     pieces = [(jitter[part], child) for part, child in zip(parts, children, strict=True)]
-    results = run_job(recorder, pieces, executor, progress=progress)
+    told = None if progress is None else _counting(progress, recorder.exposure.n_integrations)
+    results = run_job(recorder, pieces, executor, progress=told)
     for part, result in zip(parts, results, strict=True):
         yield Chunk(
             part.start, result["images"], result["error"], result["dq"], result.get("ramps")
         )
+
+
+def _counting(progress: Progress, n_integrations: int) -> Progress:
+    """Count integrations, not pieces."""
+
+    def tell(done: int, total: int) -> None:
+        progress(min(done * PIECE, n_integrations), n_integrations)
+
+    return tell
