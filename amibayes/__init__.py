@@ -12,37 +12,56 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.instrument import Instrument, instrument_names, load_instrument
     from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
+    from amibayes.parallel import open_executor
+    from amibayes.planning import expect, make_plan
     from amibayes.scene import Scene
     from amibayes.scene_file import load_scene
+    from amibayes.simulation import Detector, Exposure, Observation, simulate
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
+    "Cube": "amibayes.cube",
     "DataError": "amibayes.errors",
+    "Detector": "amibayes.simulation",
+    "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
     "Instrument": "amibayes.instrument",
+    "Observation": "amibayes.simulation",
     "Orientation": "amibayes.orientation",
     "PupilMap": "amibayes.optics",
     "RunError": "amibayes.errors",
     "Scene": "amibayes.scene",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
+    "expect": "amibayes.planning",
     "fringe_basis": "amibayes.optics",
     "instrument_names": "amibayes.instrument",
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
+    "make_plan": "amibayes.planning",
+    "open_cube": "amibayes.cube",
+    "open_executor": "amibayes.parallel",
     "psf": "amibayes.optics",
+    "read_cube": "amibayes.cube",
     "scene_image": "amibayes.optics",
+    "simulate": "amibayes.simulation",
+    "write_cube": "amibayes.cube",
 }
 
 __all__ = [
     "AmibayesError",
+    "Cube",
     "DataError",
+    "Detector",
+    "Exposure",
     "FringeBasis",
     "Instrument",
+    "Observation",
     "Orientation",
     "PupilMap",
     "RunError",
@@ -50,12 +69,19 @@ __all__ = [
     "UsageError",
     "Wavefront",
     "__version__",
+    "expect",
     "fringe_basis",
     "instrument_names",
     "load_instrument",
     "load_scene",
+    "make_plan",
+    "open_cube",
+    "open_executor",
     "psf",
+    "read_cube",
     "scene_image",
+    "simulate",
+    "write_cube",
 ]
 
 

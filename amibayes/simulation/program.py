@@ -81,9 +81,9 @@ class Program:
 
     @property
     def history(self) -> tuple[str, ...]:
-        """The file, line by line, as a FITS header can hold it."""
-        lines = self.text.expandtabs(4).splitlines()
-        return tuple(line.encode("ascii", "replace").decode() for line in lines if line.strip())
+        """The file without its comments, line by line, as a FITS header can hold it."""
+        lines = [_without_comment(line) for line in self.text.expandtabs(4).splitlines()]
+        return tuple(line.encode("ascii", "replace").decode() for line in lines if line)
 
     def shutters(self, seed: int) -> Iterator[tuple[Shot, Shutter]]:
         """Open each exposure in turn: one detector and one telescope for all of them.
@@ -105,6 +105,11 @@ class Program:
             notes = shot.observation.notes | {"SEED": seed}
             observation = replace(shot.observation, wavefront=wavefront, notes=notes)
             yield shot, open_shutter(observation, of_exposure, _maps(shot, of_maps))
+
+
+def _without_comment(line: str) -> str:
+    """Cut a comment off, unless quotes make it doubtful where it begins."""
+    return re.sub(r"""(^|\s)#[^"']*$""", "", line).rstrip()
 
 
 def _maps(shot: Shot, seed: np.random.SeedSequence) -> DetectorMaps:
