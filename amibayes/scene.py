@@ -20,6 +20,9 @@ from amibayes.units import FloatArray, read_only
 
 ComplexArray = NDArray[np.complex128]
 
+_BLOCK = 4096
+"""Frequencies of an image's transform that are computed at once, to bound the memory."""
+
 
 class Component(Protocol):
     """A piece of the scene."""
@@ -195,13 +198,17 @@ class SkyImage:
         """Fourier transform at spatial frequencies (cycles per radian), times the flux."""
         shape = np.broadcast_shapes(np.shape(east), np.shape(north))
         frequency = np.stack([np.broadcast_to(part, shape).ravel() for part in (east, north)])
-        fx, fy = self.sky_per_pixel.T @ frequency
+        blocks = np.array_split(frequency, 1 + frequency.shape[1] // _BLOCK, axis=1)
+        total = np.concatenate([self._sum(*(self.sky_per_pixel.T @ part)) for part in blocks])
+        place = np.exp(-2j * np.pi * (np.array([self.east_rad, self.north_rad]) @ frequency))
+        return np.asarray(self.flux / self.pixels.sum() * total * place).reshape(shape)
+
+    def _sum(self, fx: FloatArray, fy: FloatArray) -> ComplexArray:
+        """Sum of the pixels at frequencies in cycles per pixel, two matrix products."""
         rows, columns = self.pixels.shape
         up = np.exp(-2j * np.pi * np.outer(fy, self._offsets(np.arange(rows), rows)))
         across = np.exp(-2j * np.pi * np.outer(fx, self._offsets(np.arange(columns), columns)))
-        total = np.einsum("fx,fx->f", up @ self.pixels, across)
-        place = np.exp(-2j * np.pi * (np.array([self.east_rad, self.north_rad]) @ frequency))
-        return np.asarray(self.flux / self.pixels.sum() * total * place).reshape(shape)
+        return np.asarray(np.einsum("fx,fx->f", up @ self.pixels, across))
 
 
 @dataclass(frozen=True, eq=False)

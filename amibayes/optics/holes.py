@@ -29,13 +29,33 @@ def hole_transform(mask: Mask, fx: FloatArray, fy: FloatArray) -> FloatArray:
     """
     if mask.shape == "circle":
         return _disc(mask, np.hypot(fx, fy))
-    spokes = mask.corners_m[[0, 2, 4]]
-    along = [fx * spoke[0] + fy * spoke[1] for spoke in spokes]
-    sinc = [np.sinc(phase) for phase in along]
-    total = np.zeros(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
-    for one, two in ((0, 1), (1, 2), (2, 0)):
-        total += np.cos(np.pi * (along[one] + along[two])) * sinc[one] * sinc[two]
-    return np.asarray(total * (mask.hole_area_m2 / 3.0))
+    # The spokes to three corners sum to zero: a rhombus, sinc·sinc along two of them, has
+    # its centre at minus the third.
+    pairs = [_cosine_and_sinc(fx, fy, *spoke) for spoke in mask.corners_m[::2]]
+    cosine, sinc = zip(*pairs, strict=True)
+    total = cosine[0] * sinc[1]
+    total *= sinc[2]
+    total += sinc[0] * (cosine[1] * sinc[2] + cosine[2] * sinc[1])
+    total *= mask.hole_area_m2 / 3.0
+    return np.asarray(total)
+
+
+def _cosine_and_sinc(
+    fx: FloatArray, fy: FloatArray, x: float, y: float
+) -> tuple[FloatArray, FloatArray]:
+    """cos t and sin t / t of t = π(fx·x + fy·y).
+
+    On a grid (fx a row, fy a column) the exponentials are taken along the axes only; their
+    product leaves the sine an absolute error, so that near 0 the series must serve.
+    """
+    turn = np.exp(1j * np.pi * x * fx) * np.exp(1j * np.pi * y * fy)
+    phase = np.pi * (fx * x + fy * y)
+    small = np.abs(phase) < 1e-3
+    square = phase[small] ** 2
+    phase[small] = 1.0
+    sinc = turn.imag / phase
+    sinc[small] = 1.0 - square / 6.0 * (1.0 - square / 20.0)
+    return turn.real, sinc
 
 
 def _disc(mask: Mask, frequency: FloatArray) -> FloatArray:

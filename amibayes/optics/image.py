@@ -28,7 +28,7 @@ OVERSAMPLE = 11
 """Cells of the convolution's grid per pixel and axis."""
 
 _TOLERANCE = 1e-8
-_MARGIN = 12
+_MARGIN = 16
 """Pixels over which the convolution's window fades out, so that its edges do not ring."""
 
 
@@ -298,7 +298,8 @@ def _transfer(
     fade = 0.5 * erfc(7.0 * (outside / _MARGIN - 0.5))
     fine *= np.outer(fade, fade)
     frequency = np.asarray(np.fft.fftfreq(size, step), dtype=float)
-    band = _highest(instrument.mask, channels) + 2.5 / (_MARGIN * instrument.pixel_scale_rad)
+    # The fade, a Gaussian of σ = margin/(7√2) integrated, has 1e-5 of its spectrum beyond.
+    band = _highest(instrument.mask, channels) + 7.5 / (_MARGIN * instrument.pixel_scale_rad)
     kept = np.flatnonzero(np.abs(frequency) <= band)
     coefficients = np.fft.fft2(np.fft.ifftshift(fine))[np.ix_(kept, kept)] / size**2
     return frequency[kept], coefficients

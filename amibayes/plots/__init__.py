@@ -1,0 +1,1 @@
+"""Pictures: one small module for each, matplotlib figures out, nothing global."""
