@@ -15,6 +15,14 @@ if TYPE_CHECKING:
     from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.instrument import Instrument, instrument_names, load_instrument
+    from amibayes.oifits import (
+        OIFits,
+        OITable,
+        observables_of,
+        open_oifits,
+        read_oifits,
+        write_oifits,
+    )
     from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
     from amibayes.parallel import open_executor
@@ -31,6 +39,8 @@ _HOME = {
     "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
     "Instrument": "amibayes.instrument",
+    "OIFits": "amibayes.oifits",
+    "OITable": "amibayes.oifits",
     "Observation": "amibayes.simulation",
     "Orientation": "amibayes.orientation",
     "PupilMap": "amibayes.optics",
@@ -44,13 +54,17 @@ _HOME = {
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
     "make_plan": "amibayes.planning",
+    "observables_of": "amibayes.oifits",
     "open_cube": "amibayes.cube",
     "open_executor": "amibayes.parallel",
+    "open_oifits": "amibayes.oifits",
     "psf": "amibayes.optics",
     "read_cube": "amibayes.cube",
+    "read_oifits": "amibayes.oifits",
     "scene_image": "amibayes.optics",
     "simulate": "amibayes.simulation",
     "write_cube": "amibayes.cube",
+    "write_oifits": "amibayes.oifits",
 }
 
 __all__ = [
@@ -61,6 +75,8 @@ __all__ = [
     "Exposure",
     "FringeBasis",
     "Instrument",
+    "OIFits",
+    "OITable",
     "Observation",
     "Orientation",
     "PupilMap",
@@ -75,13 +91,17 @@ __all__ = [
     "load_instrument",
     "load_scene",
     "make_plan",
+    "observables_of",
     "open_cube",
     "open_executor",
+    "open_oifits",
     "psf",
     "read_cube",
+    "read_oifits",
     "scene_image",
     "simulate",
     "write_cube",
+    "write_oifits",
 ]
 
 

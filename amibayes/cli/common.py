@@ -6,8 +6,10 @@ import argparse
 import logging
 import sys
 import warnings
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from amibayes.errors import UsageError
 
@@ -38,7 +40,7 @@ def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
-def add_seed_option(parser: argparse.ArgumentParser) -> None:
+def add_seed_option(parser: argparse._ActionsContainer) -> None:
     """Add ``--seed``: the same seed gives the same result."""
     parser.add_argument(
         "--seed",
@@ -141,11 +143,76 @@ def refuse_repeated(paths: list[str]) -> None:
     UsageError
         Naming the file.
     """
-    from pathlib import Path
-
     seen: set[Path] = set()
     for path in paths:
         resolved = Path(path).resolve()
         if resolved in seen:
             raise UsageError("is given twice", source=path, remedy="give every file once")
         seen.add(resolved)
+
+
+def number_or_free(text: str) -> float | str:
+    """Parse a number that is not negative, or the word ``free``."""
+    if text == "free":
+        return text
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor 'free'") from None
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is negative or not finite")
+    return value
+
+
+def observable_kinds(text: str) -> tuple[str, ...]:
+    """Parse ``vis2,cp``: one or both, once each."""
+    kinds = tuple(text.split(","))
+    if not set(kinds) <= {"vis2", "cp"} or len(set(kinds)) != len(kinds):
+        raise argparse.ArgumentTypeError(f"{text!r} is not vis2, cp or vis2,cp")
+    return kinds
+
+
+class Progress:
+    """One progress bar per long stage, on standard error; nothing where it is no terminal."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._off = quiet or not sys.stderr.isatty()
+        self._bar: Any = None
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._close()
+
+    def stage(self, name: str) -> None:
+        """Begin a stage."""
+        self._close()
+        if not self._off:
+            from tqdm import tqdm
+
+            self._bar = tqdm(desc=f"{name:12}", total=1, leave=False, file=sys.stderr)
+
+    def update(self, done: int, expected: int) -> None:
+        """Say how much of the stage is done."""
+        if self._bar is not None:
+            self._bar.total = max(expected, done)
+            self._bar.n = done
+            self._bar.refresh()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+def finish(
+    arguments: argparse.Namespace, content: object, summary: Callable[[], list[str]]
+) -> None:
+    """Print the JSON or the summary, as was asked for."""
+    if arguments.json:
+        from amibayes.files import to_json
+
+        sys.stdout.write(to_json(content))
+    elif not arguments.quiet:
+        print("\n".join(summary()))

@@ -141,8 +141,8 @@ class TemplateBank:
             norm[index] = self._norm(even, odd)
         return match / norm, 1.0 / np.sqrt(norm)
 
-    def largest_gain(self, data: NDArray[np.float32]) -> FloatArray:
-        """Largest gain in χ² over the bank, for positive contrast, of many data sets.
+    def largest_gain(self, data: NDArray[np.float32]) -> tuple[FloatArray, IntArray]:
+        """Search many data sets: largest gain in χ² over the bank, for positive contrast.
 
         Parameters
         ----------
@@ -151,18 +151,25 @@ class TemplateBank:
 
         Returns
         -------
-        (n,) float array
+        gain : (n,) float array
+        position : (n,) int array
+            Where on the grid.
         """
         best = np.zeros(data.shape[1], dtype=np.float32)
+        where = np.zeros(data.shape[1], dtype=np.intp)
+        each = np.arange(data.shape[1])
         data_even = np.ascontiguousarray(data[self._even.rows].T)
         data_odd = np.ascontiguousarray(data[self._odd.rows].T)
         for index, even, odd in self._halves():
             scale = (1.0 / np.sqrt(self._norm(even, odd))).astype(np.float32)
-            here, there = scale[: len(index) // 2], scale[len(index) // 2 :]
-            shared = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
-            np.maximum(best, ((shared[0] + shared[1]) * here).max(axis=1), out=best)
-            np.maximum(best, ((shared[0] - shared[1]) * there).max(axis=1), out=best)
-        return np.asarray(best, dtype=float) ** 2
+            a, b = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
+            for half, match in zip(np.split(np.arange(len(index)), 2), (a + b, a - b), strict=True):
+                match *= scale[half]
+                top = match.argmax(axis=1)
+                value = match[each, top]
+                better = value > best
+                best[better], where[better] = value[better], index[half][top[better]]
+        return np.asarray(best, dtype=float) ** 2, where
 
     def matched_filter(self, residuals: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
@@ -170,20 +177,36 @@ class TemplateBank:
         Contrasts below zero gain nothing.
         """
         data = self.project(residuals)
-        u, v = 2.0 * np.pi * MAS * self._samples.u, 2.0 * np.pi * MAS * self._samples.v
-        half = 0.5 * self._samples.relative_band * self._smearing / np.pi
         data_even, data_odd = data[self._even.rows], data[self._odd.rows]
 
         def best(position: FloatArray) -> tuple[float, float]:
-            angle = u * position[0] + v * position[1]
-            damping = np.sinc(half * angle)
-            even = self._even.matrix @ (np.cos(angle) * damping) - self._offset
-            odd = self._odd.matrix @ (np.sin(angle) * damping)
-            match = float(data_even @ even + data_odd @ odd)
-            norm = float(self._norm(even[:, None], odd[:, None])[0])
+            even, odd = self._parts_at(position[:1], position[1:])
+            match = float(data_even @ even[:, 0] + data_odd @ odd[:, 0])
+            norm = float(self._norm(even, odd)[0])
             return match / norm, max(match, 0.0) ** 2 / norm
 
         return best
+
+    def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
+        """Templates of unit norm (n_data, m) at any positions, on the lattice or off it."""
+        even, odd = self._parts_at(east_mas, north_mas)
+        templates = np.zeros((self.n_data, len(east_mas)))
+        templates[self._even.rows] = even
+        templates[self._odd.rows] += odd
+        templates = self.project(templates)
+        return np.asarray(templates / np.linalg.norm(templates, axis=0))
+
+    def _parts_at(
+        self, east_mas: FloatArray, north_mas: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        u, v = 2.0 * np.pi * MAS * self._samples.u, 2.0 * np.pi * MAS * self._samples.v
+        angle = np.outer(u, east_mas) + np.outer(v, north_mas)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        if self._smearing:
+            damping = np.sinc((0.5 / np.pi) * self._samples.relative_band[:, None] * angle)
+            cosine *= damping
+            sine *= damping
+        return self._even.matrix @ cosine - self._offset[:, None], self._odd.matrix @ sine
 
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import gammaincc, gammaln, ndtri_exp
+
+from amibayes.units import FloatArray
 
 CONTINUED_FRACTION_TERMS = 500
 
 
-def log_chi2_survival(x: float, dof: float) -> float:
-    """Logarithm of the probability that χ² of ``dof`` degrees exceeds ``x``.
+def log_chi2_survival(x: ArrayLike, dof: float) -> FloatArray:
+    """Logarithm of the probability that χ² of ``dof`` degrees exceeds ``x`` (any shape).
 
     Where the probability itself would underflow, the continued fraction of the upper
     incomplete gamma function (Abramowitz & Stegun 6.5.31) is summed in logarithms.
     """
-    a, z = 0.5 * dof, 0.5 * x
-    plain = float(gammaincc(a, z))
-    if plain > 1e-200:
-        return float(np.log(plain))
-    fraction = 0.0
+    a, z = 0.5 * dof, 0.5 * np.asarray(x, dtype=float)
+    plain = gammaincc(a, z)
+    out = np.log(np.maximum(plain, 1e-300))
+    far = plain <= 1e-200
+    if np.any(far):
+        out = np.where(far, _log_far_tail(a, np.where(far, z, a + 1.0)), out)
+    return np.asarray(out)
+
+
+def _log_far_tail(a: float, z: FloatArray) -> FloatArray:
+    fraction = np.zeros_like(z)
     for k in range(CONTINUED_FRACTION_TERMS, 0, -1):
         fraction = k * (a - k) / (z + 2 * k + 1 - a + fraction)
-    return float(a * np.log(z) - z - gammaln(a) - np.log(z + 1 - a + fraction))
+    return np.asarray(a * np.log(z) - z - gammaln(a) - np.log(z + 1 - a + fraction))
 
 
-def candid_n_sigma(chi2_single: float, chi2_binary: float, dof: float) -> float:
+def candid_n_sigma(chi2_single: ArrayLike, chi2_binary: ArrayLike, dof: float) -> FloatArray:
     """CANDID's number of sigma (Gallenne et al. 2015, eq. 8).
 
     x = dof · χ²(single)/χ²(binary), p = P(χ²_dof > x), nσ = Φ⁻¹(1 − p/2). It compares the
@@ -32,11 +41,11 @@ def candid_n_sigma(chi2_single: float, chi2_binary: float, dof: float) -> float:
 
     Parameters
     ----------
-    chi2_single, chi2_binary : float
+    chi2_single, chi2_binary : float or float array
         χ² without and with the companion.
     dof : float
         Independent data minus free parameters; must be positive.
     """
-    ratio = dof * chi2_single / max(chi2_binary, 1e-300)
+    ratio = dof * np.asarray(chi2_single) / np.maximum(chi2_binary, 1e-300)
     log_p = log_chi2_survival(ratio, dof)
-    return float(max(0.0, -ndtri_exp(log_p - np.log(2.0))))
+    return np.asarray(np.maximum(0.0, -ndtri_exp(log_p - np.log(2.0))))

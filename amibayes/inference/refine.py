@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import nlopt
@@ -21,20 +21,28 @@ MAX_BACKGROUND = 10.0
 MAX_CONTRAST = 1.0
 """A companion brighter than its primary is the same binary seen from the other star."""
 
-GLOBAL_EVALUATIONS = 3000
+EVALUATIONS_PER_FRINGE, FEWEST_EVALUATIONS, MOST_EVALUATIONS = 40, 400, 3000
+"""Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
 
 CONVERGED = 1e-9
 """Relative change of χ² at which a local fit stops."""
 
+MOST_ROUNDS, SETTLED = 3, 1e-3
+"""A fit is taken up again, with new scales, until a round gains less than this in χ²."""
+
+CONSTRAINT_SLACK = 1e-7
+"""How far, in units of (λ/B)², a separation may stand outside the field."""
+
+EMPTY = np.empty(0)
+
 
 @dataclass(frozen=True)
 class Box:
-    """The field of a search: separations, λ/B_max, and a typical error of the contrast."""
+    """The field of a search: range of separations, and λ/B_max."""
 
     inner_mas: float
     outer_mas: float
     fringe_mas: float
-    contrast_scale: float
 
 
 def single_likelihood(likelihood: Likelihood) -> Likelihood:
@@ -64,15 +72,26 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
 
 def refine(likelihood: Likelihood, seed: FloatArray, box: Box, chi2_single: float) -> Mode:
     """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
-    scale = np.array([box.fringe_mas, box.fringe_mas, max(box.contrast_scale, 0.3 * seed[2])])
     near = np.array([[x - box.fringe_mas, x + box.fringe_mas] for x in seed[:2]])
     nuisance = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
     bounds = np.vstack([near, [[0.0, MAX_CONTRAST]], nuisance])
-    scale = np.concatenate([scale, 0.1 * np.maximum(seed[3:], 0.1)])
-    theta, chi2 = _minimise(
-        _objective(likelihood, scale), seed, scale, bounds, _field_limits(seed, box)
-    )
+    theta, chi2 = seed, np.inf
+    for _ in range(MOST_ROUNDS):
+        scale = _natural_scale(likelihood, theta, box)
+        limits = _field_limits(seed, box, scale)
+        before = chi2
+        theta, chi2 = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
+        if chi2 > before - SETTLED:
+            break
     return Mode(tuple(float(x) for x in theta), chi2_single - chi2)
+
+
+def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
+    """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
+    length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
+    widest = np.full(len(theta), 1.0)
+    widest[:2], widest[2] = 0.3 * box.fringe_mas, 0.3
+    return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
 
 
 def global_check(
@@ -97,7 +116,9 @@ def global_check(
     # The box is a little lopsided so that its first trial is not the star itself.
     optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
     optimiser.set_min_objective(loss)
-    optimiser.set_maxeval(GLOBAL_EVALUATIONS)
+    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
+    wanted = int(EVALUATIONS_PER_FRINGE * patches)
+    optimiser.set_maxeval(min(max(wanted, FEWEST_EVALUATIONS), MOST_EVALUATIONS))
     start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
@@ -117,24 +138,26 @@ def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:
     return chi2
 
 
-def _field_limits(seed: FloatArray, box: Box) -> list[Objective]:
+def _field_limits(seed: FloatArray, box: Box, scale: FloatArray) -> list[Objective]:
     """Constraints ≤ 0 that keep the separation inside the field, where it might leave it."""
     rho = float(np.hypot(seed[0], seed[1]))
     reach = 1.5 * box.fringe_mas
     limits: list[Objective] = []
     if rho + reach > box.outer_mas:
-        limits.append(_separation_limit(box, +1.0, box.outer_mas))
+        limits.append(_separation_limit(box, scale, +1.0, box.outer_mas))
     if rho - reach < box.inner_mas:
-        limits.append(_separation_limit(box, -1.0, box.inner_mas))
+        limits.append(_separation_limit(box, scale, -1.0, box.inner_mas))
     return limits
 
 
-def _separation_limit(box: Box, sign: float, limit_mas: float) -> Objective:
+def _separation_limit(box: Box, scale: FloatArray, sign: float, limit_mas: float) -> Objective:
+    squared = (scale[:2] / box.fringe_mas) ** 2
+
     def excess(x: FloatArray, gradient: FloatArray) -> float:
         if gradient.size:
             gradient[:] = 0.0
-            gradient[:2] = 2.0 * sign * x[:2]
-        return float(sign * (x[:2] @ x[:2] - (limit_mas / box.fringe_mas) ** 2))
+            gradient[:2] = 2.0 * sign * squared * x[:2]
+        return float(sign * (squared @ x[:2] ** 2 - (limit_mas / box.fringe_mas) ** 2))
 
     return excess
 
@@ -144,21 +167,37 @@ def _minimise(
     start: FloatArray,
     scale: FloatArray,
     bounds: FloatArray,
-    limits: list[Objective] | None = None,
+    limits: Sequence[Objective] = (),
 ) -> tuple[FloatArray, float]:
-    """Minimise with SLSQP inside bounds (n, 2); the best point seen is what counts."""
-    optimiser = nlopt.opt(nlopt.LD_SLSQP, len(start))
-    optimiser.set_lower_bounds(bounds[:, 0] / scale)
-    optimiser.set_upper_bounds(bounds[:, 1] / scale)
-    optimiser.set_min_objective(objective)
-    for limit in limits or []:
-        optimiser.add_inequality_constraint(limit, 1e-9)
-    optimiser.set_ftol_rel(CONVERGED)
-    optimiser.set_maxeval(200)
-    inside = np.clip(start / scale, bounds[:, 0] / scale, bounds[:, 1] / scale)
-    try:
-        best = np.asarray(optimiser.optimize(inside))
-    except nlopt.RoundoffLimited:
-        # SLSQP stops this way when it can no longer improve: the start was the minimum.
-        best = inside
-    return best * scale, objective(best, np.empty(0))
+    """Minimise inside bounds (n, 2); what counts is the best allowed point seen.
+
+    SLSQP is the fastest; where it breaks down CCSAQ takes over from its best point.
+    """
+    low, high = bounds.T / scale
+    inside = np.clip(start / scale, low, high)
+    best, least = inside, np.inf
+
+    def watched(x: FloatArray, gradient: FloatArray) -> float:
+        nonlocal best, least
+        value = objective(x, gradient)
+        if value < least and all(limit(x, EMPTY) <= CONSTRAINT_SLACK for limit in limits):
+            best, least = x.copy(), value
+        return value
+
+    for algorithm in (nlopt.LD_SLSQP, nlopt.LD_CCSAQ):
+        optimiser = nlopt.opt(algorithm, len(start))
+        optimiser.set_lower_bounds(low)
+        optimiser.set_upper_bounds(high)
+        optimiser.set_min_objective(watched)
+        for limit in limits:
+            optimiser.add_inequality_constraint(limit, CONSTRAINT_SLACK)
+        optimiser.set_ftol_rel(CONVERGED)
+        optimiser.set_maxeval(200)
+        try:
+            optimiser.optimize(best)
+        except nlopt.RoundoffLimited:
+            pass  # it can improve no further: the best point stands
+        except nlopt.runtime_error:
+            continue  # its quadratic subproblem failed: the slower, sturdier one goes on
+        break
+    return best * scale, least

@@ -119,7 +119,7 @@ class SearchResult:
     @property
     def candid_n_sigma(self) -> float:
         """CANDID's nσ of the best fit."""
-        return candid_n_sigma(self.chi2_single, self.chi2_binary, self.ndof)
+        return float(candid_n_sigma(self.chi2_single, self.chi2_binary, self.ndof))
 
     @property
     def bank_delta_chi2(self) -> FloatArray:

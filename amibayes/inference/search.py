@@ -93,7 +93,7 @@ def search(
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     contrast, sigma = bank.scan(residuals)
-    box = Box(inner, outer, fringe, float(np.median(sigma)))
+    box = Box(inner, outer, fringe)
     seeds = _seeds(likelihood, grid, contrast, sigma, single, box)
     found = [refine(likelihood, theta, box, chi2_single) for theta in seeds]
     check = global_check(likelihood, bank, box, single, chi2_single)
@@ -203,7 +203,7 @@ def innermost_first(
     A mask on a regular lattice (NIRISS) repeats itself on the sky: far positions predict
     the same data as near ones but for the width of the band. Two modes are aliases where
     their predictions differ by less than 3σ over all data, and by less than half of the
-    signal itself.
+    signal itself, though they are more than λ/B_max apart.
 
     Returns
     -------
@@ -217,6 +217,8 @@ def innermost_first(
     signal = data - likelihood.observables.covariance.whiten(none)
     apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
     alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
+    distance = np.hypot(*(thetas[:, :2] - thetas[0, :2]).T)
+    alike &= (distance == 0.0) | (distance > resolution_mas(likelihood))
     group = [m for m, same in zip(modes, alike, strict=True) if same]
     first = min(group, key=lambda m: m.companion.separation_mas)
     rest = [m for m in modes if m is not first]

@@ -108,7 +108,7 @@ def null_maxima(bank: TemplateBank, n_draws: int, rng: np.random.Generator) -> F
             for s, size in zip(seeds, sizes, strict=True)
         ]
     )
-    return bank.largest_gain(bank.project(noise.astype(float)).astype(np.float32))
+    return bank.largest_gain(bank.project(noise.astype(float)).astype(np.float32))[0]
 
 
 def significance(

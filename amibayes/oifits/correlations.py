@@ -12,10 +12,23 @@ from scipy.sparse.csgraph import connected_components
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
 from amibayes.errors import DataError
-from amibayes.observables import BoolArray, IntArray, Measurements, closure_sets, kernel_blocks
-from amibayes.oifits.setups import integers, numbers, same
+from amibayes.observables import (
+    BoolArray,
+    IntArray,
+    Measurements,
+    closure_sets,
+    exposure_labels,
+    kernel_blocks,
+)
+from amibayes.oifits.setups import integers, numbers, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, FloatArray
+
+LARGEST_MISFIT = 0.5
+"""Median departure of ln(variance ratio) past which a covariance is not that of the errors."""
+
+OPPOSITE = -0.05
+"""Mean correlation, times the sign that shared baselines give it, below which it is wrong."""
 
 REMEDY = "correct the correlations, or read the file with independent errors"
 
@@ -87,7 +100,7 @@ def pair_covariance(
 def _listed(oifits: OIFits, table: OITable) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     first, second = (integers(oifits, table, c, 1)[:, 0] for c in ("IINDX", "JINDX"))
     correlation = numbers(oifits, table, "CORR").reshape(-1)
-    rest = table.columns.get("NS_CORR_REST", np.zeros(len(correlation))).astype(float).reshape(-1)
+    rest = rest_of(table, "CORR", correlation.shape)
     off = first != second
     first, second, correlation, rest = first[off], second[off], correlation[off], rest[off]
     low, high = np.minimum(first, second), np.maximum(first, second)
@@ -140,49 +153,61 @@ def image_pairs(
     DataError
         Where the shape does not fit the data, or the diagonal fits the errors in no order.
     """
-    image = table.image
-    if image is None or image.ndim not in (2, 3) or image.shape[-1] != image.shape[-2]:
-        raise DataError(f"{table.label} is no stack of matrices", source=oifits.path, remedy=REMEDY)
-    stack = np.asarray(image, dtype=float).reshape(-1, *image.shape[-2:])
-    n_exposures, size = stack.shape[:2]
-    if n_exposures * size != len(entries) or size % n_channels:
-        raise DataError(
-            f"{table.label} is for {n_exposures * size} data, the tables hold {len(entries)}",
-            source=oifits.path,
-            remedy=REMEDY,
-        )
-    cells = np.arange(len(entries)).reshape(n_exposures, size // n_channels, n_channels)
-    diagonal = np.diagonal(stack, axis1=1, axis2=2)
-    trials = [
-        (f"{order}, {unit}", grid.reshape(n_exposures, size), scale)
-        for order, grid in (
-            ("channels fastest", cells),
-            ("baselines fastest", cells.swapaxes(1, 2)),
-        )
-        for unit, scale in (("radians", 1.0), ("degrees", DEGREE**2))
-        if unit == "radians" or table.name == "CPCOV"
-    ]
-    misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
-    best = int(np.argmin(misfit))
-    name, grid, scale = trials[best]
-    if not misfit[best] < 0.5:
-        raise DataError(
-            f"the diagonal of {table.label} does not fit the errors of the data",
-            source=oifits.path,
-            remedy=REMEDY,
-        )
-    out = np.empty(len(entries))
-    out[grid.ravel()] = (diagonal * scale).ravel()
-    i, j = np.triu_indices(size, 1)
+    stack = _stack_of(oifits, table, len(entries), n_channels)
+    name, grid, scale = _order_and_unit(oifits, table, stack, variance, n_channels)
+    diagonal = np.empty(len(entries))
+    diagonal[grid] = np.diagonal(stack, axis1=1, axis2=2) * scale
+    i, j = np.triu_indices(stack.shape[1], 1)
     pairs = Pairs(
         entries[grid[:, i]].ravel(), entries[grid[:, j]].ravel(), (stack[:, i, j] * scale).ravel()
     )
     used = pairs.covariance != 0
     return (
         Pairs(pairs.first[used], pairs.second[used], pairs.covariance[used]),
-        out,
+        diagonal,
         f"{table.label}: covariances taken ({name})",
     )
+
+
+def _stack_of(oifits: OIFits, table: OITable, n_data: int, n_channels: int) -> FloatArray:
+    """The matrices, (n_exposures, size, size), where they are for the data."""
+    image = table.image
+    if image is None or image.ndim not in (2, 3) or image.shape[-1] != image.shape[-2]:
+        raise DataError(f"{table.label} is no stack of matrices", source=oifits.path, remedy=REMEDY)
+    stack = np.asarray(image, dtype=float).reshape(-1, *image.shape[-2:])
+    held = stack.shape[0] * stack.shape[1]
+    if held != n_data or stack.shape[1] % n_channels:
+        raise DataError(
+            f"{table.label} is for {held} data, the tables hold {n_data}",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    return stack
+
+
+def _order_and_unit(
+    oifits: OIFits, table: OITable, stack: FloatArray, variance: FloatArray, n_channels: int
+) -> tuple[str, IntArray, float]:
+    """Name, (exposures, size) places of the data and scale to radians² that fit the errors best."""
+    shape = stack.shape[:2]
+    cells = np.arange(shape[0] * shape[1]).reshape(shape[0], -1, n_channels)
+    diagonal = np.diagonal(stack, axis1=1, axis2=2)
+    orders = ("channels fastest", cells), ("baselines fastest", cells.swapaxes(1, 2))
+    units = [("radians", 1.0), ("degrees", DEGREE**2)][: 1 + (table.name == "CPCOV")]
+    trials = [
+        (f"{order}, {unit}" if len(units) > 1 else order, grid.reshape(shape), scale)
+        for order, grid in orders
+        for unit, scale in units
+    ]
+    misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
+    best = int(np.argmin(misfit))
+    if not misfit[best] < LARGEST_MISFIT:
+        raise DataError(
+            f"the diagonal of {table.label} does not fit the errors of the data",
+            source=oifits.path,
+            remedy=REMEDY,
+        )
+    return trials[best]
 
 
 def _misfit(diagonal: FloatArray, variance: FloatArray) -> float:
@@ -199,6 +224,53 @@ def image_table(oifits: OIFits, name: str, insname: str) -> OITable | None:
     alike = [t for t in found if same(t.keyword("INSNAME"), insname)]
     unnamed = [t for t in found if not t.keyword("INSNAME")]
     return next(iter(alike or unnamed), None)
+
+
+def trusted_pairs(
+    pairs: Pairs, variance: FloatArray, closure_phase: Measurements
+) -> tuple[Pairs, str]:
+    """Set the correlations between closure phases aside where they cannot be right.
+
+    Two triangles of one exposure that share a baseline are correlated with the sign that
+    the baseline has in both. Correlations that on average have the opposite sign, in one
+    exposure at least, belong to another order of the triangles (fouriever's example of
+    AX Cir: half of its exposures); weighed with them, some combination would have no noise.
+
+    Returns
+    -------
+    pairs : Pairs
+    note : str
+        Empty where they were kept.
+    """
+    shift = len(variance) - len(closure_phase)
+    inner = (pairs.first >= shift) & (pairs.second >= shift)
+    i, j = pairs.first[inner] - shift, pairs.second[inner] - shift
+    exposure = exposure_labels(closure_phase)
+    same_set = (exposure[i] == exposure[j]) & (closure_phase.channel[i] == closure_phase.channel[j])
+    sign = np.where(same_set, shared_baseline_sign(closure_phase, i, j), 0.0)
+    scale = np.sqrt(variance[i + shift] * variance[j + shift])
+    tied = sign != 0
+    total = np.bincount(exposure[i[tied]], (sign * pairs.covariance[inner] / scale)[tied])
+    count = np.bincount(exposure[i[tied]])
+    wrong = int((total < OPPOSITE * count).sum())
+    if not wrong:
+        return pairs, ""
+    kept = Pairs(pairs.first[~inner], pairs.second[~inner], pairs.covariance[~inner])
+    return kept, (
+        f"the correlations given between closure phases contradict the baselines that the "
+        f"triangles share in {wrong} of {(count > 0).sum()} exposures: set aside, correlated "
+        "through shared baselines instead"
+    )
+
+
+def shared_baseline_sign(closure_phase: Measurements, i: IntArray, j: IntArray) -> FloatArray:
+    """Sign of the correlation that a shared baseline gives two closure phases; 0 for none."""
+    a, b, c = closure_phase.stations.T
+    legs = np.stack([np.stack(leg, axis=1) for leg in ((a, b), (b, c), (c, a))], axis=1)
+    one, other = legs[i][:, :, None], legs[j][:, None]
+    along = (one == other).all(axis=3).sum(axis=(1, 2))
+    against = (one == other[..., ::-1]).all(axis=3).sum(axis=(1, 2))
+    return np.asarray(np.sign(along - against), dtype=float)
 
 
 def given_covariance(

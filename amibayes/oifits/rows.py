@@ -10,7 +10,7 @@ from astropy.time import Time
 from amibayes.errors import DataError
 from amibayes.observables import BoolArray, IntArray, Measurements
 from amibayes.oifits.scales import ANGLE, LENGTH, TIME, scale_of
-from amibayes.oifits.setups import integers, numbers
+from amibayes.oifits.setups import integers, numbers, rest_of
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
 
@@ -188,14 +188,6 @@ def _scaled(
     return np.stack(out, axis=1), notes
 
 
-def _rest(table: OITable, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """What rounding to the standard's units lost, as `write_oifits` keeps it; 0 elsewhere."""
-    values = table.columns.get(f"NS_{name}_REST")
-    if values is None or values.size != np.prod(shape) or values.dtype.kind != "f":
-        return np.zeros(shape)
-    return np.asarray(values.reshape(shape), dtype=float)
-
-
 def _cells(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> _Cells:
     value = grid(oifits, table, kind.value, n_channels)
     sigma = grid(oifits, table, kind.error, n_channels)
@@ -207,10 +199,10 @@ def _cells(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> _Cell
         if not understood:
             notes.append(f"{table.label}: unit {unit!r} of {kind.value} read as degrees")
         value, sigma = value * scale, sigma * error_scale
-    value = value + _rest(table, kind.value, value.shape)
+    value = value + rest_of(table, kind.value, value.shape)
     with np.errstate(over="ignore", invalid="ignore"):
         variance = np.where(sigma > 0, sigma**2, np.nan)
-    variance = variance + _rest(table, kind.error, value.shape)
+    variance = variance + rest_of(table, kind.error, value.shape)
     u, u_notes = _scaled(oifits, table, kind.u, LENGTH, "m")
     v, v_notes = _scaled(oifits, table, kind.v, LENGTH, "m")
     return _Cells(value, variance, u, v, (*notes, *u_notes, *v_notes))
@@ -259,13 +251,11 @@ def read_rows(
     cells = _cells(oifits, table, kind, n_channels)
     mjd, time_note = times_of(table)
     flag, flag_note = _flags(oifits, table, n_channels)
-    wrong = absurd(kind, cells.value, cells.variance) | ~(wavelength > 0)
-    wrong |= ~np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)[:, None]
-    wrong |= _repeats_a_station(station_position)[:, None]
-    newly = int((wrong & ~flag)[chosen].sum())
+    flag, newly = _with_unusable(flag, cells, kind, wavelength, station_position)
     notes = [*cells.notes, time_note, flag_note]
-    if newly:
-        notes.append(f"{table.label}: {newly} value(s) without a usable value or error flagged")
+    if newly[chosen].any():
+        count = newly[chosen].sum()
+        notes.append(f"{table.label}: {count} value(s) without a usable value or error flagged")
     each = np.repeat(chosen, n_channels)
     channel = np.tile(np.arange(n_channels), n)
     measurements = Measurements(
@@ -280,7 +270,7 @@ def read_rows(
         setup=np.zeros(n * n_channels, dtype=np.intp),
         row=each,
         channel=channel,
-        flag=(flag | wrong)[chosen].ravel(),
+        flag=flag[chosen].ravel(),
     )
     return Rows(
         measurements,
@@ -291,6 +281,20 @@ def read_rows(
         table.keyword("INSNAME"),
         notes=tuple(note for note in notes if note),
     )
+
+
+def _with_unusable(
+    flag: BoolArray,
+    cells: _Cells,
+    kind: Kind,
+    wavelength: FloatArray,
+    station_position: IntArray,
+) -> tuple[BoolArray, BoolArray]:
+    """(flags with those of cells that cannot be used, which of them are new)."""
+    wrong = absurd(kind, cells.value, cells.variance) | ~(wavelength > 0)
+    wrong |= ~np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)[:, None]
+    wrong |= _repeats_a_station(station_position)[:, None]
+    return flag | wrong, wrong & ~flag
 
 
 def _correlation_index(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> IntArray:

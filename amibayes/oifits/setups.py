@@ -90,6 +90,14 @@ def integers(oifits: OIFits, table: OITable, name: str, width: int) -> IntArray:
     return values.reshape(len(table), width).astype(np.intp)
 
 
+def rest_of(table: OITable, name: str, shape: tuple[int, ...]) -> FloatArray:
+    """What rounding to the standard's units lost, as `write_oifits` keeps it; 0 elsewhere."""
+    values = table.columns.get(f"NS_{name}_REST")
+    if values is None or values.size != np.prod(shape) or values.dtype.kind != "f":
+        return np.zeros(shape)
+    return np.asarray(values.reshape(shape), dtype=float)
+
+
 def targets_of(oifits: OIFits) -> dict[int, Target]:
     """Targets by TARGET_ID; a file without OI_TARGET has none."""
     found: dict[int, Target] = {}
@@ -165,11 +173,9 @@ def _padded(table: OITable, name: str, shape: tuple[int, ...], extra: int) -> Fl
         return None
     scale, _ = scale_of(table.units[name], LENGTH, "m")
     metres = values.reshape(shape).astype(float) * scale
-    rest = table.columns.get(f"NS_{name}_REST")
-    if rest is not None and rest.shape == metres.shape:
-        metres = metres + rest
-    if np.isnan(metres).all():
-        return None
+    metres = metres + rest_of(table, name, metres.shape)
+    if not np.nan_to_num(metres).any():
+        return None  # zero throughout is how files say that they do not know
     return np.concatenate([metres, np.full((extra, *shape[1:]), np.nan)])
 
 
@@ -231,8 +237,7 @@ def _metres(oifits: OIFits, table: OITable, name: str) -> FloatArray:
     if values.shape != (len(table),):
         raise DataError(f"{table.label}: {name} is not one number a row", source=oifits.path)
     metres = values * scale_of(table.units[name], LENGTH, "m")[0]
-    rest = table.columns.get(f"NS_{name}_REST")
-    return metres if rest is None or rest.shape != metres.shape else metres + rest
+    return np.asarray(metres + rest_of(table, name, metres.shape))
 
 
 def setup_name(table: OITable, keyword: str) -> str:

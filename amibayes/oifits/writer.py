@@ -169,12 +169,12 @@ def _array_table(layout: Layout, number: int) -> Any:
     setup = layout.arrays[number]
     n = len(setup.stations)
     diameter = setup.station_diameter_m
-    diameter = np.full(n, np.nan) if diameter is None else diameter
+    diameter = np.zeros(n) if diameter is None else diameter
     single, rest = _single(diameter)
-    xyz = np.full((n, 3), np.nan) if setup.station_xyz_m is None else setup.station_xyz_m
+    xyz = np.zeros((n, 3)) if setup.station_xyz_m is None else setup.station_xyz_m
     with np.errstate(divide="ignore", invalid="ignore"):
-        # An aperture of diameter D sees a field of λ/D.
-        fov = np.where(diameter > 0, np.mean(setup.wavelength_m) / diameter / ARCSEC, np.nan)
+        # An aperture of diameter D sees a field of λ/D; zero stands for unknown.
+        fov = np.where(diameter > 0, np.mean(setup.wavelength_m) / diameter / ARCSEC, 0.0)
     columns = {
         "TEL_NAME": list(setup.stations),
         "STA_NAME": list(setup.stations),

@@ -1,1 +1,1 @@
-"""Pictures: one small module for each, matplotlib figures out, nothing global."""
+"""Pictures: one small module for each, every function takes containers and returns a Figure."""

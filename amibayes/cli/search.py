@@ -1,0 +1,192 @@
+"""``amibayes search``: the main job."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amibayes.cli import common
+from amibayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from amibayes.pipeline import SearchOptions, SearchReport
+
+RESULT, CHAIN, CALIBRATED = "result.json", "posterior.h5", "calibrated.oifits"
+
+EXAMPLES = """examples:
+  amibayes search target.oifits --cal cal*.oifits
+  amibayes search epoch1.oifits epoch2.oifits --separation 50:400 --observables cp
+  amibayes search pionier.oifits --diameter free --separation 1:50 --out axcir
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``search``."""
+    parser.epilog = EXAMPLES
+    parser.add_argument("targets", nargs="+", metavar="TARGET", help="OIFITS file(s) of the target")
+    parser.add_argument(
+        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
+    )
+    _add_model(parser.add_argument_group("model"))
+    _add_data(parser.add_argument_group("data"))
+    stages = parser.add_argument_group("stages")
+    stages.add_argument(
+        "--null-draws",
+        type=common.non_negative_integer,
+        default=10_000,
+        metavar="N",
+        help="null searches for the false-alarm probability; 0: none (default: %(default)s)",
+    )
+    stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
+    stages.add_argument(
+        "--resume", action="store_true", help="go on with a posterior that was cut off"
+    )
+    common.add_seed_option(stages)
+    common.add_output_options(parser, "search")
+
+
+def _add_model(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--separation",
+        type=common.number_range,
+        metavar="MIN:MAX",
+        help="field in mas (default: lambda/2B_max to lambda/B_min of the data)",
+    )
+    group.add_argument(
+        "--diameter",
+        type=common.number_or_free,
+        metavar="MAS|free",
+        help="uniform-disc diameter of the primary (default: 0; free where V2 is used and the "
+        "longest baseline would notice a disc of 0.3 mas)",
+    )
+    group.add_argument(
+        "--background",
+        type=common.number_or_free,
+        default=0.0,
+        metavar="FLUX|free",
+        help="over-resolved flux, primary = 1 (default: 0)",
+    )
+    group.add_argument(
+        "--smearing",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="average the model over the width of each channel (default: yes)",
+    )
+
+
+def _add_data(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--observables",
+        type=common.observable_kinds,
+        default=("vis2", "cp"),
+        metavar="vis2,cp",
+        help="which observables to fit (default: both)",
+    )
+    group.add_argument(
+        "--closure-covariance",
+        choices=["assumed", "diagonal"],
+        default="assumed",
+        help="for files with errors and no correlations: triangles correlated through shared "
+        "baselines, or (the field's habit) independent (default: %(default)s)",
+    )
+    group.add_argument(
+        "--calibration",
+        choices=["weighted", "hierarchical"],
+        help="how calibrators are combined (default: hierarchical with 3 or more)",
+    )
+    group.add_argument(
+        "--clip",
+        type=common.positive_float,
+        default=3.0,
+        metavar="SIGMA",
+        help="sigma clipping of the calibrators (default: %(default)s)",
+    )
+    group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
+    group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the main job and write its files."""
+    common.configure_logging(arguments)
+    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    from amibayes.files import output_folder
+
+    overwrite = arguments.overwrite or arguments.resume
+    folder = output_folder(arguments.out, _names(arguments), overwrite=overwrite)
+    report = _search(arguments, folder)
+    _write(report, folder)
+    common.finish(arguments, _json(report), lambda: _summary(report, folder))
+    return 0
+
+
+def _names(arguments: argparse.Namespace) -> list[str]:
+    from amibayes.plots.search import picture_names
+
+    names = [RESULT, *picture_names(posterior=not arguments.no_posterior, cal=bool(arguments.cal))]
+    names += [] if arguments.no_posterior else [CHAIN]
+    return [*names, CALIBRATED] if arguments.cal else names
+
+
+def _search(arguments: argparse.Namespace, folder: Path) -> SearchReport:
+    from amibayes.pipeline import search_companion
+
+    with common.Progress(quiet=arguments.quiet) as progress:
+        return search_companion(
+            arguments.targets,
+            arguments.cal,
+            _options(arguments),
+            chain=folder / CHAIN,
+            resume=arguments.resume,
+            announce=progress.stage,
+            progress=progress.update,
+        )
+
+
+def _options(arguments: argparse.Namespace) -> SearchOptions:
+    from amibayes.pipeline import SearchOptions
+
+    if arguments.calibration and not arguments.cal:
+        raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
+    return SearchOptions(
+        separation_mas=arguments.separation,
+        observables=arguments.observables,
+        diameter=arguments.diameter,
+        background=arguments.background,
+        smearing=arguments.smearing,
+        closure_covariance=arguments.closure_covariance,
+        calibration=arguments.calibration,
+        clip=arguments.clip,
+        insname=arguments.insname,
+        target=arguments.target,
+        null_draws=arguments.null_draws,
+        posterior=not arguments.no_posterior,
+        limits=not arguments.no_limits,
+        seed=arguments.seed,
+    )
+
+
+def _write(report: SearchReport, folder: Path) -> None:
+    from amibayes.files import write_json
+    from amibayes.oifits import write_oifits
+    from amibayes.plots.search import save_pictures
+
+    if report.calibration is not None:
+        write_oifits(folder / CALIBRATED, report.observables, overwrite=True)
+    save_pictures(report, folder)
+    write_json(folder / RESULT, _json(report))
+
+
+def _json(report: SearchReport) -> dict[str, object]:
+    from amibayes.report import result_json
+
+    return result_json(report)
+
+
+def _summary(report: SearchReport, folder: Path) -> list[str]:
+    from amibayes.report import summary
+
+    return summary(report, folder)
+
+
+__all__ = ["add_arguments", "run"]

@@ -1,0 +1,255 @@
+"""The main job, as a reader would tell it: read, calibrate, search, weigh, sample."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from amibayes.calibration import Calibration, calibrate
+from amibayes.errors import UsageError
+from amibayes.inference.bank import TemplateBank
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.limits import DetectionLimit, detection_limit
+from amibayes.inference.model import BinaryModel
+from amibayes.inference.posterior import Posterior, sample
+from amibayes.inference.priors import default_prior
+from amibayes.inference.results import SearchResult
+from amibayes.inference.search import resolves_stars, search
+from amibayes.inference.significance import ALPHA, Significance, significance
+from amibayes.observables import Observables, join
+from amibayes.oifits import read_oifits
+
+Stage = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What the main job is asked to do.
+
+    Parameters
+    ----------
+    separation_mas : (inner, outer), optional
+        By default λ/2B_max to λ/B_min of the data.
+    observables : tuple of {"vis2", "cp"}
+    diameter : float, "free" or None
+        Uniform-disc diameter of the primary, mas. None: free where the longest baseline
+        would notice a disc of 0.3 mas and V² is used, else 0.
+    background : float or "free"
+        Over-resolved flux in units of the primary's.
+    smearing : bool
+    closure_covariance : {"assumed", "diagonal"}
+        For files that give errors and no correlations.
+    calibration : str, optional
+        Method; by default that of `amibayes.calibration.calibrate`.
+    clip : float
+        Sigma clipping of the calibrators.
+    insname, target : str, optional
+        One instrument, one target of a file that holds several.
+    null_draws : int
+        0 leaves the false-alarm probability out.
+    alpha : float
+        False-alarm probability of a detection.
+    posterior, limits : bool
+        Whether to sample the posterior, and to measure detection limits (which need the
+        null draws).
+    seed : int
+    """
+
+    separation_mas: tuple[float, float] | None = None
+    observables: tuple[str, ...] = ("vis2", "cp")
+    diameter: float | Literal["free"] | None = None
+    background: float | Literal["free"] = 0.0
+    smearing: bool = True
+    closure_covariance: Literal["assumed", "diagonal"] = "assumed"
+    calibration: str | None = None
+    clip: float = 3.0
+    insname: str | None = None
+    target: str | None = None
+    null_draws: int = 10_000
+    alpha: float = ALPHA
+    posterior: bool = True
+    limits: bool = True
+    seed: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class SearchReport:
+    """Everything the main job found, for `amibayes.report` and `amibayes.plots`."""
+
+    options: SearchOptions
+    targets: tuple[str, ...]
+    calibrators: tuple[str, ...]
+    observables: Observables
+    calibration: Calibration | None
+    result: SearchResult
+    significance: Significance | None
+    posterior: Posterior | None
+    limits: DetectionLimit | None
+    warnings: tuple[str, ...]
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+
+class _Clock:
+    """Times the stages and announces them."""
+
+    def __init__(self, announce: Stage) -> None:
+        self.seconds: dict[str, float] = {}
+        self._announce = announce
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        self._announce(name)
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+
+
+def search_companion(
+    targets: Sequence[str | Path],
+    calibrators: Sequence[str | Path] = (),
+    options: SearchOptions | None = None,
+    *,
+    chain: str | Path | None = None,
+    resume: bool = False,
+    announce: Stage = lambda name: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> SearchReport:
+    """Find, weigh and measure a companion: the main job.
+
+    Parameters
+    ----------
+    targets, calibrators : sequence of path
+        OIFITS files. Targets are fitted together; without calibrators they are taken as
+        calibrated.
+    options : SearchOptions, optional
+    chain : path, optional
+        HDF5 file for the chain of the posterior.
+    resume : bool
+        Go on from ``chain``.
+    announce : callable
+        Told the name of each stage as it begins.
+    progress : callable, optional
+        Told (steps done, steps expected) of the posterior.
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be read or the data cannot carry the fit.
+    UsageError
+        Where the request makes no sense.
+    """
+    options = options or SearchOptions()
+    if not targets:
+        raise UsageError("no target given", remedy="name at least one file")
+    streams = np.random.SeedSequence(options.seed).spawn(3)
+    clock = _Clock(announce)
+    # One BLAS thread: the same bits on every machine and for any number of workers.
+    with threadpool_limits(1):
+        with clock.stage("read"):
+            parts = [_read(path, options) for path in targets]
+            references = [_read(path, options) for path in calibrators]
+        calibration = None
+        if references:
+            with clock.stage("calibrate"):
+                calibration = calibrate(parts, references, **_calibration_options(options))
+                parts = list(calibration.targets)
+        observables = join([part.unflagged() for part in parts])
+        with clock.stage("search"):
+            likelihood = Likelihood(observables.only(options.observables))
+            likelihood = likelihood.with_model(_model(likelihood, options))
+            result = search(likelihood, options.separation_mas)
+        weight = None
+        if options.null_draws:
+            with clock.stage("significance"):
+                weight = _weigh(result, options, np.random.default_rng(streams[0]))
+        posterior = None
+        if options.posterior:
+            with clock.stage("posterior"):
+                posterior = sample(
+                    result,
+                    default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas),
+                    np.random.default_rng(streams[1]),
+                    path=chain,
+                    resume=resume,
+                    progress=progress,
+                )
+        limits = None
+        if options.limits and weight is not None:
+            with clock.stage("limits"):
+                limits = detection_limit(result, weight, np.random.default_rng(streams[2]))
+    return SearchReport(
+        options,
+        tuple(str(p) for p in targets),
+        tuple(str(p) for p in calibrators),
+        observables,
+        calibration,
+        result,
+        weight,
+        posterior,
+        limits,
+        _warnings(observables, result, weight, posterior),
+        clock.seconds,
+    )
+
+
+def _read(path: str | Path, options: SearchOptions) -> Observables:
+    return read_oifits(
+        path,
+        insname=options.insname,
+        target=options.target,
+        closure_covariance=options.closure_covariance,
+    )
+
+
+def _calibration_options(options: SearchOptions) -> dict[str, object]:
+    chosen: dict[str, object] = {"clip": options.clip}
+    if options.calibration is not None:
+        chosen["method"] = options.calibration
+    return chosen
+
+
+def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
+    diameter = options.diameter
+    if diameter is None:
+        diameter = "free" if resolves_stars(likelihood) else 0.0
+    return BinaryModel(1, diameter, options.background, options.smearing)
+
+
+def _weigh(result: SearchResult, options: SearchOptions, rng: np.random.Generator) -> Significance:
+    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    statistic = float(result.bank_delta_chi2.max())
+    return significance(bank, statistic, options.null_draws, rng, options.alpha)
+
+
+def _warnings(
+    observables: Observables,
+    result: SearchResult,
+    weight: Significance | None,
+    posterior: Posterior | None,
+) -> tuple[str, ...]:
+    found = [*observables.notes, *result.warnings]
+    reduced = result.chi2_binary / result.ndof
+    if reduced > 2.0:
+        found.append(
+            f"reduced chi2 is {reduced:.1f} with the companion: the errors are too small or the "
+            "model is incomplete, and significance and errors are too optimistic"
+        )
+    if weight is not None and weight.tail is not None:
+        found.append(
+            f"none or few of the {weight.n_draws} null draws reach the observed statistic: the "
+            f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "
+            "is extrapolated"
+        )
+    if posterior is not None and not posterior.converged:
+        found.append(
+            f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "
+            f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
+        )
+    return tuple(found)

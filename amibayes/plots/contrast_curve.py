@@ -1,0 +1,178 @@
+"""Detection limits against separation, and how complete a search is below them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from amibayes.inference.results import Companion
+from amibayes.plots.style import (
+    BLACK,
+    DASHES,
+    SEQUENTIAL,
+    SERIES,
+    VERMILLION,
+    new_figure,
+    styled,
+)
+from amibayes.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A limit against separation.
+
+    Parameters
+    ----------
+    delta_mag : (n,) float array
+        NaN where there is none.
+    low, high : (n,) float array, optional
+        Spread with position angle, or an interval.
+    """
+
+    delta_mag: FloatArray
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+
+
+@styled()
+def limits_plot(
+    separation_mas: FloatArray,
+    curves: Mapping[str, Curve],
+    companion: Companion | None = None,
+) -> Figure:
+    """Draw limiting magnitude differences against separation, fainter downward.
+
+    Parameters
+    ----------
+    separation_mas : (n,) float array
+    curves : mapping of str to Curve
+        By the name that the legend gives: method, and false-positive rate or completeness.
+    companion : Companion, optional
+        One that was found, with its errors.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = new_figure(4.9)
+    ax = figure.subplots()
+    for i, (name, curve) in enumerate(curves.items()):
+        colour, dash = SERIES[i % len(SERIES)], DASHES[i % len(DASHES)]
+        ax.plot(separation_mas, curve.delta_mag, color=colour, ls=dash, lw=2.0, label=name)
+        if curve.low is not None and curve.high is not None:
+            ax.fill_between(separation_mas, curve.low, curve.high, color=colour, alpha=0.2, lw=0)
+    if companion is not None:
+        _mark_companion(ax, companion)
+    _magnitude_axis(ax)
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(2, len(labels)))
+    return figure
+
+
+@styled()
+def completeness_map(
+    separation_mas: FloatArray,
+    delta_mag: FloatArray,
+    fraction: FloatArray,
+    c50: FloatArray | None = None,
+    c95: FloatArray | None = None,
+) -> Figure:
+    """Draw the share of injected companions that the search finds.
+
+    Parameters
+    ----------
+    separation_mas : (n_sep,) float array
+        Increasing.
+    delta_mag : (n_mag,) float array
+        Increasing.
+    fraction : (n_sep, n_mag) float array
+        Between 0 and 1; NaN where nothing was injected.
+    c50, c95 : (n_sep,) float array, optional
+        Magnitude difference of 50 and 95 % completeness.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = new_figure(5.0)
+    ax = figure.subplots()
+    mesh = ax.pcolormesh(
+        _edges(separation_mas),
+        _edges(delta_mag),
+        np.ma.masked_invalid(fraction.T),
+        cmap=SEQUENTIAL,
+        vmin=0.0,
+        vmax=1.0,
+    )
+    for values, dash, name in [(c50, "-", "50 % found"), (c95, "--", "95 % found")]:
+        if values is not None:
+            ax.plot(separation_mas, values, color="white", lw=4.0)
+            ax.plot(separation_mas, values, color=BLACK, ls=dash, lw=2.0, label=name)
+    _magnitude_axis(ax, limits=(_edges(delta_mag)[0], _edges(delta_mag)[-1]))
+    figure.colorbar(
+        mesh, ax=ax, label="Share of injected companions found", location="top", aspect=35
+    )
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _edges(centres: FloatArray) -> FloatArray:
+    """Borders of the cells about increasing centres."""
+    if len(centres) == 1:
+        return np.array([centres[0] - 0.5, centres[0] + 0.5])
+    middle = 0.5 * (centres[1:] + centres[:-1])
+    first, last = 2.0 * centres[0] - middle[0], 2.0 * centres[-1] - middle[-1]
+    return np.concatenate([[first], middle, [last]])
+
+
+def _mark_companion(ax: Axes, companion: Companion) -> None:
+    errors = [companion.delta_mag_error, companion.separation_error_mas]
+    up, along = [e if np.isfinite(e) else None for e in errors]
+    ax.errorbar(
+        companion.separation_mas,
+        companion.delta_mag,
+        yerr=up,
+        xerr=along,
+        fmt="*",
+        color=VERMILLION,
+        markeredgecolor=BLACK,
+        markersize=15,
+        label="companion found",
+    )
+
+
+def _magnitude_axis(ax: Axes, limits: tuple[float, float] | None = None) -> None:
+    """Label the axes: magnitudes left, growing downward, decades of contrast right."""
+    low, high = limits or ax.get_ylim()
+    ax.set_ylim(high, low)
+    ax.set_xlabel("Separation (mas)")
+    ax.set_ylabel("Magnitude difference")
+    right = ax.secondary_yaxis("right")
+    right.yaxis.set_major_locator(FixedLocator(contrast_marks(low, high)))
+    right.yaxis.set_minor_locator(NullLocator())
+    right.yaxis.set_major_formatter(FuncFormatter(_contrast_text))
+    right.set_ylabel("Contrast (flux ratio)")
+
+
+def contrast_marks(low: float, high: float) -> list[float]:
+    """Magnitudes of round contrasts in a range: decades, and 2 and 5 of each in short ones."""
+    steps = np.array([1.0, 2.0, 5.0]) if high - low < 7.5 else np.array([1.0])
+    decades = 10.0 ** np.arange(np.floor(-0.4 * high), np.ceil(-0.4 * low) + 1)
+    marks = -2.5 * np.log10(np.outer(decades, steps).ravel())
+    return sorted(marks[(marks >= low) & (marks <= high)].tolist())
+
+
+def _contrast_text(delta_mag: float, _: object) -> str:
+    mantissa, exponent = f"{10.0 ** (-0.4 * delta_mag):.0e}".split("e")
+    if int(exponent) == 0:
+        return mantissa
+    power = f"10$^{{{int(exponent)}}}$"
+    return power if mantissa == "1" else f"{mantissa}×{power}"

@@ -1,0 +1,143 @@
+"""Marginal distributions of a posterior, one by one and in pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import corner
+import numpy as np
+from matplotlib.figure import Figure
+
+from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
+from amibayes.units import FloatArray
+
+NAMES = {
+    "east_mas": "East (mas)",
+    "north_mas": "North (mas)",
+    "contrast": "Contrast",
+    "log_contrast": "ln contrast",
+    "diameter_mas": "Diameter (mas)",
+    "background": "Background",
+    "separation_mas": "Separation (mas)",
+    "position_angle_deg": "PA (°)",
+    "delta_mag": "Δmag",
+}
+
+CONTOUR_POINTS = 10_000
+"""Samples per pair of panels below which points are drawn beside the contours."""
+
+
+def label_of(name: str) -> str:
+    """Name of a parameter as an axis label, with its unit; unknown names as they are."""
+    base, _, number = name.rpartition("_")
+    if number.isdigit() and base in NAMES:
+        return f"{NAMES[base]}, {number}"
+    return NAMES.get(name, name)
+
+
+@styled()
+def corner_plot(
+    samples: FloatArray,
+    labels: Sequence[str],
+    truths: Sequence[float] | None = None,
+    best: Sequence[float] | None = None,
+) -> Figure:
+    """Draw the corner plot of a posterior, with medians and 68 % intervals as titles.
+
+    Parameters
+    ----------
+    samples : (n, n_dim) float array
+    labels : sequence of str
+        Names of the parameters; those that amibayes knows get their unit.
+    truths, best : sequence of n_dim float, optional
+        True values (dashed lines), best fit (solid lines with squares).
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ValueError
+        Where samples are not finite, fewer than dimensions, or do not match the labels.
+    """
+    draws = np.array(samples, dtype=float)
+    if draws.ndim != 2 or draws.shape[1] != len(labels) or len(draws) <= draws.shape[1]:
+        raise ValueError(f"samples of shape {draws.shape} for {len(labels)} labels")
+    if not np.isfinite(draws).all():
+        raise ValueError("samples that are not finite")
+    factor, names = _scales(draws, labels)
+    draws = draws * factor
+    size = max(6.4, 1.0 + 1.75 * draws.shape[1])
+    figure = new_figure(size, size, layout=None)
+    corner.corner(
+        draws,
+        fig=figure,
+        labels=names,
+        range=_ranges(draws),
+        quantiles=(0.16, 0.5, 0.84),
+        color=BLACK,
+        bins=30,
+        max_n_ticks=4,
+        **_density(len(draws)),
+    )
+    # Room for two-line titles and for labels beyond slanted numbers, in inches.
+    figure.subplots_adjust(0.95 / size, 0.95 / size, 1.0 - 0.12 / size, 1.0 - 0.55 / size)
+    _title(figure, draws, names)
+    for values, colour, dash, marker in [(best, BLUE, "-", "s"), (truths, VERMILLION, "--", "o")]:
+        if values is not None:
+            at = np.asarray(values, dtype=float) * factor
+            corner.overplot_lines(figure, at, color=colour, linestyle=dash, linewidth=1.2)
+            corner.overplot_points(figure, at[None], color=colour, marker=marker, markersize=5)
+    return figure
+
+
+def _scales(draws: FloatArray, labels: Sequence[str]) -> tuple[FloatArray, list[str]]:
+    """Powers of a thousand that make small numbers readable, and labels that say so."""
+    largest = np.abs(draws).max(axis=0)
+    power = np.where(
+        (largest > 0) & (largest < 0.02), -np.floor(np.log10(np.maximum(largest, 1e-300)) / 3), 0
+    )
+    names = [
+        label_of(name) + (f" × 10$^{{{3 * int(p)}}}$" if p else "")
+        for name, p in zip(labels, power, strict=True)
+    ]
+    return np.asarray(10.0 ** (3 * power)), names
+
+
+def _ranges(draws: FloatArray) -> list[tuple[float, float]]:
+    """Limits of the axes; a parameter that never moves gets some room."""
+    low, high = np.quantile(draws, [0.0005, 0.9995], axis=0)
+    room = np.maximum(0.05 * (high - low), 1e-9 * np.maximum(np.abs(high), 1e-3))
+    return list(zip((low - room).tolist(), (high + room).tolist(), strict=True))
+
+
+def _density(n: int) -> dict[str, object]:
+    """Contours hold 39 and 86 % of two dimensions (1 and 2σ); few samples show as points."""
+    many = n >= CONTOUR_POINTS
+    return {
+        "levels": (0.393, 0.865),
+        "smooth": 1.0,
+        "plot_datapoints": not many,
+        "plot_contours": n >= 200,
+        "plot_density": n >= 200,
+        "no_fill_contours": n < 200,
+        "data_kwargs": {"alpha": 0.25, "ms": 1.5},
+        "quiet": True,
+    }
+
+
+def _title(figure: Figure, draws: FloatArray, names: Sequence[str]) -> None:
+    n = draws.shape[1]
+    for i, name in enumerate(names):
+        low, mid, high = np.quantile(draws[:, i], [0.16, 0.5, 0.84])
+        figure.axes[i * n + i].set_title(
+            f"{name}\n{interval_text(mid, mid - low, high - mid)}", fontsize=10, pad=5
+        )
+
+
+def interval_text(mid: float, below: float, above: float) -> str:
+    """Median and distances to the ends of the interval, two digits of the smaller one."""
+    least = min(x for x in (below, above, np.inf) if x > 0)
+    digits = int(np.clip(1 - np.floor(np.log10(least)), 0, 9)) if np.isfinite(least) else 3
+    return rf"${mid:.{digits}f}_{{-{below:.{digits}f}}}^{{+{above:.{digits}f}}}$"

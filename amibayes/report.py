@@ -1,0 +1,287 @@
+"""What the main job says: `result.json` and the summary on the terminal."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amibayes import __version__
+from amibayes.files import sha256
+from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.posterior import Posterior
+from amibayes.inference.results import Companion, Mode, SearchResult
+from amibayes.inference.significance import Significance
+from amibayes.pipeline import SearchReport
+from amibayes.units import contrast_to_delta_mag
+
+Json = dict[str, Any]
+
+QUANTITIES = (
+    "separation_mas",
+    "position_angle_deg",
+    "contrast",
+    "delta_mag",
+    "east_mas",
+    "north_mas",
+)
+
+
+def number(value: float) -> float | None:
+    """Make a float for JSON: null where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def result_json(report: SearchReport) -> Json:
+    """Build the content of ``result.json``, whose keys scripts rely on."""
+    result = report.result
+    return {
+        "amibayes": __version__,
+        "seed": report.options.seed,
+        "inputs": _inputs(report),
+        "data": _data(report),
+        "fit": _fit(result),
+        "significance": _significance(result, report.significance, report.options.alpha),
+        "modes": [_mode(mode) for mode in result.modes],
+        "posterior": None if report.posterior is None else _posterior(report.posterior),
+        "calibration": _calibration(report),
+        "limits": None if report.limits is None else limits_json(report.limits),
+        "noise": None,
+        "evidence": None,
+        "warnings": list(report.warnings),
+        "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
+    }
+
+
+def _inputs(report: SearchReport) -> list[Json]:
+    files = [(p, "target") for p in report.targets] + [
+        (p, "calibrator") for p in report.calibrators
+    ]
+    return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
+
+
+def _data(report: SearchReport) -> Json:
+    used = report.result.likelihood.observables
+    return {
+        "n_vis2": used.n_vis2,
+        "n_closure_phases": used.n_closure_phases,
+        "n_independent": used.n_independent,
+        "covariance": used.covariance_kind,
+        "n_integrations": used.n_integrations,
+        "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
+        "separation_mas": [report.result.grid.inner_mas, report.result.grid.outer_mas],
+    }
+
+
+def _fit(result: SearchResult) -> Json:
+    c = result.companion
+    return {
+        **{name: number(getattr(c, name)) for name in QUANTITIES},
+        "diameter_mas": result.nuisance("diameter_mas"),
+        "background": result.nuisance("background"),
+        "chi2_single": result.chi2_single,
+        "chi2_binary": result.chi2_binary,
+        "chi2r_single": result.chi2_single / result.ndof,
+        "chi2r_binary": result.chi2_binary / result.ndof,
+        "ndof": result.ndof,
+        "errors": _errors(c, result),
+    }
+
+
+def _errors(c: Companion, result: SearchResult) -> Json:
+    errors = {
+        "separation_mas": c.separation_error_mas,
+        "position_angle_deg": c.position_angle_error_deg,
+        "contrast": c.contrast_error,
+        "delta_mag": c.delta_mag_error,
+        "east_mas": c.east_error_mas,
+        "north_mas": c.north_error_mas,
+    }
+    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
+        errors[name] = float(np.sqrt(result.theta_covariance[k, k]))
+    return {name: number(value) for name, value in errors.items()}
+
+
+def _significance(result: SearchResult, weight: Significance | None, alpha: float) -> Json:
+    out: Json = {
+        "delta_chi2": result.delta_chi2,
+        "candid_n_sigma": result.candid_n_sigma,
+        "false_alarm_probability": None,
+        "false_alarm_interval": None,
+        "n_null_draws": 0,
+        "tail_extrapolated": False,
+        "detected": None,
+        "alpha": alpha,
+    }
+    if weight is not None:
+        out |= {
+            "false_alarm_probability": weight.probability,
+            "false_alarm_interval": list(weight.interval),
+            "n_null_draws": weight.n_draws,
+            "detected": weight.detected,
+            "statistic": weight.statistic,
+            "threshold": weight.threshold(),
+            "extrapolation": None
+            if weight.tail is None
+            else {
+                "generalised_pareto": weight.tail.generalised_pareto,
+                "extreme_value": weight.tail.extreme_value,
+                "log10_error": number(weight.tail.log10_error),
+            },
+        }
+    return out
+
+
+def _mode(mode: Mode) -> Json:
+    c = mode.companion
+    return {
+        "separation_mas": c.separation_mas,
+        "position_angle_deg": c.position_angle_deg,
+        "contrast": c.contrast,
+        "delta_chi2": mode.delta_chi2,
+    }
+
+
+def _posterior(posterior: Posterior) -> Json:
+    names = [*QUANTITIES, *posterior.names[3:]]
+    out: Json = {}
+    for name in names:
+        median, lower, upper = posterior.interval(name, 0.68)
+        _, lower95, upper95 = posterior.interval(name, 0.95)
+        out[name] = {
+            "median": median,
+            "lower": lower,
+            "upper": upper,
+            "lower_95": lower95,
+            "upper_95": upper95,
+        }
+    return out | {
+        "autocorrelation_time": number(posterior.autocorrelation_time),
+        "n_effective": posterior.n_effective,
+        "n_steps": posterior.n_steps,
+        "n_walkers": posterior.n_walkers,
+        "acceptance": posterior.acceptance,
+        "split_rhat": number(posterior.split_rhat),
+        "converged": posterior.converged,
+        "prior": {
+            "separation_mas": [posterior.prior.inner_mas, posterior.prior.outer_mas],
+            "contrast": [posterior.prior.contrast_min, posterior.prior.contrast_max],
+            "form": "uniform in area, log-uniform in contrast",
+        },
+    }
+
+
+def limits_json(limits: DetectionLimit) -> Json:
+    """Build the content of ``limits`` in ``result.json``; null where no contrast will do."""
+    contrasts = [number(x) for x in limits.contrast]
+    return {
+        "method": limits.method,
+        "separation_mas": list(limits.separation_mas),
+        "delta_mag_3sigma": [number(x) for x in limits.delta_mag],
+        "contrast": contrasts,
+        "delta_mag_50": [number(x) for x in contrast_to_delta_mag(limits.contrast_50)],
+        "delta_mag_error": [number(2.5 / np.log(10.0) * x) for x in limits.log_error],
+        "false_positive_rate": limits.false_positive_rate,
+        "completeness": limits.completeness,
+    }
+
+
+def _calibration(report: SearchReport) -> Json | None:
+    calibration = report.calibration
+    if calibration is None:
+        return None
+    return {
+        "method": calibration.method,
+        "calibrators": [
+            {"path": path, "kept": used.kept, "reason": used.reason}
+            for path, used in zip(report.calibrators, calibration.calibrators, strict=True)
+        ],
+        "tau": {
+            "vis2": calibration.tau_vis2,
+            "closure_phase_deg": None
+            if calibration.tau_closure_phase_rad is None
+            else float(np.degrees(calibration.tau_closure_phase_rad)),
+        },
+    }
+
+
+def summary(report: SearchReport, folder: Path) -> list[str]:
+    """Say the result in at most 20 lines."""
+    result, c = report.result, report.result.companion
+    used = result.likelihood.observables
+    lines = [
+        f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
+        f"{used.n_independent} independent ({used.covariance_kind} covariance)",
+        f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
+        f"{len(result.grid)} positions",
+        _verdict(report),
+        f"best fit    {c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
+        f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
+        f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)",
+        f"contrast    {c.contrast:.5f} +/- {c.contrast_error:.5f} "
+        f"(delta mag {c.delta_mag:.2f} +/- {c.delta_mag_error:.2f})",
+        f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
+        f"({result.ndof} dof: reduced {result.chi2_single / result.ndof:.3f} -> "
+        f"{result.chi2_binary / result.ndof:.3f})",
+        f"strength    delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
+        f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
+    ]
+    lines += _nuisance_lines(result)
+    if report.posterior is not None:
+        lines += _posterior_lines(report.posterior)
+    if report.limits is not None:
+        lines += _limit_lines(report.limits)
+    room = 19 - len(lines)
+    lines += [f"WARNING     {text}" for text in report.warnings[:room]]
+    if len(report.warnings) > room:
+        lines[-1] = f"WARNING     {len(report.warnings) - room + 1} more warnings in result.json"
+    return [*lines, f"written to  {folder}"]
+
+
+def _verdict(report: SearchReport) -> str:
+    weight = report.significance
+    if weight is None:
+        return "companion   not judged: no false-alarm probability was asked for"
+    low, high = weight.interval
+    chance = f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g})"
+    verdict = "DETECTED" if weight.detected else "not detected"
+    return f"companion   {verdict}; {chance} in {weight.n_draws} null searches"
+
+
+def _nuisance_lines(result: SearchResult) -> list[str]:
+    lines = []
+    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
+        label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
+        error = np.sqrt(result.theta_covariance[k, k])
+        lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")
+    return lines
+
+
+def _limit_lines(limits: DetectionLimit) -> list[str]:
+    delta = limits.delta_mag[np.isfinite(limits.delta_mag)]
+    if not len(delta):
+        return ["limits      no injected companion is recovered reliably in this field"]
+    return [
+        f"limits      delta mag {delta.min():.2f} to {delta.max():.2f} over the field "
+        f"({limits.completeness:.0%} recovered, false-positive rate "
+        f"{limits.false_positive_rate:.2g})"
+    ]
+
+
+def _posterior_lines(posterior: Posterior) -> list[str]:
+    parts = []
+    for name, unit in (
+        ("separation_mas", "mas"),
+        ("position_angle_deg", "deg"),
+        ("delta_mag", "mag"),
+    ):
+        median, low, high = posterior.interval(name)
+        parts.append(f"{median:.2f} +{high - median:.2f} -{median - low:.2f} {unit}")
+    state = "converged" if posterior.converged else "NOT CONVERGED"
+    return [
+        f"posterior   {', '.join(parts)} (median, 68%)",
+        f"chain       {posterior.n_steps} steps, tau {posterior.autocorrelation_time:.1f}, "
+        f"split R-hat {posterior.split_rhat:.3f}: {state}",
+    ]
