@@ -64,7 +64,7 @@ def main() -> None:
         before, contents = megabytes(), []
         for workers in (1, 2):
             start = time.perf_counter()
-            shot, shutter = next(read_program(scene).shutters(seed=1))
+            _, shutter = next(read_program(scene).shutters(seed=1))
             path = Path(folder) / f"{workers}.fits"
             with open_executor(workers) as executor:
                 write_exposure(path, shutter, executor)

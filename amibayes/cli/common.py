@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
-    from amibayes.parallel import Executor, Progress
+    from amibayes.parallel import Executor
+    from amibayes.parallel import Progress as Told
 
 
 def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
@@ -77,7 +78,7 @@ def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executo
 
 def progress_of(
     arguments: argparse.Namespace, description: str, *, unit: str = "piece", scale: float = 1.0
-) -> AbstractContextManager[Progress]:
+) -> AbstractContextManager[Told]:
     """Open a progress bar, unless ``--quiet``."""
     from amibayes.parallel import progress_bar
 

@@ -5,7 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli.common import add_output_options, number_range, positive_float
+from amibayes.cli.common import (
+    add_output_options,
+    configure_logging,
+    finish,
+    number_range,
+    positive_float,
+)
 
 if TYPE_CHECKING:
     from amibayes.planning import ContrastCurve, Expectation, Plan
@@ -57,7 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plan, write ``plan.json``, print a summary."""
-    from amibayes.files import output_folder, to_json, write_json
+    configure_logging(arguments)
+    from amibayes.files import output_folder, write_json
     from amibayes.instrument import load_instrument
     from amibayes.planning import PlanOptions, expect, make_plan
 
@@ -74,10 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     content = as_json(plan, expected, arguments.mag)
     folder = output_folder(arguments.out, ["plan.json"], overwrite=arguments.overwrite)
     write_json(folder / "plan.json", content)
-    if arguments.json:
-        print(to_json(content), end="")
-    elif not arguments.quiet:
-        print("\n".join(summary(plan, expected)))
+    finish(arguments, content, lambda: summary(plan, expected))
     return 0
 
 

@@ -6,11 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from amibayes import __version__
 from amibayes.cli.common import (
     add_output_options,
     add_parallel_options,
     add_seed_option,
+    configure_logging,
     executor_of,
+    finish,
     positive_float,
     progress_of,
 )
@@ -46,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate every exposure of the file."""
+    configure_logging(arguments)
     from amibayes.simulation.program import Overrides, example, read_program
 
     if arguments.example:
@@ -56,7 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
     overrides = Overrides(arguments.filter, arguments.photons, arguments.ramps)
     program = read_program(arguments.scene, overrides)
     done = observe(arguments, program)
-    report(arguments, done)
+    content = {"amibayes": __version__, "seed": arguments.seed, "exposures": done}
+    finish(arguments, content, lambda: summary(done))
     return 0
 
 
@@ -105,20 +110,11 @@ def described(shot: Shot, shutter: Shutter, path: Path) -> dict[str, Any]:
     }
 
 
-def report(arguments: argparse.Namespace, done: list[dict[str, Any]]) -> None:
-    """Print what was made."""
-    from amibayes import __version__
-    from amibayes.files import to_json
-
-    if arguments.json:
-        content = {"amibayes": __version__, "seed": arguments.seed, "exposures": done}
-        print(to_json(content), end="")
-    elif not arguments.quiet:
-        shown = done if len(done) <= 18 else done[:18]
-        for entry in shown:
-            print(
-                f"{entry['path']}  {entry['filter']}  {entry['n_groups']} groups, "
-                f"{entry['n_integrations']} integrations, {entry['total_photons']:.3g} photons"
-            )
-        if len(done) > len(shown):
-            print(f"and {len(done) - len(shown)} more")
+def summary(done: list[dict[str, Any]]) -> list[str]:
+    """Say what was made, in a few lines."""
+    lines = [
+        f"{entry['path']}  {entry['filter']}  {entry['n_groups']} groups, "
+        f"{entry['n_integrations']} integrations, {entry['total_photons']:.3g} photons"
+        for entry in done
+    ]
+    return lines if len(lines) <= 20 else [*lines[:19], f"and {len(lines) - 19} more"]
