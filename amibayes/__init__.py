@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration, calibrate
+    from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.inference.bank import TemplateBank
     from amibayes.inference.likelihood import Likelihood
@@ -35,9 +36,12 @@ if TYPE_CHECKING:
     )
     from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
+    from amibayes.parallel import open_executor
     from amibayes.pipeline import SearchOptions, SearchReport, search_companion
+    from amibayes.planning import expect, make_plan
     from amibayes.scene import Scene
     from amibayes.scene_file import load_scene
+    from amibayes.simulation import Detector, Exposure, Observation, simulate
     from amibayes.synthetic import point_source
 
 _HOME = {
@@ -45,14 +49,18 @@ _HOME = {
     "BinaryModel": "amibayes.inference.model",
     "Calibration": "amibayes.calibration",
     "Companion": "amibayes.inference.results",
+    "Cube": "amibayes.cube",
     "DataError": "amibayes.errors",
     "DetectionLimit": "amibayes.inference.limits",
+    "Detector": "amibayes.simulation",
+    "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
     "Instrument": "amibayes.instrument",
     "Likelihood": "amibayes.inference.likelihood",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
     "Observables": "amibayes.observables",
+    "Observation": "amibayes.simulation",
     "Orientation": "amibayes.orientation",
     "Posterior": "amibayes.inference.posterior",
     "Prior": "amibayes.inference.priors",
@@ -68,21 +76,28 @@ _HOME = {
     "Wavefront": "amibayes.optics",
     "calibrate": "amibayes.calibration",
     "detection_limit": "amibayes.inference.limits",
+    "expect": "amibayes.planning",
     "fringe_basis": "amibayes.optics",
     "instrument_names": "amibayes.instrument",
     "join": "amibayes.observables",
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
+    "make_plan": "amibayes.planning",
     "observables_of": "amibayes.oifits",
+    "open_cube": "amibayes.cube",
+    "open_executor": "amibayes.parallel",
     "open_oifits": "amibayes.oifits",
     "point_source": "amibayes.synthetic",
     "psf": "amibayes.optics",
+    "read_cube": "amibayes.cube",
     "read_oifits": "amibayes.oifits",
     "sample": "amibayes.inference.posterior",
     "scene_image": "amibayes.optics",
     "search": "amibayes.inference.search",
     "search_companion": "amibayes.pipeline",
     "significance": "amibayes.inference.significance",
+    "simulate": "amibayes.simulation",
+    "write_cube": "amibayes.cube",
     "write_oifits": "amibayes.oifits",
 }
 
@@ -91,14 +106,18 @@ __all__ = [
     "BinaryModel",
     "Calibration",
     "Companion",
+    "Cube",
     "DataError",
     "DetectionLimit",
+    "Detector",
+    "Exposure",
     "FringeBasis",
     "Instrument",
     "Likelihood",
     "OIFits",
     "OITable",
     "Observables",
+    "Observation",
     "Orientation",
     "Posterior",
     "Prior",
@@ -115,21 +134,28 @@ __all__ = [
     "__version__",
     "calibrate",
     "detection_limit",
+    "expect",
     "fringe_basis",
     "instrument_names",
     "join",
     "load_instrument",
     "load_scene",
+    "make_plan",
     "observables_of",
+    "open_cube",
+    "open_executor",
     "open_oifits",
     "point_source",
     "psf",
+    "read_cube",
     "read_oifits",
     "sample",
     "scene_image",
     "search",
     "search_companion",
     "significance",
+    "simulate",
+    "write_cube",
     "write_oifits",
 ]
 

@@ -72,6 +72,22 @@ class Section:
             raise self.fault(key, f"is {value:g}; it must be {bound}")
         return float(value)
 
+    def whole(self, key: str, default: int = _MISSING, *, at_least: int = 0) -> int:
+        """Return a whole number, ``at_least`` or more."""
+        value = self._get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise self.fault(key, f"is {value!r}, not a whole number")
+        if value < at_least:
+            raise self.fault(key, f"is {value}; it must be at least {at_least}")
+        return value
+
+    def flag(self, key: str, default: bool = _MISSING) -> bool:
+        """Return true or false."""
+        value = self._get(key, default)
+        if not isinstance(value, bool):
+            raise self.fault(key, f"is {value!r}, neither true nor false")
+        return value
+
     def text(self, key: str, default: str = _MISSING, *, choices: tuple[str, ...] = ()) -> str:
         """Return a string, one of ``choices`` where these are given."""
         value = self._get(key, default)

@@ -7,10 +7,15 @@ import logging
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from amibayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from amibayes.parallel import Executor
+    from amibayes.parallel import Progress as Told
 
 
 def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
@@ -45,6 +50,47 @@ def add_seed_option(parser: argparse._ActionsContainer) -> None:
         metavar="N",
         help="seed of all random numbers (default: %(default)s)",
     )
+
+
+def add_parallel_options(parser: argparse.ArgumentParser) -> None:
+    """Add ``--workers`` and ``--scheduler``: where the work is done, not what comes out."""
+    group = parser.add_argument_group("where the work is done").add_mutually_exclusive_group()
+    group.add_argument(
+        "--workers",
+        type=positive_integer,
+        default=1,
+        metavar="N",
+        help="processes on this machine (default: %(default)s); the result does not depend on it",
+    )
+    group.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="a dask scheduler, tcp://host:port, or mpi for the ranks of this run",
+    )
+
+
+def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
+    """Open the workers that ``--workers`` or ``--scheduler`` ask for."""
+    from amibayes.parallel import open_executor
+
+    return open_executor(arguments.workers, arguments.scheduler)
+
+
+def progress_of(
+    arguments: argparse.Namespace, description: str, *, unit: str = "piece", scale: float = 1.0
+) -> AbstractContextManager[Told]:
+    """Open a progress bar, unless ``--quiet``."""
+    from amibayes.parallel import progress_bar
+
+    return progress_bar(description, unit=unit, scale=scale, quiet=arguments.quiet)
+
+
+def positive_integer(text: str) -> int:
+    """Parse an integer above zero."""
+    value = non_negative_integer(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("0 is not a positive number")
+    return value
 
 
 def non_negative_integer(text: str) -> int:

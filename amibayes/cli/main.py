@@ -15,6 +15,8 @@ from amibayes.errors import AmibayesError
 
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
+    "simulate": "make the images that the telescope would record of a scene",
+    "plan": "groups, integrations and time of an exposure, and what it lets one see",
 }
 """Command name → one line of help; the module of the same name holds the command."""
 

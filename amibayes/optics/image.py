@@ -18,7 +18,8 @@ from scipy.special import erfc
 
 from amibayes.errors import DataError
 from amibayes.instrument import Channels, Instrument, Mask
-from amibayes.optics.psf import ComplexArray, Wavefront, axis_nodes, intensity
+from amibayes.optics.psf import ComplexArray, Wavefront, axis_nodes, intensity, psf
+from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator, pixel_transform
 from amibayes.orientation import Orientation
 from amibayes.scene import Scene
 from amibayes.units import MAS, FloatArray, read_only
@@ -74,13 +75,23 @@ class ShiftedImage:
         ValueError
             Where a shift is beyond the reach.
         """
+        weight = self._weights(shift_px)
+        flat = self.values.reshape(weight.shape[1], -1)
+        return np.asarray(weight @ flat).reshape(len(weight), *self.values.shape[2:])
+
+    def mean(self, shift_px: FloatArray) -> FloatArray:
+        """Mean (n_y, n_x) of the images `at` shifts (n, 2), at the cost of one."""
+        weight = self._weights(shift_px).mean(axis=0)
+        return np.asarray(weight @ self.values.reshape(len(weight), -1)).reshape(
+            self.values.shape[2:]
+        )
+
+    def _weights(self, shift_px: FloatArray) -> FloatArray:
         shift = np.asarray(shift_px, dtype=float)
         if np.abs(shift).max(initial=0.0) > self.reach_px * (1.0 + 1e-12):
             raise ValueError(f"a shift is beyond the reach of {self.reach_px:g} pixels")
         x, y = (_lagrange(self.nodes_px, shift[:, axis]) for axis in (0, 1))
-        weight = (y[:, :, None] * x[:, None, :]).reshape(len(shift), -1)
-        flat = self.values.reshape(weight.shape[1], -1)
-        return np.asarray(weight @ flat).reshape(len(shift), *self.values.shape[2:])
+        return np.asarray((y[:, :, None] * x[:, None, :]).reshape(len(shift), -1))
 
 
 def scene_image(
@@ -93,6 +104,7 @@ def scene_image(
     orientation: Orientation | None = None,
     reach_px: float = 0.0,
     wavefront: Wavefront | None = None,
+    pixel_response: float = 0.0,
 ) -> ShiftedImage:
     """Image of a scene whose star sends one photon through the holes.
 
@@ -114,6 +126,8 @@ def scene_image(
         Largest shift of the pointing that will be asked for, pixels.
     wavefront : Wavefront, optional
         Wavefront error; none unless given.
+    pixel_response : float
+        Relative loss of sensitivity from the middle of a pixel to its edges.
 
     Raises
     ------
@@ -123,16 +137,18 @@ def scene_image(
     side = n_pixels or instrument.n_pixels
     orient = orientation or Orientation()
     refuse_outside(scene, instrument, side, orient, centre_px)
-    phase = 2.0 * np.pi * instrument.pixel_scale_rad * _highest(instrument.mask, channels)
-    nodes = _chebyshev(reach_px, phase)
+    limit = instrument.pixel_scale_rad * _highest(instrument.mask, channels)
+    nodes = _chebyshev(reach_px, 2.0 * np.pi * limit)
     values = np.zeros((len(nodes), len(nodes), side, side))
-    for point in scene.points:
-        place = orient.to_image([point.east_rad, point.north_rad]) / instrument.pixel_scale_rad
-        values += point.flux * _point(
-            instrument, channels, side, place + centre_px, nodes, phase, wavefront
-        )
+    if scene.points:
+        oversample = fine_sampling(limit)
+        size = fine_size(side, oversample, reach_px)
+        fine = _points(scene, instrument, channels, size, oversample, orient, centre_px, wavefront)
+        values += _sampled(fine, oversample, side, nodes, pixel_response)
     if scene.extended:
-        values += _extended(scene, instrument, channels, side, orient, centre_px, nodes, wavefront)
+        values += _extended(
+            scene, instrument, channels, side, orient, centre_px, nodes, wavefront, pixel_response
+        )
     return ShiftedImage(nodes, values, reach_px)
 
 
@@ -198,32 +214,42 @@ def _lagrange(nodes: FloatArray, x: FloatArray) -> FloatArray:
     return np.asarray(np.where(hit.any(axis=1, keepdims=True), hit.astype(float), weight))
 
 
-def _point(
+def _points(
+    scene: Scene,
     instrument: Instrument,
     channels: Channels,
-    side: int,
-    place_px: FloatArray,
-    shifts: FloatArray,
-    phase_per_px: float,
+    size: int,
+    oversample: int,
+    orientation: Orientation,
+    centre_px: tuple[float, float],
     wavefront: Wavefront | None,
 ) -> FloatArray:
-    """Pixel-averaged image of one point at all shifts, (q, q, side, side).
+    """Density of all points' light at the middle of fine cells, times the cells' area."""
+    fine = np.zeros((size * oversample, size * oversample))
+    for point in scene.points:
+        place = orientation.to_image([point.east_rad, point.north_rad])
+        x, y = place / instrument.pixel_scale_rad + centre_px
+        fine += point.flux * psf(
+            instrument,
+            channels,
+            size,
+            centre_px=(float(x), float(y)),
+            oversample=oversample,
+            integrate=False,
+            wavefront=wavefront,
+        )
+    return fine
 
-    The intensity about every pixel is taken on one patch of Chebyshev nodes wide enough
-    for all shifts; averages over the shifted pixel are sums over the patch.
-    """
-    patch = _chebyshev(0.5 + float(np.abs(shifts).max()), phase_per_px)
-    inner, weight = np.polynomial.legendre.leggauss(len(patch))
-    at = (0.5 * inner - shifts[:, None]).ravel()
-    rule = (_lagrange(patch, at).reshape(len(shifts), -1, len(patch)) * weight[:, None]).sum(1)
-    pixel = instrument.pixel_scale_rad
-    x, y = (axis_nodes(side, pixel, c, patch).ravel() for c in place_px)
-    fine = np.zeros((y.size, x.size))
-    for wavelength, share in zip(channels.wavelength_m, channels.weight, strict=True):
-        fine += share * intensity(instrument.mask, wavelength, x, y, wavefront)
-    blocks = fine.reshape(side, len(patch), side, len(patch))
-    half = 0.25 * pixel**2 * np.tensordot(rule, blocks, axes=(1, 1))
-    return np.asarray(np.tensordot(rule, half, axes=(1, 3)).transpose(1, 0, 2, 3))
+
+def _sampled(
+    fine: FloatArray, oversample: int, side: int, shifts: FloatArray, pixel_response: float
+) -> FloatArray:
+    """Pixel-averaged image of the fine cells at all shifts, (q, q, side, side)."""
+    rows = np.stack(
+        [pixel_operator(side, len(fine), oversample, shift, pixel_response) for shift in shifts]
+    )
+    halfway = rows @ fine
+    return np.asarray(np.tensordot(halfway, rows, axes=(2, 2)).transpose(0, 2, 1, 3))
 
 
 def _extended(
@@ -235,6 +261,7 @@ def _extended(
     centre_px: tuple[float, float],
     shifts: FloatArray,
     wavefront: Wavefront | None,
+    pixel_response: float,
 ) -> FloatArray:
     """Pixel-averaged image of the extended components at all shifts, (q, q, side, side)."""
     pixel = instrument.pixel_scale_rad
@@ -244,7 +271,7 @@ def _extended(
     frequency, spectrum = _transfer(instrument, channels, width, wavefront)
     sky = orientation.to_sky(np.stack(np.meshgrid(frequency, frequency), axis=-1))
     source = sum(part.transform(sky[..., 0], sky[..., 1]) for part in scene.extended)
-    box = np.sinc(frequency * pixel)
+    box = pixel_transform(frequency * pixel, pixel_response)
     spectrum = spectrum * source * np.outer(box, box)
     x, y = (axis_nodes(side, pixel, c, -shifts) for c in centre_px)
     across, up = (np.exp(2j * np.pi * np.outer(axis.ravel(), frequency)) for axis in (x, y))

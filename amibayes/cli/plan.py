@@ -1,0 +1,160 @@
+"""``amibayes plan``: groups, integrations and time, and what they let one see."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from amibayes.cli.common import (
+    add_output_options,
+    configure_logging,
+    finish,
+    number_range,
+    positive_float,
+)
+
+if TYPE_CHECKING:
+    from amibayes.planning import ContrastCurve, Expectation, Plan
+
+EPILOG = """examples:
+  amibayes plan --filter F430M --photons 1e8 --mag 6
+  amibayes plan --filter F380M --mag 7.5 --time 3600
+  amibayes plan --filter F480M --photons 1e10 --mag 6 --preset paper
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.epilog = EPILOG
+    parser.add_argument(
+        "--instrument", default="niriss", metavar="NAME", help="name or TOML file (default: niriss)"
+    )
+    parser.add_argument("--filter", required=True, metavar="NAME", help="such as F430M")
+    star = parser.add_mutually_exclusive_group(required=True)
+    star.add_argument("--mag", type=float, metavar="M", help="Vega magnitude in the filter")
+    star.add_argument(
+        "--count-rate", type=positive_float, metavar="R", help="electrons per second instead"
+    )
+    depth = parser.add_mutually_exclusive_group(required=True)
+    depth.add_argument("--photons", type=positive_float, metavar="N", help="photons to collect")
+    depth.add_argument("--time", type=positive_float, metavar="SECONDS", help="time on the clock")
+    parser.add_argument(
+        "--preset",
+        choices=("default", "paper"),
+        default="default",
+        help="default: the real brightest pixel; paper: the rules of Soulain et al. (2020)",
+    )
+    parser.add_argument(
+        "--peak-limit",
+        type=positive_float,
+        default=30000.0,
+        metavar="E",
+        help="electrons that the brightest pixel may reach (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--separation",
+        type=number_range,
+        default=(50.0, 400.0),
+        metavar="LOW:HIGH",
+        help="range of the contrast curve in mas (default: 50:400)",
+    )
+    add_output_options(parser, "plan")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plan, write ``plan.json``, print a summary."""
+    configure_logging(arguments)
+    from amibayes.files import output_folder, write_json
+    from amibayes.instrument import load_instrument
+    from amibayes.planning import PlanOptions, expect, make_plan
+
+    instrument = load_instrument(arguments.instrument, arguments.filter)
+    plan = make_plan(
+        instrument,
+        magnitude=arguments.mag,
+        count_rate_e_s=arguments.count_rate,
+        photons=arguments.photons,
+        time_s=arguments.time,
+        options=PlanOptions(arguments.preset, arguments.peak_limit),
+    )
+    expected = expect(plan, arguments.separation)
+    content = as_json(plan, expected, arguments.mag)
+    folder = output_folder(arguments.out, ["plan.json"], overwrite=arguments.overwrite)
+    write_json(folder / "plan.json", content)
+    finish(arguments, content, lambda: summary(plan, expected))
+    return 0
+
+
+def as_json(plan: Plan, expected: Expectation, magnitude: float | None) -> dict[str, Any]:
+    """Everything that was found, in plain numbers."""
+    import numpy as np
+
+    from amibayes import __version__
+
+    return {
+        "amibayes": __version__,
+        "instrument": plan.instrument.name,
+        "filter": plan.instrument.bandpass.name,
+        "preset": plan.options.preset,
+        "magnitude": magnitude,
+        "count_rate_e_s": plan.count_rate_e_s,
+        "photons_wanted": plan.photons_wanted,
+        "n_groups": plan.n_groups,
+        "n_integrations": plan.n_integrations,
+        "total_photons": plan.total_photons,
+        "frame_time_s": plan.options.frame_time_s,
+        "exposure_time_s": plan.exposure_time_s,
+        "groups": plan.groups,
+        "peak_fraction": {
+            "point_sampled": plan.peaks.point_sampled,
+            "centred": plan.peaks.centred,
+            "cornered": plan.peaks.cornered,
+        },
+        "peak_e": plan.peak_e,
+        "sigma_closure_phase_deg": float(np.degrees(expected.closure_phase_rad)),
+        "sigma_closure_phase_photons_deg": float(np.degrees(expected.closure_phase_photons_rad)),
+        "sigma_vis2": expected.vis2,
+        "contrast_curve": _curve(expected.curve),
+        "closure_phase_curve": _curve(expected.closure_curve),
+        "warnings": list(plan.warnings),
+    }
+
+
+def _curve(curve: ContrastCurve) -> dict[str, list[float]]:
+    return {
+        "separation_mas": curve.separation_mas.tolist(),
+        "delta_mag_3sigma": curve.delta_mag.tolist(),
+        "delta_mag_3sigma_worst": curve.delta_mag_worst.tolist(),
+        "delta_mag_3sigma_best": curve.delta_mag_best.tolist(),
+    }
+
+
+def summary(plan: Plan, expected: Expectation) -> list[str]:
+    """Say it in a few lines."""
+    import numpy as np
+
+    groups, curve, closures = plan.groups, expected.curve, expected.closure_curve
+    at = np.unique(np.linspace(0, len(curve.separation_mas) - 1, 5).astype(int))
+
+    def row(name: str, values: Any) -> str:
+        return f"{name:<28}" + " ".join(f"{values[k]:6.1f}" for k in at)
+
+    degrees = np.degrees([expected.closure_phase_rad, expected.closure_phase_photons_rad])
+    return [
+        f"{plan.instrument.name} {plan.instrument.bandpass.name}, "
+        f"{plan.count_rate_e_s:.0f} e-/s, preset {plan.options.preset}",
+        f"groups          {plan.n_groups}  (point-sampled peak of the paper {groups['paper']}, "
+        f"brightest pixel {groups['centred']}, at a corner {groups['cornered']})",
+        f"integrations    {plan.n_integrations}",
+        f"photons         {plan.total_photons:.3g}",
+        f"time            {plan.exposure_time_s:.1f} s on the clock, "
+        f"frames of {plan.options.frame_time_s:g} s",
+        f"brightest pixel {plan.peak_e:.0f} e- at the end of a ramp",
+        f"closure phase   {degrees[0]:.4f} deg (photons alone, √1.5·N_holes/√N: "
+        f"{degrees[1]:.4f} deg)",
+        f"V²              {expected.vis2:.2g}",
+        row("separation (mas)", curve.separation_mas),
+        row("3σ, V² + closure phase (mag)", curve.delta_mag),
+        row("3σ, closure phase (mag)", closures.delta_mag),
+        *(f"warning: {warning}" for warning in plan.warnings),
+    ]

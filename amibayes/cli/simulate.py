@@ -1,0 +1,120 @@
+"""``amibayes simulate``: the images that the telescope would record of a scene."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from amibayes import __version__
+from amibayes.cli.common import (
+    add_output_options,
+    add_parallel_options,
+    add_seed_option,
+    configure_logging,
+    executor_of,
+    finish,
+    positive_float,
+    progress_of,
+)
+from amibayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from amibayes.simulation.observe import Shutter
+    from amibayes.simulation.program import Program, Shot
+
+EPILOG = """examples:
+  amibayes simulate --example > scene.toml
+  amibayes simulate scene.toml --out images
+  amibayes simulate scene.toml --filter F480M --photons 1e9 --workers 2
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.epilog = EPILOG
+    parser.add_argument("scene", nargs="?", metavar="SCENE.toml", help="what to observe, and how")
+    parser.add_argument(
+        "--example", action="store_true", help="print a documented SCENE.toml and leave"
+    )
+    parser.add_argument("--filter", metavar="NAME", help="in place of the file's filter")
+    parser.add_argument(
+        "--photons", type=positive_float, metavar="N", help="in place of the file's photons"
+    )
+    parser.add_argument("--ramps", action="store_true", help="write the reads too (*_ramp.fits)")
+    add_seed_option(parser)
+    add_parallel_options(parser)
+    add_output_options(parser, "simulate")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate every exposure of the file."""
+    configure_logging(arguments)
+    from amibayes.simulation.program import Overrides, example, read_program
+
+    if arguments.example:
+        print(example(), end="")
+        return 0
+    if arguments.scene is None:
+        raise UsageError("no scene is given", remedy="amibayes simulate --example > scene.toml")
+    overrides = Overrides(arguments.filter, arguments.photons, arguments.ramps)
+    program = read_program(arguments.scene, overrides)
+    done = observe(arguments, program)
+    content = {"amibayes": __version__, "seed": arguments.seed, "exposures": done}
+    finish(arguments, content, lambda: summary(done))
+    return 0
+
+
+def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, Any]]:
+    """Take and write the exposures; say what each one is."""
+    from amibayes.files import output_folder
+    from amibayes.simulation.observe import ramp_path, write_exposure
+    from amibayes.simulation.program import blaming
+
+    names = [shot.file_name for shot in program.shots]
+    names += [ramp_path(Path(n)).name for n in names if program.keeps_ramps]
+    folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)
+    done = []
+    with executor_of(arguments) as executor, blaming(arguments.scene):
+        for shot, shutter in program.shutters(arguments.seed):
+            with progress_of(arguments, shot.name, unit="integration") as told:
+                path = folder / shot.file_name
+                history = program.history
+                write_exposure(path, shutter, executor, history=history, progress=told)
+            done.append(described(shot, shutter, path))
+    return done
+
+
+def described(shot: Shot, shutter: Shutter, path: Path) -> dict[str, Any]:
+    """Say what an exposure is, in plain numbers."""
+    import numpy as np
+
+    from amibayes.units import MAS
+
+    observation, exposure = shutter.observation, shutter.observation.exposure
+    pixel = observation.instrument.pixel_scale_rad / MAS
+    ramp = exposure.n_groups * observation.detector.frame_time_s
+    rate = shutter.recorder.rate_e_s
+    return {
+        "path": str(path),
+        "name": observation.scene.name,
+        "calibrator": bool(observation.notes["IS_PSF"]),
+        "instrument": observation.instrument.name,
+        "filter": observation.instrument.bandpass.name,
+        "n_groups": exposure.n_groups,
+        "n_integrations": exposure.n_integrations,
+        "count_rate_e_s": rate,
+        "total_photons": rate * observation.scene.flux * ramp * exposure.n_integrations,
+        "position_angle_deg": float(np.degrees(observation.orientation.position_angle_rad)),
+        "dither_mas": (shutter.pointings.dither_px * pixel).tolist(),
+    }
+
+
+def summary(done: list[dict[str, Any]]) -> list[str]:
+    """Say what was made, in a few lines."""
+    lines = [
+        f"{entry['path']}  {entry['filter']}  {entry['n_groups']} groups, "
+        f"{entry['n_integrations']} integrations, {entry['total_photons']:.3g} photons"
+        for entry in done
+    ]
+    return lines if len(lines) <= 20 else [*lines[:19], f"and {len(lines) - 19} more"]

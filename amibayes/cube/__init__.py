@@ -1,0 +1,22 @@
+"""Image cubes: what a detector recorded, with its errors, flags and orientation."""
+
+from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube
+from amibayes.cube.read import CubeFile, open_cube, read_cube
+from amibayes.cube.stream import EmptyImage, FitsStream
+from amibayes.cube.write import CubeStream, cube_stream, header_of, write_cube
+
+__all__ = [
+    "DO_NOT_USE",
+    "JUMP",
+    "SATURATED",
+    "Cube",
+    "CubeFile",
+    "CubeStream",
+    "EmptyImage",
+    "FitsStream",
+    "cube_stream",
+    "header_of",
+    "open_cube",
+    "read_cube",
+    "write_cube",
+]

@@ -1,0 +1,119 @@
+"""The container: images of one exposure, with what is known of every pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes.errors import DataError
+from amibayes.orientation import Orientation
+from amibayes.units import FloatArray
+
+DO_NOT_USE = 1
+"""Flag of a pixel that is not to be used (JWST data quality, bit 0)."""
+
+SATURATED = 2
+"""Flag of a pixel that reached full well in some group (bit 1)."""
+
+JUMP = 4
+"""Flag of a pixel whose ramp was cut at a cosmic ray (bit 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cube:
+    """Images of one exposure.
+
+    Parameters
+    ----------
+    images : (n_int, ny, nx) array
+        One image per integration, +y up and +x right, in ``unit``.
+    pixel_scale_rad : float
+        Side of a pixel.
+    instrument, filter : str
+        Such as ``NIRISS``, ``F430M``.
+    orientation : Orientation
+        How the image lies on the sky.
+    error : (n_int, ny, nx) array, optional
+        Standard deviation of each pixel, in ``unit``.
+    dq : (n_int, ny, nx) uint32 array, optional
+        JWST data quality flags; nothing flagged where it is left out.
+    unit : str
+        ``electron/s`` or ``DN/s``; other words are kept as they came.
+    integration_time_s : float, optional
+        Time of one integration.
+    mjd : (n_int,) array, optional
+        Modified Julian Date (UTC) at the middle of each integration.
+    header : mapping
+        Header keywords as they were read, or are to be written.
+    source : str
+        The file, for messages.
+
+    Raises
+    ------
+    DataError
+        Where shapes disagree, or no pixel holds light.
+    """
+
+    images: FloatArray
+    pixel_scale_rad: float
+    instrument: str
+    filter: str
+    orientation: Orientation = field(default_factory=Orientation)
+    error: FloatArray | None = None
+    dq: NDArray[np.uint32] | None = None
+    unit: str = "electron/s"
+    integration_time_s: float | None = None
+    mjd: FloatArray | None = None
+    header: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    source: str = "cube"
+
+    def __post_init__(self) -> None:
+        self._hold("images", np.asarray(self.images, dtype=float))
+        if self.images.ndim != 3:
+            raise DataError(f"has {self.images.ndim} axes, not 3", source=self.source)
+        dq = np.zeros(self.images.shape, np.uint32) if self.dq is None else self.dq
+        self._hold("dq", np.asarray(dq, dtype=np.uint32))
+        if self.error is not None:
+            self._hold("error", np.asarray(self.error, dtype=float))
+        for name in ("error", "dq"):
+            self._check_shape(name, self.images.shape)
+        if self.mjd is not None:
+            self._hold("mjd", np.asarray(self.mjd, dtype=float))
+            self._check_shape("mjd", self.images.shape[:1])
+
+    def _hold(self, name: str, array: NDArray[Any]) -> None:
+        view = array.view()
+        view.flags.writeable = False
+        object.__setattr__(self, name, view)
+
+    def _check_shape(self, name: str, shape: tuple[int, ...]) -> None:
+        array = getattr(self, name)
+        if array is not None and array.shape != shape:
+            raise DataError(
+                f"{name} has the shape {array.shape}, the images {self.images.shape}",
+                source=self.source,
+            )
+
+    @property
+    def n_integrations(self) -> int:
+        """Number of images."""
+        return int(self.images.shape[0])
+
+    @property
+    def bad(self) -> NDArray[np.bool_]:
+        """(n_int, ny, nx): flagged as not to be used, or without a finite value or error."""
+        assert self.dq is not None
+        bad = ((self.dq & DO_NOT_USE) > 0) | ~np.isfinite(self.images)
+        if self.error is not None:
+            bad |= ~(np.isfinite(self.error) & (self.error > 0.0))
+        return bad
+
+    @property
+    def variance(self) -> FloatArray | None:
+        """(n_int, ny, nx): square of the error, where there is one."""
+        return None if self.error is None else self.error**2

@@ -1,0 +1,123 @@
+"""What a header says about an image: instrument, filter, scale, orientation, time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from amibayes.errors import DataError
+from amibayes.orientation import Orientation
+from amibayes.units import DEGREE, MAS, FloatArray
+
+Header = Mapping[str, Any]
+
+UNITS = {
+    "dn/s": "DN/s",
+    "electron/s": "electron/s",
+    "electrons/s": "electron/s",
+    "e-/s": "electron/s",
+    "e/s": "electron/s",
+}
+"""Spellings of the units that amibayes understands."""
+
+
+def number(header: Header, key: str, source: str) -> float | None:
+    """Give a finite number of the header, None where the key is missing.
+
+    Raises
+    ------
+    DataError
+        Where the key holds something else.
+    """
+    value = header.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DataError(f"keyword {key} = {value!r} is not a finite number", source=source)
+    return float(value)
+
+
+def text(header: Header, key: str) -> str | None:
+    """Give a word of the header, None where it is missing or empty."""
+    value = str(header.get(key) or "").strip()
+    return value or None
+
+
+def check_mask(header: Header, source: str) -> None:
+    """Refuse NIRISS images that were not taken through the mask.
+
+    Raises
+    ------
+    DataError
+        Naming the pupil element.
+    """
+    pupil = text(header, "PUPIL")
+    niriss = (text(header, "INSTRUME") or "").upper() == "NIRISS"
+    if niriss and pupil is not None and "NRM" not in pupil.upper():
+        raise DataError(f"was not taken through the mask (PUPIL is {pupil})", source=source)
+
+
+def orientation_of(header: Header, source: str) -> Orientation:
+    """Read the orientation: JWST keywords, else a celestial WCS, else north up, east left."""
+    roll = number(header, "ROLL_REF", source)
+    if roll is not None:
+        yang = number(header, "V3I_YANG", source) or 0.0
+        parity = number(header, "VPARITY", source) or -1.0
+        if abs(parity) != 1.0:
+            raise DataError(f"keyword VPARITY = {parity:g} is neither 1 nor -1", source=source)
+        return Orientation((roll + yang) * DEGREE, int(parity))
+    matrix = wcs_matrix(header, source)
+    if matrix is None:
+        return Orientation()
+    parity = -1 if np.linalg.det(matrix) < 0.0 else 1
+    return Orientation(float(np.arctan2(matrix[0, 1], matrix[1, 1])), int(parity))
+
+
+def pixel_scale_of(header: Header, source: str) -> float | None:
+    """Read the side of a pixel (rad): ``PIXELSCL`` (arcsec), else a celestial WCS."""
+    scale = number(header, "PIXELSCL", source)
+    if scale is not None:
+        if not 1e-5 < scale < 10.0:
+            raise DataError(
+                f"keyword PIXELSCL = {scale:g} is no pixel scale in arcsec", source=source
+            )
+        return scale * 1000.0 * MAS
+    matrix = wcs_matrix(header, source)
+    return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix))))
+
+
+def wcs_matrix(header: Header, source: str) -> FloatArray | None:
+    """Read d(east, north)/d(x, y) in radians per pixel from a celestial WCS, if there is one."""
+    axes = [text(header, f"CTYPE{i}") or "" for i in (1, 2)]
+    if not (axes[0].startswith("RA") and axes[1].startswith("DEC")):
+        return None
+    keys = [f"{i}_{j}" for i in (1, 2) for j in (1, 2)]
+    cd = [number(header, f"CD{key}", source) for key in keys]
+    if any(value is not None for value in cd):
+        degrees = np.array([value or 0.0 for value in cd]).reshape(2, 2)
+    else:
+        pc = [number(header, f"PC{key}", source) for key in keys]
+        unit = (1.0, 0.0, 0.0, 1.0)
+        rotation = [u if value is None else value for value, u in zip(pc, unit, strict=True)]
+        steps = [number(header, f"CDELT{i}", source) or 0.0 for i in (1, 2)]
+        degrees = np.array(rotation).reshape(2, 2) * np.array(steps)[:, None]
+    return degrees * DEGREE if abs(np.linalg.det(degrees)) > 0.0 else None
+
+
+def unit_of(header: Header) -> str:
+    """Read the unit of the images; ami_sim's ``UNITS`` counts as well."""
+    word = text(header, "BUNIT") or text(header, "UNITS") or "unknown"
+    return UNITS.get(word.lower(), word)
+
+
+def integration_time_of(header: Header, source: str) -> float | None:
+    """Read the time of one integration (s)."""
+    time = number(header, "EFFINTTM", source)
+    if time is not None:
+        return time
+    frame = number(header, "TGROUP", source) or number(header, "TFRAME", source)
+    groups = number(header, "NGROUPS", source)
+    return None if frame is None or groups is None else frame * groups

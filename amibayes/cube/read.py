@@ -1,0 +1,267 @@
+"""Reading image cubes, whole or a few integrations at a time."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.io.fits.verify import VerifyWarning
+from astropy.utils.exceptions import AstropyUserWarning
+from numpy.typing import NDArray
+
+from amibayes.cube import header as keys
+from amibayes.cube.container import Cube
+from amibayes.errors import DataError
+from amibayes.instrument import instrument_names, load_instrument
+from amibayes.orientation import Orientation
+from amibayes.units import DEGREE, FloatArray
+
+
+@dataclass(frozen=True)
+class CubeFile:
+    """An open cube: its description now, its images when asked for.
+
+    ``template`` is a cube of no integrations that carries everything else.
+    """
+
+    template: Cube
+    n_integrations: int
+    _hdus: dict[str, Any]
+    _mjd: FloatArray | None
+
+    def read(self, start: int = 0, stop: int | None = None) -> Cube:
+        """Read the integrations from ``start`` up to ``stop``."""
+        part = slice(start, self.n_integrations if stop is None else stop)
+        arrays = {name: _section(hdu, part) for name, hdu in self._hdus.items()}
+        mjd = None if self._mjd is None else self._mjd[part]
+        return replace(
+            self.template,
+            images=arrays["SCI"],
+            error=arrays.get("ERR"),
+            dq=arrays.get("DQ"),
+            mjd=mjd,
+        )
+
+    def chunks(self, size: int = 256) -> Iterator[Cube]:
+        """Read the whole cube, ``size`` integrations at a time.
+
+        Raises
+        ------
+        DataError
+            After the last chunk, where no pixel of the whole cube held light.
+        """
+        light = False
+        for start in range(0, self.n_integrations, size):
+            chunk = self.read(start, min(start + size, self.n_integrations))
+            light = light or holds_light(chunk)
+            yield chunk
+        if not light:
+            raise no_light(self.template.source)
+
+
+def holds_light(cube: Cube) -> bool:
+    """Tell whether any two usable pixels differ."""
+    good = cube.images[~cube.bad]
+    return good.size > 0 and bool(np.ptp(good) > 0.0)
+
+
+def no_light(source: str) -> DataError:
+    """Describe a cube without a single usable value."""
+    return DataError("every pixel is flagged, not a number, or the same", source=source)
+
+
+def read_cube(path: str | Path, **options: Any) -> Cube:
+    """Read a whole cube; see `open_cube` for the options and errors."""
+    with open_cube(path, **options) as file:
+        cube = file.read()
+    if not holds_light(cube):
+        raise no_light(str(path))
+    return cube
+
+
+@contextmanager
+def open_cube(
+    path: str | Path,
+    *,
+    instrument: str | None = None,
+    filter: str | None = None,
+    pixel_scale_rad: float | None = None,
+    position_angle_deg: float | None = None,
+) -> Iterator[CubeFile]:
+    """Open a JWST-like ``calints`` file, or any FITS file with an image or a cube.
+
+    Parameters
+    ----------
+    path : path
+        FITS file; its images are in the extension ``SCI``, else in the first one that
+        holds any.
+    instrument, filter, pixel_scale_rad : optional
+        Used in place of what the header says.
+    position_angle_deg : float, optional
+        Position angle of the image's +y axis, in place of what the header says.
+
+    Yields
+    ------
+    CubeFile
+        To be read whole or in chunks while the block lasts.
+
+    Raises
+    ------
+    DataError
+        Where the file is missing, damaged, holds no cube, or does not say which
+        instrument, filter or pixel scale it is of.
+    """
+    source = str(path)
+    with _opened(Path(path)) as hdus:
+        science = _science(hdus, source)
+        chosen = {"SCI": science} | _companions(hdus, science, source)
+        _check_complete(hdus, source)
+        header = _merged(hdus, science)
+        keys.check_mask(header, source)
+        given = {
+            "instrument": instrument,
+            "filter": filter,
+            "pixel_scale_rad": pixel_scale_rad,
+            "position_angle_deg": position_angle_deg,
+        }
+        template = _template(header, science, given, source)
+        n = science.shape[0] if len(science.shape) == 3 else 1
+        yield CubeFile(template, n, chosen, _mid_times(hdus, n, source))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a FITS file, with every complaint of the library as one line."""
+    if path.is_dir():
+        raise DataError("is a folder", source=path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", VerifyWarning)
+            warnings.simplefilter("ignore", AstropyUserWarning)
+            hdus = fits.open(path, memmap=False)
+            len(hdus)  # reads every header
+    except FileNotFoundError:
+        raise DataError("is not there", source=path) from None
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+        raise DataError(
+            f"is not a readable FITS file: {str(error).splitlines()[0] if str(error) else error!r}",
+            source=path,
+        ) from error
+    with hdus:
+        yield hdus
+
+
+def _science(hdus: Any, source: str) -> Any:
+    named = [hdu for hdu in hdus if hdu.name == "SCI"]
+    images = [hdu for hdu in (named or hdus) if hdu.is_image and len(hdu.shape) > 0]
+    if not images:
+        raise DataError("holds no image", source=source)
+    hdu = images[0]
+    if len(hdu.shape) > 3:
+        raise DataError(
+            f"holds {len(hdu.shape)}-dimensional data (ramps?), not images",
+            source=source,
+            remedy="give the slope images of each integration (calints)",
+        )
+    if len(hdu.shape) < 2 or 0 in hdu.shape:
+        raise DataError(f"its image has the shape {hdu.shape}", source=source)
+    return hdu
+
+
+def _companions(hdus: Any, science: Any, source: str) -> dict[str, Any]:
+    """Find the error and data quality that belong to the image."""
+    found = {}
+    for hdu in hdus:
+        if hdu.name not in ("ERR", "DQ") or hdu.name in found:
+            continue
+        if not hdu.is_image or hdu.shape != science.shape:
+            raise DataError(
+                f"{hdu.name} has the shape {hdu.shape}, the images {science.shape}", source=source
+            )
+        found[hdu.name] = hdu
+    return found
+
+
+def _check_complete(hdus: Any, source: str) -> None:
+    """Refuse a file that ends before its data do; zeros would be read in their place."""
+    if hdus.fileinfo(0)["file"].compression:
+        return
+    size = Path(source).stat().st_size
+    for index, hdu in enumerate(hdus):
+        place = hdus.fileinfo(index)
+        if place["datLoc"] + hdu.size > size:
+            raise DataError(
+                f"is cut short: {size} bytes, and extension {hdu.name or index} needs "
+                f"{place['datLoc'] + hdu.size}",
+                source=source,
+            )
+
+
+def _merged(hdus: Any, science: Any) -> dict[str, Any]:
+    """Merge the primary header and the image's own, which wins."""
+    merged: dict[str, Any] = {}
+    for hdu in (hdus[0], science):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for card in hdu.header.cards:
+                if card.keyword not in ("", "COMMENT", "HISTORY"):
+                    merged[card.keyword] = card.value
+    return merged
+
+
+def _template(header: dict[str, Any], science: Any, given: dict[str, Any], source: str) -> Cube:
+    angle = given["position_angle_deg"]
+    orientation = keys.orientation_of(header, source)
+    if angle is not None:
+        orientation = Orientation(angle * DEGREE, orientation.parity)
+    scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source)
+    instrument = given["instrument"] or keys.text(header, "INSTRUME")
+    filter_ = given["filter"] or keys.text(header, "FILTER")
+    for value, option in ((instrument, "instrument"), (filter_, "filter")):
+        if value is None:
+            raise DataError(f"does not say its {option}", source=source, remedy=f"give --{option}")
+    scale = scale or _usual_pixel_scale(str(instrument), str(filter_), source)
+    return Cube(
+        images=np.empty((0, *science.shape[-2:])),
+        pixel_scale_rad=scale,
+        instrument=str(instrument),
+        filter=str(filter_),
+        orientation=orientation
+        if angle is None
+        else Orientation(angle * DEGREE, orientation.parity),
+        unit=keys.unit_of(header),
+        integration_time_s=keys.integration_time_of(header, source),
+        header=MappingProxyType(header),
+        source=source,
+    )
+
+
+def _usual_pixel_scale(instrument: str, filter: str, source: str) -> float:
+    """Side of a pixel of an instrument that the package knows."""
+    if instrument.lower() in instrument_names() or instrument.endswith(".toml"):
+        return load_instrument(instrument, filter).pixel_scale_rad
+    raise DataError("does not say its pixel scale", source=source, remedy="give --pixel-scale")
+
+
+def _mid_times(hdus: Any, n: int, source: str) -> FloatArray | None:
+    table = next((hdu for hdu in hdus if hdu.name == "INT_TIMES"), None)
+    if table is None or table.is_image or "int_mid_MJD_UTC" not in table.columns.names:
+        return None
+    times = np.asarray(table.data["int_mid_MJD_UTC"], dtype=float)
+    if len(times) != n:
+        raise DataError(f"INT_TIMES has {len(times)} rows for {n} images", source=source)
+    return times
+
+
+def _section(hdu: Any, part: slice) -> NDArray[Any]:
+    """Read a few images, and no others, into memory."""
+    if len(hdu.shape) == 2:
+        return np.asarray(hdu.section[:, :])[None][part]
+    return np.asarray(hdu.section[part])

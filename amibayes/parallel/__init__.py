@@ -1,0 +1,37 @@
+"""The same job list on one core, on all, or on a cluster, without losing work.
+
+A job is a function and a list of pieces that is fixed before anything runs. Every
+piece carries its own random seed and is computed with one BLAS thread, so a result is
+the same to the last bit for any number of workers, and after any interruption.
+"""
+
+from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
+from amibayes.parallel.job import (
+    Executor,
+    SerialExecutor,
+    child_seeds,
+    open_executor,
+    run_job,
+    slices,
+    spawn,
+)
+from amibayes.parallel.journal import Journal, digest
+from amibayes.parallel.processes import ProcessExecutor
+from amibayes.parallel.progress import Progress, progress_bar
+
+__all__ = [
+    "DaskExecutor",
+    "Executor",
+    "Journal",
+    "MPIExecutor",
+    "ProcessExecutor",
+    "Progress",
+    "SerialExecutor",
+    "child_seeds",
+    "digest",
+    "open_executor",
+    "progress_bar",
+    "run_job",
+    "slices",
+    "spawn",
+]

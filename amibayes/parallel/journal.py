@@ -1,0 +1,134 @@
+"""The journal of finished pieces: a killed run goes on where it stopped.
+
+One file per piece, written whole or not at all, in a folder named after the digest of
+everything that the job's answer depends on: a journal of other inputs is never read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes import __version__
+from amibayes.files import atomic_path, cannot_write, sha256
+
+Columns = dict[str, NDArray[Any]]
+"""What a journalled piece returns: named arrays."""
+
+
+class Journal:
+    """Finished pieces of one job in a folder.
+
+    Parameters
+    ----------
+    folder : path
+        Where journals live; made if missing.
+    key : str
+        Digest of the job's inputs (`digest`).
+    resume : bool
+        Keep the pieces that are there; otherwise start afresh.
+
+    Raises
+    ------
+    RunError
+        Where the folder cannot be written.
+    """
+
+    def __init__(self, folder: str | Path, key: str, *, resume: bool) -> None:
+        self.path = Path(folder) / key
+        if not resume:
+            self.remove()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise cannot_write(self.path, error) from error
+
+    def read(self, index: int) -> Columns | None:
+        """Give the arrays of a finished piece; None where it has to be computed."""
+        try:
+            with np.load(self._file(index), allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+            return None
+
+    def write(self, index: int, columns: Mapping[str, Any]) -> Columns:
+        """Record a finished piece and return it as `read` will give it."""
+        arrays = {name: np.asarray(column) for name, column in columns.items()}
+        with atomic_path(self._file(index)) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        return arrays
+
+    def remove(self) -> None:
+        """Forget all pieces of this job."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def _file(self, index: int) -> Path:
+        return self.path / f"piece-{index:06d}.npz"
+
+
+def digest(*inputs: Any) -> str:
+    """Hexadecimal digest of everything that a job's answer depends on.
+
+    Parameters
+    ----------
+    *inputs
+        Numbers, text, arrays, paths (the file's content counts, not its name), seeds,
+        frozen dataclasses, and lists, tuples and dictionaries of these. The version of
+        amibayes is always part of it.
+
+    Raises
+    ------
+    TypeError
+        For anything else, since a digest that misses an input would revive stale work.
+    """
+    running = hashlib.sha256(__version__.encode())
+    for item in inputs:
+        _feed(running, item)
+    return running.hexdigest()[:32]
+
+
+def _feed(running: Any, item: Any) -> None:
+    running.update(f"<{type(item).__name__}>".encode())
+    if isinstance(item, np.ndarray):
+        running.update(f"{item.dtype.str}{item.shape}".encode())
+        running.update(np.ascontiguousarray(item).tobytes())
+    elif isinstance(item, Path):
+        running.update(sha256(item).encode())
+    elif (parts := _parts(item)) is not None:
+        running.update(f"{len(parts)}".encode())
+        for part in parts:
+            _feed(running, part)
+    else:
+        running.update(_text(item).encode())
+
+
+def _parts(item: Any) -> list[Any] | None:
+    """Give the inputs that an input consists of; None for a single value."""
+    if is_dataclass(item) and not isinstance(item, type):
+        return [(field.name, getattr(item, field.name)) for field in fields(item)]
+    if isinstance(item, np.random.SeedSequence):
+        return [item.entropy, item.spawn_key, item.pool_size]
+    if isinstance(item, Mapping):
+        return sorted(item.items())
+    if isinstance(item, list | tuple):
+        return list(item)
+    return None
+
+
+def _text(item: Any) -> str:
+    if isinstance(item, np.generic):
+        item = item.item()
+    if isinstance(item, complex):
+        item = [item.real, item.imag]
+    if isinstance(item, bytes):
+        item = item.hex()
+    return json.dumps(item)

@@ -1,0 +1,20 @@
+"""From a scene to what the detector records of it."""
+
+from amibayes.simulation.detector import PRESETS, Detector, DetectorMaps, detector_preset, draw_maps
+from amibayes.simulation.exposure import Exposure
+from amibayes.simulation.observe import Observation, open_shutter, simulate, write_exposure
+from amibayes.simulation.wavefront import WavefrontErrors
+
+__all__ = [
+    "PRESETS",
+    "Detector",
+    "DetectorMaps",
+    "Exposure",
+    "Observation",
+    "WavefrontErrors",
+    "detector_preset",
+    "draw_maps",
+    "open_shutter",
+    "simulate",
+    "write_exposure",
+]

@@ -1,0 +1,318 @@
+"""One exposure of one scene, in memory or straight into a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, header_of
+from amibayes.errors import DataError
+from amibayes.instrument import Instrument, instrument_names, load_instrument
+from amibayes.optics import Wavefront, scene_image
+from amibayes.orientation import Orientation
+from amibayes.parallel import Executor, Progress, SerialExecutor, child_seeds, spawn
+from amibayes.scene import Scene
+from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
+from amibayes.simulation.exposure import (
+    Chunk,
+    Exposure,
+    Pointings,
+    Recorder,
+    draw_pointings,
+    make_recorder,
+    record,
+)
+from amibayes.simulation.truth import exposure_header, instrument_keyword, truth_tables
+from amibayes.units import FloatArray
+
+DAY_S = 86400.0
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """All that decides what an exposure shows, but for the random numbers.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is on the sky.
+    instrument : Instrument
+        Mask, filter and pixel scale.
+    exposure : Exposure
+        Groups, integrations and pointing errors.
+    detector : Detector
+        What happens to the light.
+    orientation : Orientation
+        How the detector lies on the sky.
+    wavefront : Wavefront, optional
+        Errors of the holes.
+    count_rate_e_s : float, optional
+        Electrons per second of the star; from its magnitude unless given.
+    n_wavelengths : int
+        Wavelengths that stand for the filter.
+    start_mjd : float
+        Start of the exposure.
+    notes : mapping
+        Further header keywords.
+    """
+
+    scene: Scene
+    instrument: Instrument
+    exposure: Exposure
+    detector: Detector = field(default_factory=Detector)
+    orientation: Orientation = field(default_factory=Orientation)
+    wavefront: Wavefront | None = None
+    count_rate_e_s: float | None = None
+    n_wavelengths: int = 9
+    start_mjd: float = 60000.0
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def rate_e_s(self) -> float:
+        """Electrons per second of the star.
+
+        Raises
+        ------
+        DataError
+            Where neither a magnitude nor a rate is known.
+        """
+        if self.count_rate_e_s is not None:
+            return self.count_rate_e_s
+        return star_rate(self.scene, self.instrument)
+
+    @property
+    def mid_times_mjd(self) -> FloatArray:
+        """(n_int,) middle of each ramp; a frame that resets the detector follows each."""
+        frame = self.detector.frame_time_s
+        ramp = self.exposure.n_groups * frame
+        start = np.arange(self.exposure.n_integrations) * (ramp + frame)
+        return np.asarray(self.start_mjd + (start + ramp / 2.0) / DAY_S)
+
+
+def star_rate(scene: Scene, instrument: Instrument, source: str | None = None) -> float:
+    """Electrons per second of a scene's star, from its magnitude.
+
+    Parameters
+    ----------
+    scene : Scene
+        With a magnitude in any filter of the instrument.
+    instrument : Instrument
+        In the filter that is used.
+    source : str, optional
+        Name or file of the instrument, where its other filters are.
+
+    Raises
+    ------
+    DataError
+        Where the scene has no magnitude.
+    """
+    if scene.magnitude is None:
+        raise DataError(
+            "key 'star.magnitude' is missing", source=scene.source, remedy="or give 'count_rate'"
+        )
+    band = None
+    if scene.magnitude_filter not in (None, instrument.bandpass.name):
+        band = load_instrument(source or _catalogued(instrument), scene.magnitude_filter).bandpass
+    return instrument.count_rate(scene.spectrum, scene.magnitude, band)
+
+
+def _catalogued(instrument: Instrument) -> str:
+    name = instrument.name.split()[0].lower()
+    if name not in instrument_names():
+        raise DataError(
+            f"a magnitude in another filter needs the file of instrument {instrument.name}",
+            remedy="give the magnitude in the filter used, or a count rate",
+        )
+    return name
+
+
+@dataclass(frozen=True, eq=False)
+class Shutter:
+    """An exposure about to be taken."""
+
+    observation: Observation
+    pointings: Pointings
+    recorder: Recorder
+    noise: np.random.SeedSequence
+
+    def take(self, executor: Executor, progress: Progress | None = None) -> Iterator[Chunk]:
+        """Give the integrations, some at a time, in order."""
+        return record(self.recorder, self.pointings, self.noise, executor, progress)
+
+
+def open_shutter(
+    observation: Observation, seed: np.random.SeedSequence, maps: DetectorMaps
+) -> Shutter:
+    """Point the telescope and form the image.
+
+    Raises
+    ------
+    DataError
+        Where a source lies outside the image.
+    UsageError
+        Where the scene saturates.
+    """
+    exposure, instrument = observation.exposure, observation.instrument
+    of_pointing, noise = child_seeds(seed, 2)
+    pointings = draw_pointings(exposure, instrument.pixel_scale_rad, of_pointing)
+    image = scene_image(
+        observation.scene,
+        instrument,
+        instrument.bandpass.channels(observation.scene.spectrum, observation.n_wavelengths),
+        exposure.n_pixels,
+        centre_px=(float(pointings.dither_px[0]), float(pointings.dither_px[1])),
+        orientation=observation.orientation,
+        reach_px=pointings.reach_px,
+        wavefront=observation.wavefront,
+        pixel_response=observation.detector.pixel_response,
+    )
+    rate = observation.rate_e_s
+    recorder = make_recorder(image, rate, pointings, exposure, observation.detector, maps)
+    return Shutter(observation, pointings, recorder, noise)
+
+
+def simulate(
+    scene: Scene,
+    instrument: Instrument,
+    exposure: Exposure,
+    rng: np.random.Generator,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Cube:
+    """Simulate one exposure, in memory.
+
+    Parameters
+    ----------
+    scene, instrument, exposure : Scene, Instrument, Exposure
+        What is observed, with what, and how.
+    rng : numpy Generator
+        Source of all randomness.
+    executor : Executor, optional
+        Where the work is done; it changes nothing in the result.
+    progress : Progress, optional
+        Told how far it is.
+    **settings
+        Further fields of `Observation`: detector, orientation, wavefront, …
+
+    Returns
+    -------
+    Cube
+        Images in electrons per second.
+
+    Raises
+    ------
+    DataError, UsageError
+        Where the scene does not fit the image, or saturates.
+    """
+    observation = Observation(scene, instrument, exposure, **settings)
+    of_maps, of_exposure = spawn(rng, 2)
+    n = exposure.n_pixels
+    maps = draw_maps(observation.detector, (n, n), np.random.default_rng(of_maps))
+    shutter = open_shutter(observation, of_exposure, maps)
+    chunks = list(shutter.take(executor or SerialExecutor(), progress))
+    return replace(
+        blank_cube(shutter),
+        images=np.concatenate([chunk.images for chunk in chunks]),
+        error=np.concatenate([chunk.error for chunk in chunks]),
+        dq=np.concatenate([chunk.dq for chunk in chunks]),
+        mjd=observation.mid_times_mjd,
+    )
+
+
+def blank_cube(shutter: Shutter) -> Cube:
+    """Everything of the cube but its images."""
+    observation = shutter.observation
+    n = observation.exposure.n_pixels
+    empty = np.empty((0, n, n))
+    exposure = observation.exposure
+    return Cube(
+        images=empty,
+        pixel_scale_rad=observation.instrument.pixel_scale_rad,
+        instrument=instrument_keyword(observation.instrument.name),
+        filter=observation.instrument.bandpass.name,
+        orientation=observation.orientation,
+        error=empty,
+        integration_time_s=exposure.n_groups * observation.detector.frame_time_s,
+        header=exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s),
+    )
+
+
+def write_exposure(
+    path: Path,
+    shutter: Shutter,
+    executor: Executor,
+    *,
+    history: tuple[str, ...] = (),
+    progress: Progress | None = None,
+) -> None:
+    """Take an exposure straight into a ``calints`` file, a few integrations at a time.
+
+    The file carries the truth: the scene and the seed in its header, the sources, the
+    wavefront and the pointing of every integration in tables. Where the reads are kept,
+    they go to a file of their own beside it, named ``…_ramp.fits``.
+
+    Parameters
+    ----------
+    path : Path
+        ``…_calints.fits``.
+    shutter : Shutter
+        From `open_shutter`.
+    executor : Executor
+        Where the work is done.
+    history : tuple of str
+        Lines for the header.
+    progress : Progress, optional
+        Told how far it is.
+
+    Raises
+    ------
+    RunError
+        Where a file cannot be written.
+    """
+    with _files(path, shutter, history) as (cube, ramps):
+        for chunk in shutter.take(executor, progress):
+            cube.write(chunk.start, chunk.images, chunk.error, chunk.dq)
+            if ramps is not None and chunk.ramps is not None:
+                ramps.write("SCI", chunk.start, chunk.ramps)
+
+
+@contextmanager
+def _files(
+    path: Path, shutter: Shutter, history: tuple[str, ...]
+) -> Iterator[tuple[CubeStream, FitsStream | None]]:
+    observation = shutter.observation
+    n = observation.exposure.n_integrations
+    template = blank_cube(shutter)
+    tables = truth_tables(observation, shutter.pointings)
+    with ExitStack() as stack:
+        mid = observation.mid_times_mjd
+        cube = stack.enter_context(
+            cube_stream(path, template, n, mjd=mid, history=history, tables=tables)
+        )
+        ramps = None
+        if observation.exposure.keep_ramps:
+            ramps = stack.enter_context(FitsStream.create(ramp_path(path), _ramp_hdus(shutter)))
+        yield cube, ramps
+
+
+def ramp_path(path: Path) -> Path:
+    """Name of the reads' file beside a ``calints`` file."""
+    return path.with_name(path.name.replace("_calints", "_ramp"))
+
+
+def _ramp_hdus(shutter: Shutter) -> list[Any]:
+    observation = shutter.observation
+    exposure = observation.exposure
+    header = exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s)
+    primary, science = header_of(header), header_of({"BUNIT": "electron"})
+    reads = observation.detector.n_reads(exposure.n_groups)
+    shape = (exposure.n_integrations, reads, exposure.n_pixels, exposure.n_pixels)
+    return [fits.PrimaryHDU(header=primary), EmptyImage("SCI", shape, "float32", science)]
