@@ -1,0 +1,154 @@
+"""Make examples/data: a target with a faint companion and three calibrators, simulated.
+
+    python examples/make_example_data.py [folder]
+
+NIRISS aperture masking through F480M. All four share the instrument: each baseline loses
+visibility and shifts phase by amounts of its own, which drift a little from one star to
+the next, more than the noise of one exposure. Only a calibrated target shows its companion.
+The truth stands in the headers; the files are the same, byte by byte, on every machine.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from amibayes.closure import closure_matrix, kernel_basis
+from amibayes.covariance import Block, BlockCovariance, DiagonalCovariance, stack_covariances
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.model import BinaryModel
+from amibayes.observables import Observables
+from amibayes.oifits import write_oifits
+from amibayes.synthetic import point_source
+from amibayes.units import DEGREE, FloatArray, delta_mag_to_contrast, offset
+
+SEED = 20201211
+
+HOLES_M = [
+    (0.0, -2.64),
+    (-2.28631, 0.0),
+    (2.28631, -1.32),
+    (-2.28631, 1.32),
+    (-1.14315, 1.98),
+    (2.28631, 1.32),
+    (1.14315, 1.98),
+]
+HOLE_DIAMETER_M = 0.8
+WAVELENGTH_M, BAND_M = 4.817e-6, 0.302e-6
+
+SEPARATION_MAS, POSITION_ANGLE_DEG, DELTA_MAG = 150.0, 40.0, 5.0
+
+VIS2_ERROR = 0.002
+PHASE_ERROR_RAD = 0.1 * DEGREE
+"""Noise of V² and of the phase of each baseline in one exposure."""
+
+GAIN, PHASE_OFFSET_RAD = 0.03, 1.0 * DEGREE
+"""Spread over the baselines of the instrument's gain and phase, the same for all stars."""
+
+GAIN_DRIFT, PHASE_DRIFT_RAD = 0.002, 0.1 * DEGREE
+"""Spread over the stars, on each baseline."""
+
+STARS = {"target": 60000.00, "cal1": 59999.97, "cal2": 60000.03, "cal3": 60000.06}
+"""File and date (MJD) of each star."""
+
+DIGITS = 7
+"""Decimals of the values (radians for phases): far below the noise, and far above what
+differs between mathematical libraries."""
+
+
+def blank(name: str, mjd: float) -> Observables:
+    """A point source with the covariance of independent noise on every baseline."""
+    sheet = point_source(
+        HOLES_M,
+        WAVELENGTH_M,
+        BAND_M,
+        vis2_error=VIS2_ERROR,
+        closure_error_rad=np.sqrt(3.0) * PHASE_ERROR_RAD,
+        covariance="diagonal",
+        insname="NIRISS",
+        mjd=mjd,
+    )
+    matrix, _ = closure_matrix(sheet.closure_phase.stations)
+    closures = Block(
+        np.arange(len(matrix)), PHASE_ERROR_RAD**2 * (matrix @ matrix.T), kernel_basis(matrix)
+    )
+    covariance = stack_covariances(
+        [
+            DiagonalCovariance(np.full(len(sheet.vis2), VIS2_ERROR**2)),
+            BlockCovariance(len(matrix), [closures]),
+        ]
+    )
+    setup = replace(
+        sheet.setups[0],
+        target=f"EXAMPLE-{name.upper()}",
+        station_diameter_m=np.full(len(HOLES_M), HOLE_DIAMETER_M),
+        right_ascension_deg=150.0,
+        declination_deg=-40.0,
+    )
+    return replace(sheet, covariance=covariance, covariance_kind="given", setups=(setup,))
+
+
+def observe(
+    sheet: Observables, companion: bool, gain: FloatArray, phase: FloatArray
+) -> Observables:
+    """What is measured of a star through baselines with a gain and a phase of their own."""
+    east, north = offset(SEPARATION_MAS, POSITION_ANGLE_DEG)
+    contrast = float(delta_mag_to_contrast(DELTA_MAG)) if companion else 0.0
+    model = Likelihood(sheet, BinaryModel()).predict([[east, north, contrast]])[:, 0]
+    vis2, closure = np.split(model, [len(sheet.vis2)])
+    matrix, _ = closure_matrix(sheet.closure_phase.stations)
+    return replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=np.round(vis2 * gain, DIGITS)),
+        closure_phase=replace(
+            sheet.closure_phase, value=np.round(closure + matrix @ phase, DIGITS)
+        ),
+    )
+
+
+def simulate() -> dict[str, Observables]:
+    """The target and its calibrators, by file name."""
+    rng = np.random.default_rng(SEED)
+    n = len(HOLES_M) * (len(HOLES_M) - 1) // 2
+    instrument = 0.93 + GAIN * rng.standard_normal(n)
+    instrument_phase = PHASE_OFFSET_RAD * rng.standard_normal(n)
+    stars = {}
+    for name, mjd in STARS.items():
+        drift, noise, phase_drift, phase_noise = rng.standard_normal((4, n))
+        gain = instrument * (1.0 + GAIN_DRIFT * drift) + VIS2_ERROR * noise
+        phase = instrument_phase + PHASE_DRIFT_RAD * phase_drift + PHASE_ERROR_RAD * phase_noise
+        stars[name] = observe(blank(name, mjd), name == "target", gain, phase)
+    return stars
+
+
+def header(name: str) -> dict[str, str | int | float]:
+    """Keywords that hold the truth, and no date of today."""
+    truth: dict[str, str | int | float] = {
+        "HIERARCH TRUTH SEED": SEED,
+        "HIERARCH TRUTH VIS2_DRIFT": GAIN_DRIFT,
+        "HIERARCH TRUTH PHASE_DRIFT_DEG": PHASE_DRIFT_RAD / DEGREE,
+    }
+    if name == "target":
+        truth |= {
+            "HIERARCH TRUTH SEPARATION_MAS": SEPARATION_MAS,
+            "HIERARCH TRUTH POSITION_ANGLE_DEG": POSITION_ANGLE_DEG,
+            "HIERARCH TRUTH DELTA_MAG": DELTA_MAG,
+        }
+    program = {"DATE": "2023-02-25", "PROCSOFT": "amibayes, examples/make_example_data.py"}
+    return {**program, "ORIGIN": "SIMULATED", "TELESCOP": "JWST", "INSMODE": "NRM F480M", **truth}
+
+
+def main(folder: Path) -> None:
+    """Write the four files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, observables in simulate().items():
+        path = folder / f"{name}.oifits"
+        write_oifits(path, observables, header=header(name), overwrite=True)
+        print(path)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "data")
