@@ -4,7 +4,7 @@
 
 NIRISS aperture masking through F480M. All four share the instrument: each baseline loses
 visibility and shifts phase by amounts of its own, which drift a little from one star to
-the next, more than the noise of one exposure. Only a calibrated target shows its companion.
+the next, about as much as the noise of one exposure. Without calibration nothing fits.
 The truth stands in the headers; the files are the same, byte by byte, on every machine.
 """
 
@@ -20,6 +20,7 @@ from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, DiagonalCovariance, stack_covariances
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
+from amibayes.instrument import load_instrument
 from amibayes.observables import Observables
 from amibayes.oifits import write_oifits
 from amibayes.synthetic import point_source
@@ -27,17 +28,7 @@ from amibayes.units import DEGREE, FloatArray, delta_mag_to_contrast, offset
 
 SEED = 20201211
 
-HOLES_M = [
-    (0.0, -2.64),
-    (-2.28631, 0.0),
-    (2.28631, -1.32),
-    (-2.28631, 1.32),
-    (-1.14315, 1.98),
-    (2.28631, 1.32),
-    (1.14315, 1.98),
-]
-HOLE_DIAMETER_M = 0.8
-WAVELENGTH_M, BAND_M = 4.817e-6, 0.302e-6
+INSTRUMENT = load_instrument("niriss", "F480M")
 
 SEPARATION_MAS, POSITION_ANGLE_DEG, DELTA_MAG = 150.0, 40.0, 5.0
 
@@ -54,17 +45,19 @@ GAIN_DRIFT, PHASE_DRIFT_RAD = 0.002, 0.1 * DEGREE
 STARS = {"target": 60000.00, "cal1": 59999.97, "cal2": 60000.03, "cal3": 60000.06}
 """File and date (MJD) of each star."""
 
-DIGITS = 7
-"""Decimals of the values (radians for phases): far below the noise, and far above what
-differs between mathematical libraries."""
+DIGITS, PICOMETRE = 7, 12
+"""Decimals of the values (radians for phases) and of wavelengths: far below the noise, and
+far above what differs between mathematical libraries."""
 
 
 def blank(name: str, mjd: float) -> Observables:
     """A point source with the covariance of independent noise on every baseline."""
+    mask, bandpass = INSTRUMENT.mask, INSTRUMENT.bandpass
     sheet = point_source(
-        HOLES_M,
-        WAVELENGTH_M,
-        BAND_M,
+        # North up and east left: the image's x runs to the west.
+        mask.holes_m * [-1.0, 1.0],
+        round(bandpass.pivot_m, PICOMETRE),
+        round(bandpass.half_power_m[1] - bandpass.half_power_m[0], PICOMETRE),
         vis2_error=VIS2_ERROR,
         closure_error_rad=np.sqrt(3.0) * PHASE_ERROR_RAD,
         covariance="diagonal",
@@ -84,7 +77,7 @@ def blank(name: str, mjd: float) -> Observables:
     setup = replace(
         sheet.setups[0],
         target=f"EXAMPLE-{name.upper()}",
-        station_diameter_m=np.full(len(HOLES_M), HOLE_DIAMETER_M),
+        station_diameter_m=np.full(mask.n_holes, mask.size_m),
         right_ascension_deg=150.0,
         declination_deg=-40.0,
     )
@@ -112,7 +105,7 @@ def observe(
 def simulate() -> dict[str, Observables]:
     """The target and its calibrators, by file name."""
     rng = np.random.default_rng(SEED)
-    n = len(HOLES_M) * (len(HOLES_M) - 1) // 2
+    n = INSTRUMENT.mask.n_baselines
     instrument = 0.93 + GAIN * rng.standard_normal(n)
     instrument_phase = PHASE_OFFSET_RAD * rng.standard_normal(n)
     stars = {}

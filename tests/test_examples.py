@@ -64,6 +64,7 @@ def test_calibrated_by_the_plain_mean_the_companion_is_that_of_the_header() -> N
     )
 
 
-def test_without_calibration_it_is_not_found() -> None:
-    raw = search(Likelihood(read_oifits(EXAMPLES / "data" / "target.oifits")), (50.0, 400.0))
-    assert np.hypot(raw.companion.east_mas - 96.4, raw.companion.north_mas - 114.9) > 50.0
+def test_without_calibration_nothing_fits() -> None:
+    raw = search(Likelihood(read_oifits(EXAMPLES / "data" / "target.oifits")))
+    assert raw.chi2_binary / raw.ndof > 100.0
+    assert raw.companion.delta_mag < 4.0
