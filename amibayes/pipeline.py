@@ -18,11 +18,13 @@ from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
+from amibayes.inference.noise import ExtraNoise, search_with_noise
 from amibayes.inference.posterior import Posterior, modes_to_sample, sample
 from amibayes.inference.priors import default_prior
+from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
-from amibayes.inference.significance import ALPHA, Significance, significance
+from amibayes.inference.significance import ALPHA, Significance, bank_statistic, significance
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits
 
@@ -56,6 +58,8 @@ class SearchOptions:
         0 leaves the false-alarm probability out.
     alpha : float
         False-alarm probability of a detection.
+    extra_noise : bool
+        Add noise per kind of observable where the residuals ask for it.
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
@@ -74,6 +78,7 @@ class SearchOptions:
     target: str | None = None
     null_draws: int = 10_000
     alpha: float = ALPHA
+    extra_noise: bool = True
     posterior: bool = True
     limits: bool = True
     seed: int = 1
@@ -90,6 +95,7 @@ class SearchReport:
     calibration: Calibration | None
     references: tuple[Observables, ...]
     result: SearchResult
+    noise: ExtraNoise
     significance: Significance | None
     posterior: Posterior | None
     limits: DetectionLimit | None
@@ -170,11 +176,15 @@ def search_companion(
         with clock.stage("search"):
             likelihood = Likelihood(observables.only(options.observables))
             likelihood = likelihood.with_model(_model(likelihood, options))
-            result = search(likelihood, options.separation_mas)
+            if options.extra_noise:
+                result, noise = search_with_noise(likelihood, options.separation_mas)
+            else:
+                result, noise = search(likelihood, options.separation_mas), ExtraNoise()
+            likelihood = result.likelihood
         weight = None
         if options.null_draws:
             with clock.stage("significance"):
-                weight = _weigh(result, options, np.random.default_rng(streams[0]))
+                weight = _weigh(result, noise, options, np.random.default_rng(streams[0]))
         posterior = None
         if options.posterior:
             with clock.stage("posterior"):
@@ -198,10 +208,11 @@ def search_companion(
         calibration,
         tuple(references),
         result,
+        noise,
         weight,
         posterior,
         limits,
-        _warnings(observables, result, weight, posterior),
+        _warnings(observables, result, noise, weight, posterior),
         clock.seconds,
     )
 
@@ -222,25 +233,37 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
     return BinaryModel(1, diameter, options.background, options.smearing)
 
 
-def _weigh(result: SearchResult, options: SearchOptions, rng: np.random.Generator) -> Significance:
+def _weigh(
+    result: SearchResult, noise: ExtraNoise, options: SearchOptions, rng: np.random.Generator
+) -> Significance:
     bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    statistic = float(result.bank_delta_chi2.max())
-    return significance(bank, statistic, options.null_draws, rng, options.alpha)
+    residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
+    statistic = float(bank_statistic(bank, residuals, free_scale=noise.any)[0])
+    return significance(
+        bank, statistic, options.null_draws, rng, options.alpha, free_scale=noise.any
+    )
 
 
 def _warnings(
     observables: Observables,
     result: SearchResult,
+    noise: ExtraNoise,
     weight: Significance | None,
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
     outside = look_outside(result)
     found = [*([outside] if outside else []), *result.warnings, *observables.notes]
-    reduced = result.chi2_binary / result.ndof
-    if reduced > 2.0:
+    if noise.any:
         found.append(
-            f"reduced chi2 is {reduced:.1f} with the companion: the errors are too small or the "
-            "model is incomplete, and significance and errors are too optimistic"
+            f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "
+            f"{np.degrees(noise.closure_phase_rad):.2g} deg in closure phase was added in "
+            "quadrature; chi2 and errors include it"
+        )
+    elif result.chi2_binary / result.ndof > 2.0:
+        found.append(
+            f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "
+            "errors are too small or the model is incomplete, and significance and errors are "
+            "too optimistic"
         )
     if weight is not None and weight.tail is not None:
         found.append(

@@ -48,7 +48,10 @@ def result_json(report: SearchReport) -> Json:
         "posterior": None if report.posterior is None else _posterior(report.posterior),
         "calibration": _calibration(report),
         "limits": None if report.limits is None else limits_json(report.limits),
-        "noise": None,
+        "noise": {
+            "extra_vis2": report.noise.vis2,
+            "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
+        },
         "evidence": None,
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},

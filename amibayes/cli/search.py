@@ -103,6 +103,12 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         metavar="SIGMA",
         help="sigma clipping of the calibrators (default: %(default)s)",
     )
+    group.add_argument(
+        "--extra-noise",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="add noise where the stated errors do not explain the residuals (default: yes)",
+    )
     group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
     group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
 
@@ -161,6 +167,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         clip=arguments.clip,
         insname=arguments.insname,
         target=arguments.target,
+        extra_noise=arguments.extra_noise,
         null_draws=arguments.null_draws,
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,

@@ -122,6 +122,11 @@ class TemplateBank:
     def __len__(self) -> int:
         return len(self.grid)
 
+    @property
+    def n_nuisance(self) -> int:
+        """Number of nuisance directions."""
+        return int(self._basis.shape[1])
+
     def project(self, data: FloatArray) -> FloatArray:
         """Take the nuisance directions out of whitened data (n_data, …)."""
         return data - self._basis @ (self._basis.T @ data) if self._basis.size else data

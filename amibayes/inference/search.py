@@ -250,7 +250,8 @@ def innermost_first(
     apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
     alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
     distance = np.hypot(*(thetas[:, :2] - thetas[0, :2]).T)
-    alike &= (distance == 0.0) | (distance > resolution_mas(likelihood))
+    alike &= distance > resolution_mas(likelihood)
+    alike[0] = True
     group = [m for m, same in zip(modes, alike, strict=True) if same]
     first = min(group, key=lambda m: m.companion.separation_mas)
     rest = [m for m in modes if m is not first]

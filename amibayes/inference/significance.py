@@ -92,8 +92,38 @@ class Significance:
         return float(np.quantile(self.null, 1.0 - (alpha or self.alpha)))
 
 
-def null_maxima(bank: TemplateBank, n_draws: int, rng: np.random.Generator) -> FloatArray:
-    """Largest gain in χ² over the bank for ``n_draws`` null data sets, (n_draws,).
+def profiled(gain: FloatArray, chi2: FloatArray, n_data: int) -> FloatArray:
+    """Turn a gain in χ² into 2Δln L of a fit that scales the errors as well.
+
+    With the scale of the noise free, 2Δln L = n ln(χ²/(χ² − gain)): residuals and errors of
+    one data set grow together, and only their ratio counts.
+
+    Parameters
+    ----------
+    gain : (n,) float array
+    chi2 : (n,) float array
+        Without the companion.
+    n_data : int
+        Number of independent data less the nuisance parameters.
+    """
+    return np.asarray(-n_data * np.log1p(-np.minimum(gain / chi2, 1.0 - 1e-15)))
+
+
+def bank_statistic(bank: TemplateBank, white: FloatArray, *, free_scale: bool) -> FloatArray:
+    """Statistic of whitened data sets (n_data, n), the observed one as well as null ones."""
+    data = bank.project(white)
+    gain, _ = bank.largest_gain(data.astype(np.float32))
+    if not free_scale:
+        return gain
+    return profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
+
+
+def null_maxima(
+    bank: TemplateBank, n_draws: int, rng: np.random.Generator, *, free_scale: bool = False
+) -> FloatArray:
+    """Statistic of ``n_draws`` null data sets, (n_draws,): the largest gain over the bank.
+
+    With ``free_scale`` it is that of `profiled`, for noise whose size was fitted.
 
     Notes
     -----
@@ -108,7 +138,7 @@ def null_maxima(bank: TemplateBank, n_draws: int, rng: np.random.Generator) -> F
             for s, size in zip(seeds, sizes, strict=True)
         ]
     )
-    return bank.largest_gain(bank.project(noise.astype(float)).astype(np.float32))[0]
+    return bank_statistic(bank, noise.astype(float), free_scale=free_scale)
 
 
 def significance(
@@ -117,6 +147,8 @@ def significance(
     n_draws: int,
     rng: np.random.Generator,
     alpha: float = ALPHA,
+    *,
+    free_scale: bool = False,
 ) -> Significance:
     """Simulate the null distribution of a search and place the observed statistic in it.
 
@@ -130,8 +162,10 @@ def significance(
         At least 1.
     rng : numpy.random.Generator
     alpha : float
+    free_scale : bool
+        The size of the noise was fitted: see `profiled`; the statistic has to be so too.
     """
-    null = np.sort(null_maxima(bank, n_draws, rng))
+    null = np.sort(null_maxima(bank, n_draws, rng, free_scale=free_scale))
     above = int((null >= statistic).sum())
     tail = _tail(null, statistic, rng) if above < 10 <= n_draws * TAIL_FRACTION else None
     return Significance(

@@ -1,0 +1,188 @@
+"""Extra noise: a variance per kind of observable, for errors that are too small.
+
+Where the best model leaves residuals that the stated errors cannot explain, a variance is
+added to every V² and one to every closure phase (through the baselines that its triangles
+share) that makes the residuals as likely as can be. A reduced χ² of ten then means errors
+three times larger, and not a companion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from amibayes.closure import closure_matrix
+from amibayes.covariance import (
+    Block,
+    BlockCovariance,
+    Covariance,
+    DiagonalCovariance,
+    as_blocks,
+)
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.results import SearchResult
+from amibayes.inference.search import search
+from amibayes.observables import Observables, closure_sets
+from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
+
+UNLIKELY = 1e-3
+"""Probability of a χ² as large as that of a kind of observable, below which noise is added."""
+
+MOST_ROUNDS = 4
+
+SETTLED = 0.01
+"""Relative change of the extra noise at which search and noise agree."""
+
+
+@dataclass(frozen=True)
+class ExtraNoise:
+    """Standard deviations added in quadrature.
+
+    Parameters
+    ----------
+    vis2 : float
+        To every V².
+    closure_phase_rad : float
+        To every closure phase.
+    """
+
+    vis2: float = 0.0
+    closure_phase_rad: float = 0.0
+
+    @property
+    def any(self) -> bool:
+        """Whether there is any."""
+        return self.vis2 > 0.0 or self.closure_phase_rad > 0.0
+
+
+def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
+    """Add extra noise to the covariance of unflagged observables."""
+    if not extra.any:
+        return observables
+    data = observables.unflagged()
+    n_vis2 = data.n_vis2
+    diagonal = np.zeros(data.covariance.size)
+    diagonal[:n_vis2] = extra.vis2**2
+    if isinstance(data.covariance, DiagonalCovariance):
+        diagonal[n_vis2:] = extra.closure_phase_rad**2
+        return replace(data, covariance=DiagonalCovariance(data.covariance.variance + diagonal))
+    blocks = as_blocks(data.covariance)
+    matrices = [b.matrix + np.diag(diagonal[b.index]) for b in blocks]
+    home, place = _places(blocks, data.covariance.size)
+    for entries, shared in _shared_noise(data):
+        at = place[entries + n_vis2]
+        matrices[home[entries[0] + n_vis2]][np.ix_(at, at)] += extra.closure_phase_rad**2 * shared
+    noisy: Covariance = BlockCovariance(
+        data.covariance.size,
+        [Block(b.index, m, b.basis) for b, m in zip(blocks, matrices, strict=True)],
+    )
+    return replace(data, covariance=noisy)
+
+
+def _places(blocks: list[Block], size: int) -> tuple[IntArray, IntArray]:
+    """The block each datum stands in, and where in it."""
+    home, place = np.empty(size, dtype=np.intp), np.empty(size, dtype=np.intp)
+    for number, block in enumerate(blocks):
+        home[block.index], place[block.index] = number, np.arange(len(block.index))
+    return home, place
+
+
+def _shared_noise(data: Observables) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Covariance K Kᵀ/3 of closure phases whose baseline phases have variance 1/3 each."""
+    for entries in closure_sets(data.closure_phase):
+        matrix, _ = closure_matrix(data.closure_phase.stations[entries])
+        yield entries, matrix @ matrix.T / 3.0
+
+
+def fit_noise(likelihood: Likelihood, theta: FloatArray) -> ExtraNoise:
+    """Find the extra noise that makes the residuals of a fit most likely.
+
+    Each kind of observable is judged by itself: it gets extra noise only where its χ² has a
+    probability below `UNLIKELY`. The likelihood is the restricted one: the parameters of
+    the fit take their share of the degrees of freedom.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the stated errors.
+    theta : (n_dim,) float array
+        The fit.
+    """
+    data = likelihood.observables
+    difference = data.data - likelihood.predict(theta)[:, 0]
+    closure = difference[data.n_vis2 :]
+    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+    vis2 = np.arange(data.covariance.size) < data.n_vis2
+    share = 1.0 - len(theta) / likelihood.n_independent
+    return ExtraNoise(
+        _one_kind(data, difference, vis2, share, "vis2"),
+        _one_kind(data, difference, ~vis2, share, "closure_phase_rad"),
+    )
+
+
+def _one_kind(
+    data: Observables, difference: FloatArray, which: NDArray[np.bool_], share: float, name: str
+) -> float:
+    """Extra noise of one kind of observable from its residuals."""
+    if not which.any():
+        return 0.0
+    n = data.n_vis2
+    part = data.select(np.full(n, name == "vis2"), np.full(data.n_closure_phases, name != "vis2"))
+    residual = difference[which]
+    chi2, dof = _chi2(part.covariance, residual), share * part.covariance.rank
+    if stats.chi2.sf(chi2, dof) > UNLIKELY:
+        return 0.0
+    typical = float(np.sqrt(np.median(part.covariance.variance)))
+    largest = typical * np.sqrt(chi2 / dof)
+
+    def loss(log_sigma: float) -> float:
+        noisy = add_noise(part, ExtraNoise(**{name: float(np.exp(log_sigma))})).covariance
+        return _chi2(noisy, residual) + share * noisy.logdet()
+
+    bounds = float(np.log(1e-2 * typical)), float(np.log(10.0 * largest))
+    best = optimize.minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3})
+    return float(np.exp(best.x))
+
+
+def _chi2(covariance: Covariance, residual: FloatArray) -> float:
+    return float((covariance.whiten(residual) ** 2).sum())
+
+
+def search_with_noise(
+    likelihood: Likelihood, separation_mas: tuple[float, float] | None = None
+) -> tuple[SearchResult, ExtraNoise]:
+    """Search, and search again with the extra noise that the residuals ask for.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the stated errors.
+    separation_mas : (inner, outer), optional
+
+    Returns
+    -------
+    result : SearchResult
+        Of the data with the extra noise.
+    noise : ExtraNoise
+        None (zeros) where the stated errors explain the residuals.
+    """
+    result = search(likelihood, separation_mas)
+    noise = ExtraNoise()
+    for _ in range(MOST_ROUNDS):
+        before, noise = noise, fit_noise(likelihood, result.theta)
+        if _same(before, noise):
+            break
+        noisy = Likelihood(add_noise(likelihood.observables, noise), likelihood.model)
+        result = search(noisy, separation_mas)
+    return result, noise
+
+
+def _same(a: ExtraNoise, b: ExtraNoise) -> bool:
+    pairs = (a.vis2, b.vis2), (a.closure_phase_rad, b.closure_phase_rad)
+    return all(abs(x - y) <= SETTLED * max(x, y) for x, y in pairs)
