@@ -33,6 +33,10 @@ def _in_order(
         yield result(flying.popleft())
 
 
+def _same(function: Any) -> Any:
+    return function
+
+
 def _optional(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
@@ -77,7 +81,9 @@ class DaskExecutor:
         RunError
             When a piece killed several workers, or the cluster went away.
         """
-        submit = partial(self._client.submit, run_in_worker, function, pure=False)
+        # a task of its own: sent once, and made again where the worker that held it dies
+        shared = self._client.submit(_same, function, pure=False)
+        submit = partial(self._client.submit, run_in_worker, shared, pure=False)
         ahead = max(AHEAD, 2 * sum(self._client.nthreads().values()))
         return _in_order(submit, self._result, pieces, ahead)
 
@@ -118,7 +124,7 @@ class DaskExecutor:
         return RunError(
             what,
             source=self.address,
-            remedy="start dask scheduler and dask worker; finished pieces are kept for --resume",
+            remedy="start it (dask scheduler) and its workers (dask worker), and run again",
         )
 
 

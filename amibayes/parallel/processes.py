@@ -205,5 +205,5 @@ def _died(piece: int, exitcode: int | None) -> RunError:
     how = f"signal {-status}" if status < 0 else f"exit status {status}"
     return RunError(
         f"piece {piece} lost its worker process {ATTEMPTS} times ({how})",
-        remedy="fewer --workers need less memory; finished pieces are kept for --resume",
+        remedy="fewer --workers need less memory",
     )
