@@ -22,6 +22,27 @@ FLOOR = 0.05
 """Smallest baseline variance, in units of the mean one: no combination gets infinite weight."""
 
 
+def canonical(stations: IntArray) -> tuple[IntArray, IntArray]:
+    """Stations of baselines or triangles in rising order, and the sign that this gives.
+
+    Parameters
+    ----------
+    stations : (n, 2) or (n, 3) int array
+
+    Returns
+    -------
+    ordered : int array of the same shape
+    sign : (n,) int array
+        +1 or −1: a closure phase changes sign when two stations change places (0 where a
+        station comes twice). A squared visibility does not: always +1.
+    """
+    ordered = np.sort(stations, axis=1)
+    if stations.shape[1] == 2:
+        return ordered, np.ones(len(stations), dtype=np.intp)
+    a, b, c = stations.T
+    return ordered, np.sign((b - a) * (c - a) * (c - b)).astype(np.intp)
+
+
 def closure_matrix(triangles: IntArray) -> tuple[FloatArray, IntArray]:
     """Incidence of triangles on baselines: closure phase = K · baseline phase.
 

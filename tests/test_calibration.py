@@ -13,10 +13,10 @@ from scipy.special import j1
 
 from amibayes.calibration import Calibration, calibrate
 from amibayes.calibration.hierarchical import population_of, predictive, sample_tau
-from amibayes.calibration.matching import canonical, keys_of, match
+from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.transfer import Transfer, transfer_of, uniform_disc, wrapped
 from amibayes.calibration.weighted import clipped, weighted_response
-from amibayes.closure import closure_matrix, kernel_basis
+from amibayes.closure import canonical, closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, as_blocks
 from amibayes.errors import DataError
 from amibayes.observables import Observables, join

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.closure import canonical
 from amibayes.observables import IntArray, Measurements, Observables, Setup
 from amibayes.units import FloatArray
 
@@ -81,16 +82,6 @@ class Match:
     entry: IntArray
     key: IntArray
     sign: IntArray
-
-
-def canonical(stations: IntArray) -> tuple[IntArray, IntArray]:
-    """Stations in rising order, (n, k), and the sign that this gives a closure phase, (n,)."""
-    ordered = np.sort(stations, axis=1)
-    if stations.shape[1] == 2:
-        return ordered, np.ones(len(stations), dtype=np.intp)
-    a, b, c = stations.T
-    sign = np.sign((b - a) * (c - a) * (c - b))
-    return ordered, sign.astype(np.intp)
 
 
 def keys_of(target: Observables, window_days: float | None = None) -> Keys:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from astropy.time import Time
 
 from amibayes.errors import DataError
 from amibayes.observables import BoolArray, IntArray, Measurements
+from amibayes.oifits.dates import mjd_of_date
 from amibayes.oifits.scales import ANGLE, LENGTH, TIME, scale_of
 from amibayes.oifits.setups import integers, numbers, rest_of
 from amibayes.oifits.tables import OIFits, OITable
@@ -119,7 +119,7 @@ def times_of(table: OITable) -> tuple[FloatArray, str]:
     count = len(table)
     mjd = _one_number(table, "MJD", np.nan)
     seconds = _one_number(table, "TIME", 0.0) * scale_of(table.units.get("TIME", ""), TIME, "s")[0]
-    night = _date_obs(table)
+    night = mjd_of_date(table.keyword("DATE-OBS"))
     bad = ~(np.isfinite(mjd) & (mjd != 0))
     # One integer day in every row, and a clock that runs: MJD is only the date.
     is_date = not bad.any() and (mjd == np.floor(mjd)).all() and np.ptp(seconds) > 0
@@ -131,14 +131,6 @@ def times_of(table: OITable) -> tuple[FloatArray, str]:
     if bad.any():
         return np.where(bad, seconds / DAY_S, mjd), f"{table.label}: no date"
     return mjd.reshape(count), ""
-
-
-def _date_obs(table: OITable) -> float:
-    text = table.keyword("DATE-OBS")
-    try:
-        return float(np.floor(Time(text.split("T")[0], format="isot", scale="utc").mjd))
-    except ValueError:
-        return float("nan")
 
 
 def _one_number(table: OITable, name: str, absent: float) -> FloatArray:

@@ -30,13 +30,15 @@ class ColumnRule:
 class TableRule:
     """One table: the revision it has in each version, its keywords and columns.
 
-    ``keywords`` are mandatory; ``later_keywords`` are so from version 2 on.
+    ``keywords`` are mandatory; ``later_keywords`` are so from version 2 on; ``since`` is the
+    first version that has the table.
     """
 
     revision: tuple[int, int]
     keywords: tuple[str, ...]
     columns: tuple[ColumnRule, ...]
     later_keywords: tuple[str, ...] = ()
+    since: int = 1
 
     def keywords_of(self, version: int) -> tuple[str, ...]:
         """Mandatory keywords in a version."""
@@ -190,6 +192,8 @@ TABLES = {
     "OI_VIS": TableRule((1, 2), ("OI_REVN", "DATE-OBS", "INSNAME"), _columns(_VIS), ("ARRNAME",)),
     "OI_VIS2": TableRule((1, 2), ("OI_REVN", "DATE-OBS", "INSNAME"), _columns(_VIS2), ("ARRNAME",)),
     "OI_T3": TableRule((1, 2), ("OI_REVN", "DATE-OBS", "INSNAME"), _columns(_T3), ("ARRNAME",)),
-    "OI_FLUX": TableRule((1, 1), ("OI_REVN", "DATE-OBS", "INSNAME", "CALSTAT"), _columns(_FLUX)),
-    "OI_CORR": TableRule((1, 1), ("OI_REVN", "CORRNAME", "NDATA"), _columns(_CORR)),
+    "OI_FLUX": TableRule(
+        (1, 1), ("OI_REVN", "DATE-OBS", "INSNAME", "CALSTAT"), _columns(_FLUX), since=2
+    ),
+    "OI_CORR": TableRule((1, 1), ("OI_REVN", "CORRNAME", "NDATA"), _columns(_CORR), since=2),
 }

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.time import Time
 from numpy.typing import NDArray
 
 from amibayes import __version__
@@ -24,6 +23,7 @@ from amibayes.errors import UsageError
 from amibayes.files import atomic_path
 from amibayes.observables import BoolArray, IntArray, Observables
 from amibayes.oifits.correlations import pair_covariance
+from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of
 from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.standard import TABLES
@@ -117,7 +117,7 @@ def _primary(
     standard: dict[str, HeaderValue] = {
         "ORIGIN": UNKNOWN,
         "DATE": _today(),
-        "DATE-OBS": _date(mjd),
+        "DATE-OBS": first_date(mjd),
         "CONTENT": "OIFITS2",
         "TELESCOP": _one(layout.arrnames),
         "INSTRUME": _one(layout.insnames),
@@ -140,11 +140,6 @@ def _today() -> str:
     epoch = os.environ.get("SOURCE_DATE_EPOCH", "")
     now = datetime.fromtimestamp(int(epoch), UTC) if epoch.isdigit() else datetime.now(UTC)
     return now.strftime("%Y-%m-%d")
-
-
-def _date(mjd: FloatArray) -> str:
-    known = mjd[np.isfinite(mjd)]
-    return str(Time(known.min() if len(known) else 0.0, format="mjd").isot).split("T")[0]
 
 
 def _target_table(layout: Layout) -> Any:
@@ -251,7 +246,7 @@ def _describe(
 ) -> None:
     """The keywords of a data table."""
     m = measurements_of(observables, grid.kind)
-    table.header["DATE-OBS"] = _date(m.mjd[grid.entries])
+    table.header["DATE-OBS"] = first_date(m.mjd[grid.entries])
     table.header["ARRNAME"] = layout.arrnames[layout.array[grid.setup]]
     table.header["INSNAME"] = layout.insnames[layout.channel[grid.setup]]
     if correlated:

@@ -1,0 +1,99 @@
+"""What is wrong or doubtful in an OIFITS file, why it matters and what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from amibayes.errors import DataError
+from amibayes.observables import Observables
+from amibayes.oifits.audit import geometry, noise, packages, structure, values
+from amibayes.oifits.audit.finding import Finding, Severity
+from amibayes.oifits.audit.repair import repair
+from amibayes.oifits.reader import observables_of
+from amibayes.oifits.setups import DATA_TABLES, integers, targets_of
+from amibayes.oifits.tables import OIFits, open_oifits
+
+__all__ = ["Audit", "Finding", "Severity", "audit", "repair"]
+
+FILE_CHECKS = (
+    *structure.CHECKS,
+    *values.CHECKS,
+    *geometry.CHECKS,
+    *noise.CHECKS,
+    *packages.CHECKS,
+)
+DATA_CHECKS = (*geometry.DATA_CHECKS, *noise.DATA_CHECKS)
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """A file and what was found in it.
+
+    Parameters
+    ----------
+    oifits : OIFits
+    findings : tuple of Finding
+        Errors first.
+    """
+
+    oifits: OIFits
+    findings: tuple[Finding, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """As `audit.json` holds it."""
+        return {
+            "path": self.oifits.path,
+            "oifits_version": self.oifits.version,
+            "tables": [f"{t.name} {t.extver}" for t in self.oifits.tables],
+            "not_used": [f"{t.name} {t.extver}" for t in self.oifits.unused],
+            "findings": [f.as_json() for f in self.findings],
+        }
+
+
+def audit(path: str | Path | OIFits) -> Audit:
+    """Look for what is wrong or doubtful in an OIFITS file.
+
+    Parameters
+    ----------
+    path : path or OIFits
+
+    Returns
+    -------
+    Audit
+        Also for a file that has neither V² nor closure phases.
+
+    Raises
+    ------
+    DataError
+        Where the file cannot be read at all.
+    """
+    oifits = path if isinstance(path, OIFits) else open_oifits(path)
+    found = [finding for check in FILE_CHECKS for finding in check(oifits)]
+    names = _targets(oifits)
+    found += list(noise.unusable(oifits, names))
+    parts = [p for p in (_part(oifits, name) for name in names) if p is not None]
+    found += [finding for check in DATA_CHECKS for finding in check(oifits, parts)]
+    return Audit(oifits, tuple(sorted(found, key=lambda f: f.severity != "error")))
+
+
+def _targets(oifits: OIFits) -> list[str]:
+    """Names of the targets that have V² or closure phases, as `observables_of` knows them."""
+    known = targets_of(oifits) if oifits.named("OI_TARGET") else {}
+    names = []
+    for table in oifits.tables:
+        if table.name in DATA_TABLES and len(table):
+            try:
+                ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
+            except DataError:
+                continue
+            names += [known[i].name if i in known else f"target {i}" for i in set(ids.tolist())]
+    return list(dict.fromkeys(names))
+
+
+def _part(oifits: OIFits, name: str) -> Observables | None:
+    """The data of a target with independent errors; None where they cannot be read."""
+    try:
+        return observables_of(oifits, target=name, closure_covariance="diagonal")
+    except DataError:
+        return None

@@ -1,0 +1,232 @@
+"""Whether (u, v), stations and closure phases belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from amibayes.closure import canonical
+from amibayes.observables import BoolArray, IntArray, Measurements, Observables, closure_sets
+from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
+from amibayes.oifits.tables import OIFits
+from amibayes.units import FloatArray
+
+SAME_UV = 0.02
+"""(u, v) of one baseline in two tables agree to this part of its length …"""
+
+TURN_PER_DAY = 2 * np.pi
+"""… and to what the Earth's rotation changes between their dates."""
+
+SIMULTANEOUS_D = 0.02
+NON_CLOSING = 4.0
+"""Mean χ² of sums over four triangles past which closure phases do not close (1 expected)."""
+
+
+def repeated_stations(oifits: OIFits) -> Findings:
+    """Baselines or triangles that name a station twice."""
+    for table, _ in data_tables(oifits):
+        stations = column(table, "STA_INDEX")
+        if stations is None:
+            continue
+        twice = (np.diff(np.sort(stations, axis=1), axis=1) == 0).any(axis=1)
+        if twice.any():
+            yield Finding(
+                "error",
+                "station-twice",
+                table.label,
+                f"{count(int(twice.sum()), 'row')} name a station twice",
+                "closure phases cannot be tied to baselines",
+                "write the stations of each row",
+            )
+
+
+def uv_against_stations(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
+    """(u, v) of triangles against those of the same baselines in OI_VIS2."""
+    for part in parts:
+        agree, reverse, compared = _legs(part)
+        off = compared & ~agree & ~reverse
+        where = ", ".join(s.insname for s in part.setups)
+        if off.sum() > 0.01 * max(compared.sum(), 1):
+            yield Finding(
+                "error",
+                "uv-stations",
+                where,
+                f"(u, v) of {count(int(off.sum()), 'side')} of triangles (of "
+                f"{compared.sum()}) are not those of the same stations in OI_VIS2",
+                "models are computed at wrong baselines",
+                "check STA_INDEX and the order of U1COORD, U2COORD",
+            )
+        elif (agree & ~reverse).any() and (reverse & ~agree).any():
+            yield Finding(
+                "warning",
+                "uv-direction",
+                where,
+                f"(u, v) of {count(int((reverse & ~agree).sum()), 'side')} of triangles run "
+                "against those of the same stations in OI_VIS2, of others they do not",
+                "the sign of those closure phases is in doubt",
+                "check the order of the stations",
+            )
+
+
+def _legs(part: Observables) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Where the two sides of each triangle agree with V²'s (u, v), or with its reverse."""
+    vis2, closure = _rows(part.vis2), _rows(part.closure_phase)
+    n = len(closure)
+    agree, reverse, compared = (np.zeros((n, 2), dtype=bool) for _ in range(3))
+    if not len(vis2) or not n:
+        return agree, reverse, compared
+    for side in range(2):
+        pair = closure.stations[:, side : side + 2]
+        uv = np.stack([closure.u_m[:, side], closure.v_m[:, side]], axis=1)
+        nearest, days = _same_baseline(closure, pair, vis2)
+        turned = (pair[:, 0] > pair[:, 1]) != (
+            vis2.stations[nearest, 0] > vis2.stations[nearest, 1]
+        )
+        known = np.concatenate([vis2.u_m, vis2.v_m], axis=1)[nearest]
+        known = known * np.where(turned, -1.0, 1.0)[:, None]
+        length = np.linalg.norm(known, axis=1)
+        allowed = length * (SAME_UV + TURN_PER_DAY * days) + 1e-6
+        compared[:, side] = days < SIMULTANEOUS_D
+        agree[:, side] = np.linalg.norm(uv - known, axis=1) < allowed
+        reverse[:, side] = np.linalg.norm(uv + known, axis=1) < allowed
+    return agree & compared, reverse & compared, compared
+
+
+def _rows(m: Measurements) -> Measurements:
+    """One entry of every row."""
+    _, first = np.unique(np.stack([m.setup, m.row]), axis=1, return_index=True)
+    return m.select(np.sort(first))
+
+
+def _same_baseline(
+    closure: Measurements, pair: IntArray, vis2: Measurements
+) -> tuple[IntArray, FloatArray]:
+    """V² row of the same setup and baseline nearest in time to each triangle, and how near."""
+    wanted = np.column_stack([closure.setup, np.sort(pair, axis=1)])
+    there = np.column_stack([vis2.setup, np.sort(vis2.stations, axis=1)])
+    same = (wanted[:, None] == there[None]).all(axis=2)
+    days = np.where(same, np.abs(closure.mjd[:, None] - vis2.mjd), np.inf)
+    nearest = np.argmin(days, axis=1)
+    return nearest, days[np.arange(len(nearest)), nearest]
+
+
+def baselines_longer_than_the_array(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
+    """Projected baselines that are longer than the distance of their stations."""
+    for part in parts:
+        rows = _rows(part.vis2)
+        for number, setup in enumerate(part.setups):
+            ours = rows.select(rows.setup == number)
+            if setup.station_xyz_m is None or not len(ours):
+                continue
+            ends = setup.station_xyz_m[ours.stations]
+            apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+            length = np.hypot(ours.u_m[:, 0], ours.v_m[:, 0])
+            long = length > apart * (1 + SAME_UV) + 1e-3
+            if long.mean() > 0.01:
+                yield Finding(
+                    "error",
+                    "uv-length",
+                    setup.insname,
+                    f"{count(int(long.sum()), 'baseline')} of {len(long)} longer than the "
+                    f"distance of the stations (up to {(length / apart)[long].max():.3g} times)",
+                    "(u, v) are not in metres, or STA_INDEX or STAXYZ is wrong",
+                    "check the unit of UCOORD and the station numbers",
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class FourTriangles:
+    """Sums of closure phases over four triangles in one closure set.
+
+    ``sign`` (n_sums, n_triangles) holds −1, 0, +1; ``phase`` and ``variance`` are those of the
+    triangles, ``name`` what to call them.
+    """
+
+    name: list[str]
+    sign: FloatArray
+    phase: FloatArray
+    variance: FloatArray
+
+    def chi2(self, turned: Collection[str] = ()) -> FloatArray:
+        """χ² of each sum, with some triangles turned round."""
+        side = np.array([-1.0 if name in turned else 1.0 for name in self.name])
+        left = self.sign @ (side * self.phase)
+        left = np.angle(np.exp(1j * left))
+        return np.asarray(left**2 / (np.abs(self.sign) @ self.variance))
+
+
+def closures_that_do_not_close(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
+    """Sums of closure phases over four triangles, which vanish whatever the source is.
+
+    φ(abc) − φ(abd) + φ(acd) − φ(bcd) = 0 holds for every object, so what is left is noise.
+    """
+    for part in parts:
+        sums = four_triangles(part)
+        chi2 = np.concatenate([np.empty(0), *(s.chi2() for s in sums)])
+        if len(chi2) < 5 or chi2.mean() < NON_CLOSING:
+            continue
+        turned = _turned(sums)
+        clause = f"; with {listed(turned)} turned round it would be {_mean(sums, turned):.3g}"
+        yield Finding(
+            "error",
+            "non-closing",
+            ", ".join(s.insname for s in part.setups),
+            f"sums over four triangles, which are zero for any source, have a mean χ² of "
+            f"{chi2.mean():.3g} ({len(chi2)} sums){clause if turned else ''}",
+            "the order of the stations or the sign of some closure phases is wrong, or errors "
+            "are too small",
+            f"check STA_INDEX{'' if turned else ' and the errors'} of OI_T3",
+        )
+
+
+def four_triangles(part: Observables) -> list[FourTriangles]:
+    """The sums of every closure set that has all four triangles of some four stations."""
+    closure = part.closure_phase.select(~part.closure_phase.flag)
+    sigma = part.errors[1][~part.closure_phase.flag]
+    found = []
+    for entries in closure_sets(closure):
+        few = closure.select(entries)
+        ordered, sign = canonical(few.stations)
+        place = {tuple(t): i for i, t in enumerate(ordered.tolist())}
+        rows = []
+        for four in combinations(np.unique(ordered).tolist(), 4):
+            corners = [four[:k] + four[k + 1 :] for k in range(4)]
+            if all(t in place for t in corners):
+                which = [place[t] for t in corners]
+                rows.append(np.zeros(len(few)))
+                rows[-1][which] = np.array([-1, 1, -1, 1]) * sign[which]
+        if rows:
+            stations = part.setups[int(few.setup[0])].stations
+            names = ["-".join(stations[s] for s in t) for t in few.stations]
+            found.append(
+                FourTriangles(names, np.array(rows), few.value, np.asarray(sigma[entries] ** 2))
+            )
+    return found
+
+
+def _mean(sums: list[FourTriangles], turned: Collection[str]) -> float:
+    return float(np.concatenate([s.chi2(turned) for s in sums]).mean())
+
+
+def _turned(sums: list[FourTriangles]) -> list[str]:
+    """Few triangles that, turned round, make the sums close; none where that does not help."""
+    names = sorted({name for s in sums for name in s.name})
+    chosen: list[str] = []
+    while len(chosen) < len(names) // 3 + 1:
+        trials = {n: _mean(sums, [*chosen, n]) for n in names if n not in chosen}
+        best = min(trials, key=trials.__getitem__)
+        chosen.append(best)
+        if trials[best] < NON_CLOSING:
+            return chosen
+    return []
+
+
+CHECKS = (repeated_stations,)
+DATA_CHECKS = (
+    uv_against_stations,
+    baselines_longer_than_the_array,
+    closures_that_do_not_close,
+)
