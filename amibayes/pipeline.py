@@ -27,6 +27,7 @@ from amibayes.inference.search import look_outside, resolves_stars, search
 from amibayes.inference.significance import ALPHA, Significance, bank_statistic, significance
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits
+from amibayes.parallel import Executor, Progress
 
 Stage = Callable[[str], None]
 
@@ -126,7 +127,8 @@ def search_companion(
     chain: str | Path | None = None,
     resume: bool = False,
     announce: Stage = lambda name: None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
 ) -> SearchReport:
     """Find, weigh and measure a companion: the main job.
 
@@ -143,7 +145,9 @@ def search_companion(
     announce : callable
         Told the name of each stage as it begins.
     progress : callable, optional
-        Told (steps done, steps expected) of the posterior.
+        Told (done, expected) within the longer stages.
+    executor : Executor, optional
+        Where null draws and limits are computed; the result does not depend on it.
 
     Raises
     ------
@@ -184,7 +188,9 @@ def search_companion(
         weight = None
         if options.null_draws:
             with clock.stage("significance"):
-                weight = _weigh(result, noise, options, np.random.default_rng(streams[0]))
+                weight = _weigh(
+                    result, noise, options, np.random.default_rng(streams[0]), executor, progress
+                )
         posterior = None
         if options.posterior:
             with clock.stage("posterior"):
@@ -199,7 +205,13 @@ def search_companion(
         limits = None
         if options.limits and weight is not None:
             with clock.stage("limits"):
-                limits = detection_limit(result, weight, np.random.default_rng(streams[2]))
+                limits = detection_limit(
+                    result,
+                    weight,
+                    np.random.default_rng(streams[2]),
+                    executor=executor,
+                    progress=progress,
+                )
     return SearchReport(
         options,
         tuple(str(p) for p in targets),
@@ -234,13 +246,25 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
 
 
 def _weigh(
-    result: SearchResult, noise: ExtraNoise, options: SearchOptions, rng: np.random.Generator
+    result: SearchResult,
+    noise: ExtraNoise,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    executor: Executor | None,
+    progress: Progress | None,
 ) -> Significance:
     bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
     residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
     statistic = float(bank_statistic(bank, residuals, free_scale=noise.any)[0])
     return significance(
-        bank, statistic, options.null_draws, rng, options.alpha, free_scale=noise.any
+        bank,
+        statistic,
+        options.null_draws,
+        rng,
+        options.alpha,
+        free_scale=noise.any,
+        executor=executor,
+        progress=progress,
     )
 
 

@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--resume", action="store_true", help="go on with a posterior that was cut off"
     )
     common.add_seed_option(stages)
+    common.add_parallel_options(parser)
     common.add_output_options(parser, "search")
 
 
@@ -139,7 +140,10 @@ def _names(arguments: argparse.Namespace, options: SearchOptions) -> list[str]:
 def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path) -> SearchReport:
     from amibayes.pipeline import search_companion
 
-    with common.Progress(quiet=arguments.quiet) as progress:
+    with (
+        common.executor_of(arguments) as executor,
+        common.Progress(quiet=arguments.quiet) as progress,
+    ):
         return search_companion(
             arguments.targets,
             arguments.cal,
@@ -148,6 +152,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
             resume=arguments.resume,
             announce=progress.stage,
             progress=progress.update,
+            executor=executor,
         )
 
 

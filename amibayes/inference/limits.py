@@ -9,6 +9,7 @@ than a null search, a column of a matrix product.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import optimize, special, stats
@@ -19,6 +20,8 @@ from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolution_mas
 from amibayes.inference.significance import Significance
+from amibayes.observables import BoolArray
+from amibayes.parallel import Executor, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray, contrast_to_delta_mag, offset
 
 N_SEPARATIONS = 16
@@ -86,6 +89,8 @@ def detection_limit(
     *,
     n_separations: int = N_SEPARATIONS,
     trials_per_cell: int = TRIALS_PER_CELL,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> DetectionLimit:
     """Measure the detection limit of a search by injection and recovery.
 
@@ -97,6 +102,8 @@ def detection_limit(
         Its null draws set the threshold, at its α.
     rng : numpy.random.Generator
     n_separations, trials_per_cell : int
+    executor, progress
+        As in `recover`.
 
     Returns
     -------
@@ -113,7 +120,16 @@ def detection_limit(
     east, north = offset(np.broadcast_to(rho[:, None, None], shape), angle)
     contrast = np.minimum(np.broadcast_to(level[:, :, None], shape), 1.0)
     theta = np.stack([east, north, contrast], axis=-1).reshape(-1, 3)
-    found = recover(likelihood, bank, result.single_theta, theta, threshold, rng).reshape(shape)
+    found = recover(
+        likelihood,
+        bank,
+        result.single_theta,
+        theta,
+        threshold,
+        rng,
+        executor=executor,
+        progress=progress,
+    ).reshape(shape)
     recovered = found.sum(axis=2)
     trials = np.full(recovered.shape, trials_per_cell)
     fits = [_logistic(np.log(c), r, n) for c, r, n in zip(level, recovered, trials, strict=True)]
@@ -140,7 +156,10 @@ def recover(
     theta: FloatArray,
     threshold: float,
     rng: np.random.Generator,
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> BoolArray:
     """Inject companions and say which of them the search recovers.
 
     Parameters
@@ -154,38 +173,34 @@ def recover(
     threshold : float
         Gain in χ² that counts as a detection.
     rng : numpy.random.Generator
+    executor : Executor, optional
+        Where it is computed; the result does not depend on it.
+    progress : callable, optional
+        Told (pieces done, pieces in all).
 
     Returns
     -------
     (n,) bool array
     """
-    starts = range(0, len(theta), TRIALS_AT_ONCE)
-    streams = rng.bit_generator.seed_seq.spawn(len(starts))  # type: ignore[attr-defined]
-    pieces = [
-        _recover_piece(
-            likelihood,
-            bank,
-            single,
-            theta[s : s + TRIALS_AT_ONCE],
-            threshold,
-            np.random.default_rng(k),
-        )
-        for s, k in zip(starts, streams, strict=True)
-    ]
-    return np.concatenate(pieces)
+    parts = slices(len(theta), TRIALS_AT_ONCE)
+    pieces = [(theta[p], seed) for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)]
+    work = partial(_recover_piece, likelihood, bank, single, threshold)
+    return np.concatenate(
+        list(run_job(work, pieces, executor or SerialExecutor(), progress=progress))
+    )
 
 
 def _recover_piece(
     likelihood: Likelihood,
     bank: TemplateBank,
     single: FloatArray,
-    theta: FloatArray,
     threshold: float,
-    rng: np.random.Generator,
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    piece: tuple[FloatArray, np.random.SeedSequence],
+) -> BoolArray:
+    theta, seed = piece
     signal = injected_signal(likelihood, single, theta)
-    data = bank.project(signal + rng.standard_normal(signal.shape)).astype(np.float32)
-    gain, position = bank.largest_gain(data)
+    noise = np.random.default_rng(seed).standard_normal(signal.shape)
+    gain, position = bank.largest_gain(bank.project(signal + noise).astype(np.float32))
     east, north = bank.grid.east_mas[position], bank.grid.north_mas[position]
     away = np.hypot(east - theta[:, 0], north - theta[:, 1])
     near = away < 0.5 * resolution_mas(likelihood)
