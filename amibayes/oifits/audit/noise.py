@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from scipy.stats import chi2
 
-from amibayes.closure import canonical, closure_matrix, kernel_basis
+from amibayes.closure import canonical, canonical_uv, closure_matrix, kernel_basis
 from amibayes.errors import DataError
 from amibayes.observables import IntArray, Measurements, Observables, closure_sets
 from amibayes.oifits.audit.finding import Finding, Findings, column, count
@@ -155,7 +155,7 @@ def _repeats(m: Measurements) -> Iterator[IntArray]:
     ordered, _ = canonical(m.stations)
     key = np.column_stack([m.setup, m.channel, ordered])
     order = np.lexsort((m.mjd, *key.T))
-    uv = np.concatenate([np.abs(m.u_m), np.abs(m.v_m)], axis=1)[order]
+    uv = canonical_uv(m.stations, m.u_m, m.v_m)[order]
     moved = np.abs(np.diff(uv, axis=0)).max(axis=1) > SAME_PLACE * np.abs(uv[1:]).max(axis=1)
     cut = (np.diff(key[order], axis=0) != 0).any(axis=1) | moved
     for group in np.split(order, np.flatnonzero(cut) + 1):
