@@ -43,6 +43,29 @@ def canonical(stations: IntArray) -> tuple[IntArray, IntArray]:
     return ordered, np.sign((b - a) * (c - a) * (c - b)).astype(np.intp)
 
 
+def canonical_uv(stations: IntArray, u_m: FloatArray, v_m: FloatArray) -> FloatArray:
+    """(u, v) of baselines or triangles as if their stations stood in rising order.
+
+    Parameters
+    ----------
+    stations : (n, k + 1) int array
+        k = 1 for baselines, 2 for triangles.
+    u_m, v_m : (n, k) float array
+        From each station to the next.
+
+    Returns
+    -------
+    (n, 2k) float array
+        u, then v.
+    """
+    order = np.argsort(stations, axis=1)
+    parts = []
+    for step in (u_m, v_m):
+        place = np.concatenate([np.zeros((len(step), 1)), np.cumsum(step, axis=1)], axis=1)
+        parts.append(np.diff(np.take_along_axis(place, order, axis=1), axis=1))
+    return np.concatenate(parts, axis=1)
+
+
 def closure_matrix(triangles: IntArray) -> tuple[FloatArray, IntArray]:
     """Incidence of triangles on baselines: closure phase = K · baseline phase.
 

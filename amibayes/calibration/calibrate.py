@@ -80,6 +80,23 @@ class Calibration:
     tau: FloatArray | None = None
 
     @property
+    def tau_closure_phase_deg(self) -> float | None:
+        """Scatter of closure phases in degrees."""
+        tau = self.tau_closure_phase_rad
+        return None if tau is None else float(np.degrees(tau))
+
+    def as_json(self) -> dict[str, object]:
+        """As `result.json` holds it."""
+        return {
+            "method": self.method,
+            "calibrators": [
+                {"path": use.path, "kept": use.kept, "reason": use.reason}
+                for use in self.calibrators
+            ],
+            "tau": {"vis2": self.tau_vis2, "closure_phase_deg": self.tau_closure_phase_deg},
+        }
+
+    @property
     def targets(self) -> tuple[Observables, ...]:
         """Each target by itself (without its covariance with the others)."""
         ends = np.cumsum(self.n_setups)

@@ -15,6 +15,9 @@ from amibayes.errors import AmibayesError
 
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
+    "calibrate": "divide the instrument out of a target's data with calibrators",
+    "audit": "say what is wrong or doubtful in OIFITS files",
+    "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",
     "plan": "groups, integrations and time of an exposure, and what it lets one see",
 }

@@ -8,6 +8,7 @@ programs that ask for them; nothing is NaN, also where flagged.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -67,23 +68,24 @@ class Export:
     def command(self, path: str | Path) -> str:
         """The command line that reconstructs an image from the file ``path``."""
         stem = Path(path).with_suffix("")
+        path, image = shlex.quote(str(path)), shlex.quote(f"{stem}-image")
         if self.program == "squeeze":
             return (
                 f"squeeze {path} -s {self.pixel_mas:.4g} -w {self.n_pixels} -novis -not3amp "
-                f"-chains 5 -o {stem}-image"
+                f"-chains 5 -o {image}"
             )
         if self.program == "mira":
             # The mean pixel of an image of unit flux is the threshold of the edges.
             return (
                 f"ymira -pixelsize={self.pixel_mas:.4g}mas -fov={self.field_mas:.4g}mas -flux=1 "
                 f"-min=0 -regul=hyperbolic -mu=3e3 -tau={self.n_pixels**-2.0:.2g} -ftol=0 -gtol=0 "
-                f"-maxeval=1000 -initial=Dirac -bootstrap=1 -recenter {path} {stem}-image.fits"
+                f"-maxeval=1000 -initial=Dirac -bootstrap=1 -recenter {path} {image}.fits"
             )
         first, last = self.wavelength_um
         return (
             f"esorex mat_cal_imarec --fov={self.field_mas:.4g} --npix={self.n_pixels} "
             f"--lambda_from={first:.4f} --lambda_to={last:.4f} --algo_mode=1 --calc_t3amp=1 "
-            f"--start_mode=1 --mjd_tol={self.mjd_tolerance:.2g} {stem}.sof"
+            f"--start_mode=1 --mjd_tol={self.mjd_tolerance:.2g} {shlex.quote(f'{stem}.sof')}"
         )
 
     def set_of_frames(self, path: str | Path) -> str:

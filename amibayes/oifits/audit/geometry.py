@@ -22,7 +22,10 @@ TURN_PER_DAY = 2 * np.pi
 
 SIMULTANEOUS_D = 0.02
 NON_CLOSING = 4.0
-"""Mean χ² of sums over four triangles past which closure phases do not close (1 expected)."""
+"""Mean χ² of sums over four triangles past which closure phases do not close (1 expected) …"""
+
+ONE_NON_CLOSING = 36.0
+"""… and χ² of a single one (6σ)."""
 
 
 def repeated_stations(oifits: OIFits) -> Findings:
@@ -48,7 +51,7 @@ def uv_against_stations(oifits: OIFits, parts: Sequence[Observables]) -> Finding
     for part in parts:
         agree, reverse, compared = _legs(part)
         off = compared & ~agree & ~reverse
-        where = ", ".join(s.insname for s in part.setups)
+        where = listed(s.insname for s in part.setups)
         if off.sum() > 0.01 * max(compared.sum(), 1):
             yield Finding(
                 "error",
@@ -96,7 +99,8 @@ def _legs(part: Observables) -> tuple[BoolArray, BoolArray, BoolArray]:
 
 
 def _rows(m: Measurements) -> Measurements:
-    """One entry of every row."""
+    """One unflagged entry of every row that has one."""
+    m = m.select(~m.flag)
     _, first = np.unique(np.stack([m.setup, m.row]), axis=1, return_index=True)
     return m.select(np.sort(first))
 
@@ -166,16 +170,17 @@ def closures_that_do_not_close(oifits: OIFits, parts: Sequence[Observables]) -> 
     for part in parts:
         sums = four_triangles(part)
         chi2 = np.concatenate([np.empty(0), *(s.chi2() for s in sums)])
-        if len(chi2) < 5 or chi2.mean() < NON_CLOSING:
+        if len(chi2) < 5 or _closes(chi2):
             continue
         turned = _turned(sums)
-        clause = f"; with {listed(turned)} turned round it would be {_mean(sums, turned):.3g}"
+        clause = f"; with {listed(turned)} turned round they would close"
         yield Finding(
             "error",
             "non-closing",
-            ", ".join(s.insname for s in part.setups),
-            f"sums over four triangles, which are zero for any source, have a mean χ² of "
-            f"{chi2.mean():.3g} ({len(chi2)} sums){clause if turned else ''}",
+            listed(s.insname for s in part.setups),
+            f"sums over four triangles, which are zero for any source, have χ² of "
+            f"{chi2.mean():.3g} in the mean and up to {chi2.max():.3g} ({len(chi2)} sums)"
+            f"{clause if turned else ''}",
             "the order of the stations or the sign of some closure phases is wrong, or errors "
             "are too small",
             f"check STA_INDEX{'' if turned else ' and the errors'} of OI_T3",
@@ -207,8 +212,9 @@ def four_triangles(part: Observables) -> list[FourTriangles]:
     return found
 
 
-def _mean(sums: list[FourTriangles], turned: Collection[str]) -> float:
-    return float(np.concatenate([s.chi2(turned) for s in sums]).mean())
+def _closes(chi2: FloatArray) -> bool:
+    """Whether sums are noise: in the mean, and each of them."""
+    return bool(chi2.mean() < NON_CLOSING and chi2.max() < ONE_NON_CLOSING)
 
 
 def _turned(sums: list[FourTriangles]) -> list[str]:
@@ -216,10 +222,14 @@ def _turned(sums: list[FourTriangles]) -> list[str]:
     names = sorted({name for s in sums for name in s.name})
     chosen: list[str] = []
     while len(chosen) < len(names) // 3 + 1:
-        trials = {n: _mean(sums, [*chosen, n]) for n in names if n not in chosen}
-        best = min(trials, key=trials.__getitem__)
+        trials = {
+            n: np.concatenate([s.chi2([*chosen, n]) for s in sums])
+            for n in names
+            if n not in chosen
+        }
+        best = min(trials, key=lambda n: float(trials[n].sum()))
         chosen.append(best)
-        if trials[best] < NON_CLOSING:
+        if _closes(trials[best]):
             return chosen
     return []
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from amibayes.closure import canonical, closure_matrix, kernel_basis
+from amibayes.closure import canonical, canonical_uv, closure_matrix, kernel_basis
 from amibayes.errors import DataError
 from amibayes.observables import IntArray, Measurements, Observables, closure_sets
-from amibayes.oifits.audit.finding import Finding, Findings, column, count
+from amibayes.oifits.audit.finding import Finding, Findings, column, count, listed
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits
 from amibayes.units import FloatArray
@@ -38,7 +39,7 @@ def independent_closures(oifits: OIFits, parts: Sequence[Observables]) -> Findin
             yield Finding(
                 "warning",
                 "closures-as-independent",
-                ", ".join(s.insname for s in part.setups),
+                listed(s.insname for s in part.setups),
                 f"{n} closure phases of which {rank} are independent, and no correlations",
                 "triangles share baselines: a fit that takes them as independent makes its "
                 f"errors too small by {np.sqrt(n / rank):.2f}",
@@ -115,22 +116,31 @@ def readable_without(oifits: OIFits, name: str) -> bool:
 def scatter(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
     """Repeats at one point of the (u, v) plane that scatter more than their errors say."""
     for part in parts:
+        instrument = _instruments(part)
         for m, error, what in (
             (part.vis2, part.errors[0], "V²"),
             (part.closure_phase, part.errors[1], "closure phases"),
         ):
             used = ~m.flag
-            total, degrees = _repeat_chi2(m.select(used), error[used], what != "V²")
+            alike = replace(m, setup=instrument[m.setup]).select(used)
+            total, degrees = _repeat_chi2(alike, error[used], what != "V²")
             if degrees >= 5 and total / degrees > 2 and chi2.sf(total, degrees) < CHANCE:
                 yield Finding(
                     "warning",
                     "errors-too-small",
-                    ", ".join(s.insname for s in part.setups),
+                    listed(s.insname for s in part.setups),
                     f"repeats of {what} at one (u, v) scatter {np.sqrt(total / degrees):.1f} "
                     f"times more than their errors ({degrees} degrees of freedom)",
                     "contrasts and their errors will be too optimistic",
                     "fit an extra noise, or find what makes the scatter",
                 )
+
+
+def _instruments(part: Observables) -> IntArray:
+    """Number of each setup's instrument: setups of one name, stations and channels are one."""
+    known: dict[tuple[object, ...], int] = {}
+    keys = [(s.insname, s.stations, s.wavelength_m.tobytes()) for s in part.setups]
+    return np.array([known.setdefault(key, len(known)) for key in keys], dtype=np.intp)
 
 
 def _repeat_chi2(m: Measurements, error: FloatArray, is_phase: bool) -> tuple[float, int]:
@@ -155,7 +165,7 @@ def _repeats(m: Measurements) -> Iterator[IntArray]:
     ordered, _ = canonical(m.stations)
     key = np.column_stack([m.setup, m.channel, ordered])
     order = np.lexsort((m.mjd, *key.T))
-    uv = np.concatenate([np.abs(m.u_m), np.abs(m.v_m)], axis=1)[order]
+    uv = canonical_uv(m.stations, m.u_m, m.v_m)[order]
     moved = np.abs(np.diff(uv, axis=0)).max(axis=1) > SAME_PLACE * np.abs(uv[1:]).max(axis=1)
     cut = (np.diff(key[order], axis=0) != 0).any(axis=1) | moved
     for group in np.split(order, np.flatnonzero(cut) + 1):

@@ -81,7 +81,7 @@ def dates(oifits: OIFits) -> Findings:
                 yield _wrong_date(table, f"DATE-OBS {night!r} is no date")
             continue
         apart = np.abs(mjd - written - 0.5)
-        if np.isfinite(apart).all() and apart.min(initial=0.0) > 2.0:
+        if np.isfinite(apart).all() and apart.min() > 2.0:
             yield _wrong_date(table, f"MJD {mjd.min():.1f} is not the night of {night}")
 
 

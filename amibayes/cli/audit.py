@@ -1,0 +1,130 @@
+"""``amibayes audit``: what is wrong or doubtful in an OIFITS file."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amibayes.cli import common
+from amibayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from amibayes.oifits.audit import Audit, Finding
+
+RESULT = "audit.json"
+MOST_LINES = 20
+
+EXAMPLES = """examples:
+  amibayes audit target.oifits
+  amibayes audit *.oifits --fix --out audited
+
+exit status: 0 nothing found, 1 findings, 3 a file that cannot be read
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``audit``."""
+    parser.epilog = EXAMPLES
+    parser.add_argument("files", nargs="+", metavar="FILE", help="OIFITS file(s)")
+    parser.add_argument(
+        "--fix",
+        action="store_true",
+        help="write a corrected copy of each file, where the remedy is certain",
+    )
+    common.add_output_options(parser, "audit")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Audit the files; the exit status says whether anything was found."""
+    common.configure_logging(arguments)
+    common.refuse_repeated(arguments.files)
+    from amibayes import __version__
+    from amibayes.files import output_folder, write_json
+    from amibayes.oifits.audit import audit
+
+    audits = [audit(path) for path in arguments.files]
+    copies = _copies(arguments, audits)
+    folder = output_folder(arguments.out, [RESULT, *copies.values()], overwrite=arguments.overwrite)
+    fixed = _fix(audits, copies, folder)
+    content = {
+        "amibayes": __version__,
+        "n_findings": sum(len(a.findings) for a in audits),
+        "files": [
+            a.as_json()
+            | {
+                "fixed": [f.code for f in mended],
+                "copy": str(folder / copies[a.oifits.path]) if mended else None,
+            }
+            for a, mended in zip(audits, fixed, strict=True)
+        ],
+    }
+    write_json(folder / RESULT, content)
+    common.finish(arguments, content, lambda: _summary(audits, fixed, copies, folder))
+    return int(any(a.findings for a in audits))
+
+
+def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str]:
+    """Name of the corrected copy of each file that has something certain to mend.
+
+    Raises
+    ------
+    UsageError
+        Where two files of one name would get the same copy.
+    """
+    if not arguments.fix:
+        return {}
+    paths = [a.oifits.path for a in audits if any(f.certain for f in a.findings)]
+    names = {path: Path(path).name.removesuffix(".gz") for path in paths}
+    if len(set(names.values())) < len(names):
+        raise UsageError(
+            "two files have the same name", source="--fix", remedy="audit them one by one"
+        )
+    return names
+
+
+def _fix(audits: list[Audit], copies: dict[str, str], folder: Path) -> list[list[Finding]]:
+    from amibayes.oifits.audit import repair
+
+    out: list[list[Finding]] = []
+    for a in audits:
+        name = copies.get(a.oifits.path)
+        target = folder / name if name else None
+        if target is not None and target.resolve() == Path(a.oifits.path).resolve():
+            raise UsageError(
+                "would be written over itself", source=target, remedy="choose another --out"
+            )
+        out.append([] if target is None else repair(a.oifits, list(a.findings), target))
+    return out
+
+
+def _summary(
+    audits: list[Audit], fixed: list[list[Finding]], copies: dict[str, str], folder: Path
+) -> list[str]:
+    """At most 20 lines: what was found, each kind once for a file; the rest is in the JSON."""
+    lines = []
+    for a, mended in zip(audits, fixed, strict=True):
+        count = len(a.findings)
+        said = "nothing found" if not count else f"{count} finding{'s' if count > 1 else ''}"
+        if mended:
+            said += f", {len(mended)} mended in {folder / copies[a.oifits.path]}"
+        lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {said}")
+        lines += [_line(group) for group in _alike(a.findings)]
+    if len(lines) > MOST_LINES - 1:
+        left = len(lines) - (MOST_LINES - 2)
+        lines = [*lines[: MOST_LINES - 2], f"and {left} lines more"]
+    return [*lines, f"explained in {folder / RESULT}"]
+
+
+def _alike(findings: tuple[Finding, ...]) -> list[list[Finding]]:
+    """Findings of one kind together."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        groups.setdefault((finding.code, finding.remedy), []).append(finding)
+    return list(groups.values())
+
+
+def _line(group: list[Finding]) -> str:
+    first = group[0]
+    more = f" and {len(group) - 1} more" if len(group) > 1 else ""
+    return f"  {first.severity:7} {first.where}{more}: {first.what} ({first.remedy})"
