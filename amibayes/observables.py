@@ -25,8 +25,10 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 CovarianceKind = Literal["diagonal", "assumed", "given", "estimated"]
 
-SIMULTANEOUS_DAY = 2e-4
-"""Rows of one table nearer in time than this (17 s) may belong to one exposure."""
+SIMULTANEOUS_S = 17.0
+"""Rows of one setup nearer in time than this, or than they were integrated, go together."""
+
+DAY_S = 86400.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,8 +250,8 @@ def _freeze(container: Any) -> None:
 def exposure_labels(closure_phase: Measurements) -> IntArray:
     """Number the exposure each closure phase belongs to: one set of triangles at one time.
 
-    Rows of one setup within `SIMULTANEOUS_DAY` of each other are simultaneous, unless a
-    triangle comes back, which starts the next exposure.
+    Rows of one setup within `SIMULTANEOUS_S` (or their integration time) of each other are
+    simultaneous, unless a triangle comes back, which starts the next exposure.
     """
     m = closure_phase
     if not len(m):
@@ -268,13 +270,20 @@ def _count_exposures(rows: Measurements) -> list[int]:
     for i in range(len(rows)):
         triangle = tuple(sorted(rows.stations[i].tolist()))
         apart = i and (
-            rows.setup[i] != rows.setup[i - 1] or rows.mjd[i] - rows.mjd[i - 1] > SIMULTANEOUS_DAY
+            rows.setup[i] != rows.setup[i - 1] or _far_in_time(rows, i)
         )
         if apart or triangle in seen:
             seen = set()
         label.append(label[-1] + (not seen) if label else 0)
         seen.add(triangle)
     return label
+
+
+def _far_in_time(rows: Measurements, i: int) -> bool:
+    """Whether a row begins after the one before it can have ended."""
+    overlap = 0.5 * float(np.nan_to_num(rows.integration_s[[i - 1, i]]).sum())
+    gap = DAY_S * (rows.mjd[i] - rows.mjd[i - 1])
+    return bool(gap > max(SIMULTANEOUS_S, overlap))
 
 
 def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:

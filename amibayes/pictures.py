@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from amibayes.pipeline import SearchOptions, SearchReport
+from amibayes.pipeline import SearchOptions, SearchReport, calibrator_verdicts
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
@@ -66,13 +66,8 @@ def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
 
 
 def _calibrators(report: SearchReport) -> Figure:
-    calibration = report.calibration
-    assert calibration is not None
-    return calibrator_plot(
-        report.references,
-        [c.kept for c in calibration.calibrators],
-        [Path(p).name for p in report.calibrators],
-    )
+    kept = [bool(c["kept"]) for c in calibrator_verdicts(report)]
+    return calibrator_plot(report.references, kept, [Path(p).name for p in report.calibrators])
 
 
 def _null(report: SearchReport) -> Figure:

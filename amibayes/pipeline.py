@@ -13,7 +13,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import Calibration, Method, calibrate
-from amibayes.errors import UsageError
+from amibayes.errors import DataError, UsageError
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
@@ -28,6 +28,7 @@ from amibayes.inference.significance import ALPHA, Significance, bank_statistic,
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits
 from amibayes.parallel import Executor, Progress
+from amibayes.vetting import Vetting, doubts, vet
 
 Stage = Callable[[str], None]
 
@@ -53,6 +54,8 @@ class SearchOptions:
         By default hierarchical with 3 calibrators or more.
     clip : float
         Sigma clipping of the calibrators.
+    keep_all : bool
+        Use all calibrators, whatever vetting would say of them.
     insname, target : str, optional
         One instrument, one target of a file that holds several.
     null_draws : int
@@ -75,6 +78,7 @@ class SearchOptions:
     closure_covariance: Literal["assumed", "diagonal"] = "assumed"
     calibration: Method | None = None
     clip: float = 3.0
+    keep_all: bool = False
     insname: str | None = None
     target: str | None = None
     null_draws: int = 10_000
@@ -95,6 +99,7 @@ class SearchReport:
     observables: Observables
     calibration: Calibration | None
     references: tuple[Observables, ...]
+    vetting: Vetting | None
     result: SearchResult
     noise: ExtraNoise
     significance: Significance | None
@@ -102,6 +107,12 @@ class SearchReport:
     limits: DetectionLimit | None
     warnings: tuple[str, ...]
     timing_s: dict[str, float] = field(default_factory=dict)
+
+
+FEWEST_TO_VET = 3
+"""Of two calibrators that disagree nothing says which is the bad one."""
+
+VETTING_DRAWS = 1000
 
 
 class _Clock:
@@ -166,12 +177,23 @@ def search_companion(
         with clock.stage("read"):
             parts = [_read(path, options) for path in targets]
             references = [_read(path, options) for path in calibrators]
+        vetting, believed = None, references
+        if len(references) >= FEWEST_TO_VET and not options.keep_all:
+            with clock.stage("vet"):
+                vetting = vet(
+                    references,
+                    separation_mas=options.separation_mas,
+                    null_draws=VETTING_DRAWS,
+                    limits=False,
+                    seed=options.seed,
+                )
+                believed = _believed(references, vetting)
         calibration, observables = None, join(parts)
         if references:
             with clock.stage("calibrate"):
                 calibration = calibrate(
                     parts,
-                    references,
+                    believed,
                     method=options.calibration,
                     clip=options.clip,
                     rng=np.random.default_rng(streams[3]),
@@ -219,12 +241,13 @@ def search_companion(
         observables,
         calibration,
         tuple(references),
+        vetting,
         result,
         noise,
         weight,
         posterior,
         limits,
-        _warnings(observables, result, noise, weight, posterior),
+        (*_vetting_warnings(vetting), *_warnings(observables, result, noise, weight, posterior)),
         clock.seconds,
     )
 
@@ -236,6 +259,38 @@ def _read(path: str | Path, options: SearchOptions) -> Observables:
         target=options.target,
         closure_covariance=options.closure_covariance,
     )
+
+
+def _believed(references: list[Observables], vetting: Vetting) -> list[Observables]:
+    """The calibrators that vetting kept.
+
+    Raises
+    ------
+    DataError
+        Where it kept none.
+    """
+    kept = [r for r, v in zip(references, vetting.calibrators, strict=True) if v.kept]
+    if not kept:
+        raise DataError(
+            f"no calibrator is left: {vetting.calibrators[0].path} "
+            f"{vetting.calibrators[0].reason}, and so on",
+            source="--cal",
+            remedy="give other calibrators, or --keep-all",
+        )
+    return kept
+
+
+def _vetting_warnings(vetting: Vetting | None) -> list[str]:
+    if vetting is None:
+        return []
+    dropped = [
+        f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
+    ]
+    return dropped + [
+        f"calibrator {v.path} {doubt}"
+        for v in vetting.calibrators
+        for doubt in doubts(v, vetting.alpha)
+    ]
 
 
 def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
@@ -308,3 +363,25 @@ def _warnings(
             f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
         )
     return tuple(found)
+
+
+def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
+    """Every calibrator in the order given: vetting's verdict, then what calibration used."""
+    if report.calibration is None:
+        return []
+    used = iter(report.calibration.calibrators)
+    verdicts = None if report.vetting is None else report.vetting.calibrators
+    out: list[dict[str, object]] = []
+    for k, path in enumerate(report.calibrators):
+        vetted = None if verdicts is None else verdicts[k]
+        judged = vetted if vetted is not None and not vetted.kept else next(used)
+        agreement = None if vetted is None else vetted.agreement
+        out.append(
+            {
+                "path": path,
+                "kept": judged.kept,
+                "reason": judged.reason,
+                "agreement_probability": agreement,
+            }
+        )
+    return out

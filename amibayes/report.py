@@ -14,7 +14,7 @@ from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.significance import Significance
-from amibayes.pipeline import SearchReport
+from amibayes.pipeline import SearchReport, calibrator_verdicts
 from amibayes.units import contrast_to_delta_mag
 
 Json = dict[str, Any]
@@ -205,10 +205,7 @@ def _calibration(report: SearchReport) -> Json | None:
         return None
     return {
         "method": calibration.method,
-        "calibrators": [
-            {"path": path, "kept": used.kept, "reason": used.reason}
-            for path, used in zip(report.calibrators, calibration.calibrators, strict=True)
-        ],
+        "calibrators": calibrator_verdicts(report),
         "tau": {
             "vis2": calibration.tau_vis2,
             "closure_phase_deg": None

@@ -105,6 +105,9 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         help="sigma clipping of the calibrators (default: %(default)s)",
     )
     group.add_argument(
+        "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
+    )
+    group.add_argument(
         "--extra-noise",
         action=argparse.BooleanOptionalAction,
         default=True,
@@ -170,6 +173,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         closure_covariance=arguments.closure_covariance,
         calibration=arguments.calibration,
         clip=arguments.clip,
+        keep_all=arguments.keep_all,
         insname=arguments.insname,
         target=arguments.target,
         extra_noise=arguments.extra_noise,

@@ -186,7 +186,9 @@ class GridPosterior:
             share = self.contrast_probability[kept]
             return Marginal(edges[:, :-1][kept], edges[:, 1:][kept], share)
         k = self.nuisance_names.index(name)
-        return Marginal(self.nuisance.low[:, k], self.nuisance.high[:, k], self.nuisance_probability)
+        return Marginal(
+            self.nuisance.low[:, k], self.nuisance.high[:, k], self.nuisance_probability
+        )
 
     def _along(self, east: int, north: int) -> Marginal:
         """Distribution along a direction; each cell a box of its own variance."""
@@ -373,8 +375,7 @@ class _Work:
             return Nuisance(none, np.zeros(1), none, none)
         axes = [self._axis(k) for k in range(len(self.single))]
         value, weight, low, high = (
-            np.stack(np.meshgrid(*[a[j] for a in axes], indexing="ij"), axis=-1)
-            for j in range(4)
+            np.stack(np.meshgrid(*[a[j] for a in axes], indexing="ij"), axis=-1) for j in range(4)
         )
         n = len(axes)
         log_weight = np.log(weight).sum(axis=-1).ravel()
