@@ -123,8 +123,7 @@ def calibrate(
 ) -> Calibration:
     """Divide V² and subtract closure phases of calibrators, with the full covariance.
 
-    Values are matched by baseline or triangle (stations are known by name or by place) and
-    wavelength; the order of stations may differ between files.
+    Matched by baseline or triangle (stations by name or place, in any order) and wavelength.
 
     Parameters
     ----------
@@ -132,9 +131,8 @@ def calibrate(
         Several targets keep the covariance that the calibrators they share give them.
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted"}, optional
-        Inverse-variance means, with the scatter between calibrators where it is larger than
-        the errors; or random effects, with a scatter per type of observable that the target
-        has too. By default hierarchical with 3 calibrators or more.
+        Inverse-variance means, with the scatter where it is larger than the errors; or random
+        effects (see `amibayes.calibration.hierarchical`), the default with 3 or more.
     clip : float, optional
         Leave out values that stand off the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (float, float), optional
@@ -142,16 +140,14 @@ def calibrate(
     window_days : float, optional
         Use only calibrators observed within this time of each epoch of the target.
     charge_levels : sequence of float, optional
-        Charge level (or brightness) of the target, then of each calibrator, on which the
-        response may depend linearly. Hierarchical only.
+        Of the target, then of each calibrator: the response may depend on them linearly.
     rng : numpy.random.Generator, optional
-        For the sampling of the scatter; a fixed seed by default.
+        A fixed seed by default.
 
     Raises
     ------
     DataError
-        Where there is no calibrator, one is the target itself, none has a baseline and
-        wavelength in common with it, or there are too few for the method.
+        Where calibrators are none, too few, the target itself, or have nothing in common.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
     calibrators = list(calibrators)
