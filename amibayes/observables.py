@@ -269,9 +269,7 @@ def _count_exposures(rows: Measurements) -> list[int]:
     seen: set[tuple[int, ...]] = set()
     for i in range(len(rows)):
         triangle = tuple(sorted(rows.stations[i].tolist()))
-        apart = i and (
-            rows.setup[i] != rows.setup[i - 1] or _far_in_time(rows, i)
-        )
+        apart = i and (rows.setup[i] != rows.setup[i - 1] or _far_in_time(rows, i))
         if apart or triangle in seen:
             seen = set()
         label.append(label[-1] + (not seen) if label else 0)

@@ -39,6 +39,7 @@ LAYERS = [
     "pipeline",
     "pictures",
     "report",
+    "vetting_report",
     "cli",
     "__main__",
 ]

@@ -17,7 +17,8 @@ from amibayes.calibration.transfer import sparse_covariance, wrapped
 from amibayes.closure import canonical, canonical_uv
 from amibayes.errors import UsageError
 from amibayes.observables import (
-    SIMULTANEOUS_DAY,
+    DAY_S,
+    SIMULTANEOUS_S,
     IntArray,
     Measurements,
     Observables,
@@ -87,7 +88,7 @@ def average_polarisations(observables: Observables) -> Observables:
     parts = []
     for m in (observables.vis2, observables.closure_phase):
         ours = home[m.setup]
-        parts.append(_Groups(m, ours, _rows(m, ours, SIMULTANEOUS_DAY), m.channel))
+        parts.append(_Groups(m, ours, _rows(m, ours, SIMULTANEOUS_S / DAY_S), m.channel))
     return _averaged(observables, parts, setups, summed_time=False)
 
 

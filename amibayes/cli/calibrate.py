@@ -57,7 +57,7 @@ def _add_method(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--charge-levels",
-        type=_numbers,
+        type=common.numbers,
         metavar="LIST",
         help="charge level (or brightness) of the target, then of each calibrator, on which the "
         "response may depend (hierarchical)",
@@ -106,14 +106,6 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         metavar="DAYS",
         help="average the target's exposures within this time, while (u, v) stays",
     )
-
-
-def _numbers(text: str) -> list[float]:
-    """Parse numbers with commas between them."""
-    try:
-        return [float(word) for word in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers") from None
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -165,6 +165,19 @@ def number_or_free(text: str) -> float | str:
     return value
 
 
+def probability(text: str) -> float:
+    """Parse a number between 0 and 1, both left out."""
+    value = positive_float(text)
+    if value >= 1.0:
+        raise argparse.ArgumentTypeError(f"{text} is not below 1")
+    return value
+
+
+def numbers(text: str) -> list[float]:
+    """Parse positive numbers with commas between them."""
+    return [positive_float(part) for part in text.split(",")]
+
+
 def observable_kinds(text: str) -> tuple[str, ...]:
     """Parse ``vis2,cp``: one or both, once each."""
     kinds = tuple(text.split(","))

@@ -16,6 +16,7 @@ from amibayes.errors import AmibayesError
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
     "calibrate": "divide the instrument out of a target's data with calibrators",
+    "vet": "say which calibrators may be believed, and why",
     "audit": "say what is wrong or doubtful in OIFITS files",
     "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",

@@ -1,0 +1,100 @@
+"""``amibayes vet``: which calibrators may be believed."""
+
+from __future__ import annotations
+
+import argparse
+
+from amibayes.cli import common
+from amibayes.errors import UsageError
+
+RESULT, PICTURE = "vetting.json", "vetting.png"
+
+EXAMPLES = """examples:
+  amibayes vet cal*.oifits
+  amibayes vet vetted_star_*.oifits --calibrated --separation 20:250
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``vet``."""
+    parser.epilog = EXAMPLES
+    parser.add_argument("calibrators", nargs="+", metavar="CAL", help="OIFITS files")
+    group = parser.add_argument_group("tests")
+    group.add_argument(
+        "--calibrated",
+        action="store_true",
+        help="the files are calibrated already: judge each by itself, not against the others",
+    )
+    group.add_argument(
+        "--separation", type=common.number_range, metavar="MIN:MAX", help="field in mas"
+    )
+    group.add_argument(
+        "--alpha",
+        type=common.probability,
+        default=0.003,
+        help="probability of chance of each test below which a calibrator is dropped "
+        "(default: %(default)s)",
+    )
+    group.add_argument(
+        "--null-draws",
+        type=common.positive_integer,
+        default=4000,
+        metavar="N",
+        help="null searches for the false-alarm probability (default: %(default)s)",
+    )
+    group.add_argument("--no-limits", action="store_true", help="leave the limits out")
+    group.add_argument(
+        "--charge-levels",
+        type=common.numbers,
+        metavar="LIST",
+        help="charge level (or brightness) of the target, then of each calibrator",
+    )
+    group.add_argument(
+        "--closure-covariance",
+        choices=["assumed", "diagonal"],
+        default="assumed",
+        help="for files with errors and no correlations (default: %(default)s)",
+    )
+    group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
+    common.add_seed_option(group)
+    common.add_output_options(parser, "vet")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Judge the calibrators and write the verdicts."""
+    common.configure_logging(arguments)
+    common.refuse_repeated(arguments.calibrators)
+    levels = arguments.charge_levels
+    if levels is not None and len(levels) != 1 + len(arguments.calibrators):
+        raise UsageError(
+            f"needs {1 + len(arguments.calibrators)} numbers, the target's first",
+            source="--charge-levels",
+        )
+    from amibayes.files import output_folder, write_json
+    from amibayes.oifits import read_oifits
+    from amibayes.plots.style import save
+    from amibayes.vetting import vet
+    from amibayes.vetting_report import vetting_json, vetting_picture, vetting_table
+
+    folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
+    data = [
+        read_oifits(
+            path, insname=arguments.insname, closure_covariance=arguments.closure_covariance
+        )
+        for path in arguments.calibrators
+    ]
+    vetting = vet(
+        data,
+        calibrated=arguments.calibrated,
+        separation_mas=arguments.separation,
+        alpha=arguments.alpha,
+        null_draws=arguments.null_draws,
+        limits=not arguments.no_limits,
+        charge_levels=levels,
+        seed=arguments.seed,
+    )
+    content = vetting_json(vetting)
+    save(vetting_picture(vetting), folder / PICTURE)
+    write_json(folder / RESULT, content)
+    common.finish(arguments, content, lambda: [*vetting_table(vetting), f"written to {folder}"])
+    return 0
