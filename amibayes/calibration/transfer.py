@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import block_array, coo_array, csr_array, diags_array
-from scipy.special import j0, j1
 
 from amibayes.calibration.matching import Keys, Match, match
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Covariance, as_blocks
+from amibayes.disc import uniform_disc
 from amibayes.observables import BoolArray, IntArray, Observables
-from amibayes.units import MAS, FloatArray
+from amibayes.units import FloatArray
 
 Diameter = tuple[float, float]
 """Uniform-disc diameter of a calibrator and its error, mas."""
@@ -113,17 +113,6 @@ def _disc_correction(
     return scale, change
 
 
-def uniform_disc(frequency: FloatArray, diameter_mas: float) -> tuple[FloatArray, FloatArray]:
-    """Visibility 2 J1(z)/z, z = πθ|u|, of a uniform disc, and its derivative per mas."""
-    per_mas = np.pi * MAS * frequency
-    z = per_mas * diameter_mas
-    small = z < 1e-4
-    safe = np.where(small, 1.0, z)
-    amplitude = np.where(small, 1.0 - z * z / 8.0, 2.0 * j1(safe) / safe)
-    slope = np.where(small, -z / 4.0, 2.0 * (j0(safe) - amplitude) / safe) * per_mas
-    return amplitude, slope
-
-
 def sparse_covariance(covariance: Covariance) -> csr_array:
     """Write a covariance as a sparse matrix."""
     rows, columns, values = [], [], []
@@ -192,6 +181,5 @@ __all__ = [
     "on_one_branch",
     "sparse_covariance",
     "transfer_of",
-    "uniform_disc",
     "wrapped",
 ]

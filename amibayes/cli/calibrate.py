@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common
+from amibayes.cli import common, data_options
 from amibayes.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -36,18 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_method(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--calibration",
-        choices=["weighted", "hierarchical"],
-        help="how calibrators are combined (default: hierarchical with 3 or more)",
-    )
-    group.add_argument(
-        "--clip",
-        type=common.positive_float,
-        default=3.0,
-        metavar="SIGMA",
-        help="leave out values that stand off the other calibrators (default: %(default)s)",
-    )
+    data_options.add_calibration(group)
     group.add_argument(
         "--calibrator-diameters",
         metavar="LIST|TABLE",
@@ -72,13 +61,8 @@ def _add_method(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_data(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--closure-covariance",
-        choices=["assumed", "diagonal"],
-        default="assumed",
-        help="for files with errors and no correlations (default: %(default)s)",
-    )
-    group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
+    data_options.add_closure_covariance(group)
+    data_options.add_insname(group)
     group.add_argument("--target", metavar="NAME", help="use one target of the target's files")
     group.add_argument(
         "--flag",

@@ -175,7 +175,10 @@ def probability(text: str) -> float:
 
 def numbers(text: str) -> list[float]:
     """Parse positive numbers with commas between them."""
-    return [positive_float(part) for part in text.split(",")]
+    try:
+        return [positive_float(part) for part in text.split(",")]
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers: {error}") from None
 
 
 def observable_kinds(text: str) -> tuple[str, ...]:

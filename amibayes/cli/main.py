@@ -37,8 +37,9 @@ class Parser(argparse.ArgumentParser):
         for action in self._actions:
             if isinstance(action, argparse._SubParsersAction):
                 known += [o for p in action.choices.values() for o in p._option_string_actions]
-        words = [word.strip("'\"").split("=")[0] for word in message.split()]
-        for word in words:
+        doubtful = ("unrecognized arguments", "argument COMMAND")
+        words = message.split() if message.startswith(doubtful) else []
+        for word in (w.strip("'\"").split("=")[0] for w in words[2:]):
             if word not in known and (close := difflib.get_close_matches(word, known, n=1)):
                 return f" (did you mean {close[0]}?)"
         return " (see --help)"

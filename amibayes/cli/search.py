@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common
+from amibayes.cli import common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
@@ -31,13 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_model(parser.add_argument_group("model"))
     _add_data(parser.add_argument_group("data"))
     stages = parser.add_argument_group("stages")
-    stages.add_argument(
-        "--null-draws",
-        type=common.non_negative_integer,
-        default=10_000,
-        metavar="N",
-        help="null searches for the false-alarm probability; 0: none (default: %(default)s)",
-    )
+    data_options.add_null_draws(stages, 10_000)
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
     stages.add_argument(
@@ -49,12 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_model(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--separation",
-        type=common.number_range,
-        metavar="MIN:MAX",
-        help="field in mas (default: lambda/2B_max to lambda/B_min of the data)",
-    )
+    data_options.add_separation(group)
     group.add_argument(
         "--diameter",
         type=common.number_or_free,
@@ -85,25 +74,8 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         metavar="vis2,cp",
         help="which observables to fit (default: both)",
     )
-    group.add_argument(
-        "--closure-covariance",
-        choices=["assumed", "diagonal"],
-        default="assumed",
-        help="for files with errors and no correlations: triangles correlated through shared "
-        "baselines, or (the field's habit) independent (default: %(default)s)",
-    )
-    group.add_argument(
-        "--calibration",
-        choices=["weighted", "hierarchical"],
-        help="how calibrators are combined (default: hierarchical with 3 or more)",
-    )
-    group.add_argument(
-        "--clip",
-        type=common.positive_float,
-        default=3.0,
-        metavar="SIGMA",
-        help="sigma clipping of the calibrators (default: %(default)s)",
-    )
+    data_options.add_closure_covariance(group)
+    data_options.add_calibration(group)
     group.add_argument(
         "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
     )
@@ -113,7 +85,7 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
         default=True,
         help="add noise where the stated errors do not explain the residuals (default: yes)",
     )
-    group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
+    data_options.add_insname(group)
     group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
 
 

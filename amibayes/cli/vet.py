@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amibayes.cli import common
+from amibayes.cli import common, data_options
 from amibayes.errors import UsageError
 
 RESULT, PICTURE = "vetting.json", "vetting.png"
@@ -25,9 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the files are calibrated already: judge each by itself, not against the others",
     )
-    group.add_argument(
-        "--separation", type=common.number_range, metavar="MIN:MAX", help="field in mas"
-    )
+    data_options.add_separation(group)
     group.add_argument(
         "--alpha",
         type=common.probability,
@@ -35,13 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="probability of chance of each test below which a calibrator is dropped "
         "(default: %(default)s)",
     )
-    group.add_argument(
-        "--null-draws",
-        type=common.positive_integer,
-        default=4000,
-        metavar="N",
-        help="null searches for the false-alarm probability (default: %(default)s)",
-    )
+    data_options.add_null_draws(group, 4000, least=1)
     group.add_argument("--no-limits", action="store_true", help="leave the limits out")
     group.add_argument(
         "--charge-levels",
@@ -49,13 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LIST",
         help="charge level (or brightness) of the target, then of each calibrator",
     )
-    group.add_argument(
-        "--closure-covariance",
-        choices=["assumed", "diagonal"],
-        default="assumed",
-        help="for files with errors and no correlations (default: %(default)s)",
-    )
-    group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
+    data_options.add_closure_covariance(group)
+    data_options.add_insname(group)
     common.add_seed_option(group)
     common.add_output_options(parser, "vet")
 

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j0, j1
 
+from amibayes.disc import uniform_disc
 from amibayes.inference.samples import Samples
 from amibayes.units import MAS, FloatArray
 
@@ -91,7 +91,7 @@ class BinaryModel:
         """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
         pairs, diameter, background = self.split(theta)
         total = 1.0 + pairs[:, 2].sum(axis=0) + background
-        primary, by_diameter = disc_gradient(samples, diameter)
+        primary, by_diameter = uniform_disc(samples.frequency[:, None], diameter)
         light, slopes = primary.astype(complex), []
         for east, north, contrast in pairs:
             wave, slope = self._companion_slope(samples, east, north)
@@ -144,19 +144,7 @@ def _sinc(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def disc(samples: Samples, diameter_mas: FloatArray) -> FloatArray:
-    """Visibility 2 J1(z)/z of uniform discs, z = π θ |u|, (n_samples, n)."""
+    """Visibility of uniform discs, (n_samples, n)."""
     if not np.any(diameter_mas):
         return np.ones((len(samples), len(diameter_mas)))
-    return disc_gradient(samples, diameter_mas)[0]
-
-
-def disc_gradient(samples: Samples, diameter_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Visibility of uniform discs and its derivative by the diameter (per mas)."""
-    per_mas = np.pi * MAS * samples.frequency[:, None]
-    z = per_mas * np.abs(diameter_mas)
-    small = z < 1e-4
-    safe = np.where(small, 1.0, z)
-    ratio = np.where(small, 0.5 - z * z / 16.0, j1(safe) / safe)
-    # d/dz 2 J1(z)/z = −2 J2(z)/z and J2 = 2 J1/z − J0.
-    slope = np.where(small, -z / 4.0, -2.0 * (2.0 * ratio - j0(safe)) / safe)
-    return 2.0 * ratio, slope * per_mas * np.sign(diameter_mas + (diameter_mas == 0))
+    return uniform_disc(samples.frequency[:, None], diameter_mas)[0]
