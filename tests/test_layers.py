@@ -24,6 +24,7 @@ LAYERS = [
     "optics",
     "cube",
     "simulation",
+    "response",
     "closure",
     "covariance",
     "observables",
