@@ -165,7 +165,7 @@ def _own(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Comple
     for b in range(n):
         here = cells.baseline == b
         fringe = basis[:, 1 + b] - 1j * basis[:, 1 + n + b]
-        out[here] = fringe.conj() @ level.transform(view, cells.frequency_px[here])
+        out[here] = fringe @ level.transform(view, cells.frequency_px[here])
     return out
 
 
