@@ -44,6 +44,10 @@ class Reference:
     noise : NoiseModel
     n_bad : int
         Pixels that are never used.
+    sample : (k, n_y, n_x) array
+        The integrations it was made of, NaN at bad pixels.
+    has_errors : bool
+        Whether the noise is that of the cube's own errors.
     """
 
     image: FloatArray
@@ -51,6 +55,8 @@ class Reference:
     good: BoolArray
     noise: NoiseModel
     n_bad: int
+    sample: FloatArray
+    has_errors: bool
 
     def __post_init__(self) -> None:
         read_only(self, "image", "scatter")
@@ -93,7 +99,9 @@ def reference_of(file: Source) -> Reference:
     measured = _measured_variance(cube, keep, lit, spread, len(images))
     noise = noise_model(image, measured, good & np.isfinite(measured) & (measured > 0.0))
     scatter = np.sqrt(np.maximum(spread**2, noise.variance) + (0.03 * maximum_filter(np.abs(image), 3)) ** 2)
-    return Reference(image, scatter, good, noise, int((~good).sum()))
+    return Reference(
+        image, scatter, good, noise, int((~good).sum()), images, cube.error is not None
+    )
 
 
 def _sample(file: Source) -> Cube:

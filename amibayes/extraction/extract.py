@@ -15,14 +15,15 @@ from amibayes.extraction.averaging import Average, average, standing_off
 from amibayes.extraction.cleaning import Reference, reference_of
 from amibayes.extraction.fourier import fourier_sampling
 from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
-from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling
-from amibayes.extraction.noise import misfit_variance
+from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
+from amibayes.extraction.noise import NoiseModel, cropped, misfit_level, noise_model, scatter_about_pointing
 from amibayes.extraction.options import ExtractOptions, Method
 from amibayes.extraction.response import off_axis_response
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import Source, opened
 from amibayes.extraction.table import independent_basis, observables_of
 from amibayes.extraction.view import View, look_at
+from amibayes.optics import FringeBasis
 from amibayes.observables import Observables, join
 from amibayes.response import even_powers
 from amibayes.units import FloatArray
@@ -167,18 +168,39 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     view = look_at(reference.image, template, options)
     part = (view.rows, view.columns)
     image, good = reference.image[part], reference.good[part]
-    variance = reference.noise.variance[part]
-    view = centre_on(view, image, variance, good, template.source)
-    fit = fringe_fit(view, variance, good)
-    pixels = image.reshape(1, -1)
-    residual = (pixels - fit.solve(pixels) @ fit.design.T).reshape(image.shape)
-    fit = fringe_fit(view, variance + misfit_variance(residual, image, good), good)
+    view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
+    noise, level = _noise_and_misfit(view, basis, reference)
+    fit = fringe_fit(basis, noise.variance + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
     else:
-        sampling = fourier_sampling(view, options)
-    noise = sampling.noise(np.where(good, variance, 0.0))
-    return Bench(view, reference, fit, sampling, noise, options)
+        sampling = fourier_sampling(view, basis, options)
+    covariance = sampling.noise(np.where(good, noise.variance, 0.0))
+    return Bench(view, reference, fit, sampling, covariance, options)
+
+
+def _noise_and_misfit(
+    view: View, basis: FringeBasis, reference: Reference
+) -> tuple[NoiseModel, float]:
+    """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
+
+    Where the cube has no errors of its own, the noise is what differs between the
+    residuals: the fits have followed the pointing.
+    """
+    part = (view.rows, view.columns)
+    image, good = reference.image[part], reference.good[part]
+    sample = reference.sample[(slice(None), *part)]
+    fit = fringe_fit(basis, np.full(view.shape, 1.0), good)
+    missing = np.isnan(sample) | ~good
+    pixels = fit.fill(np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1))
+    coefficients = fit.solve(pixels)
+    residual = pixels - coefficients @ fit.design.T
+    noise = cropped(reference.noise, part)
+    if not reference.has_errors and len(sample) > 2:
+        _, samples = fringe_sampling(fit, view).split(coefficients)
+        spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
+        noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
+    return noise, misfit_level(residual.reshape(sample.shape), good, noise)
 
 
 def _attenuation(

@@ -14,6 +14,7 @@ import numpy as np
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.sampling import IntArray, Sampling, closing_products
 from amibayes.extraction.view import View
+from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
@@ -45,10 +46,9 @@ class _Cells:
         return _Cells(self.baseline[keep], self.offset[keep], self.frequency_px[keep])
 
 
-def fourier_sampling(view: View, options: ExtractOptions) -> Sampling:
-    """Make the operator of one of the Fourier methods."""
+def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) -> Sampling:
+    """Make the operator of one of the Fourier methods; ``fringes`` is the view's basis."""
     mask = view.instrument.mask
-    fringes = view.basis()
     star = fringes.image().ravel()
     level = _Levels.of(view, options, star)
     if options.method == "unique":

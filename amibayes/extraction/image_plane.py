@@ -14,6 +14,7 @@ import numpy as np
 from amibayes.errors import DataError
 from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import CONVERGED_PX, View
+from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray, read_only
 
@@ -87,10 +88,9 @@ class FringeFit:
         return np.asarray(((pixels - coefficients @ self.design.T) ** 2) @ self.weight)
 
 
-def fringe_fit(view: View, variance: FloatArray, good: FloatArray) -> FringeFit:
+def fringe_fit(basis: FringeBasis, variance: FloatArray, good: FloatArray) -> FringeFit:
     """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only."""
-    basis = view.basis().matrix
-    design = np.column_stack([basis, np.ones(len(basis))])
+    design = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
     weight = np.where(good, 1.0 / variance, 0.0).ravel()
     # Columns of like size keep the factorisation well conditioned.
     scale = np.sqrt(weight @ design**2)
@@ -122,8 +122,15 @@ def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None
     return np.asarray(-(phase * w) @ np.linalg.pinv(design).T)
 
 
-def centre_on(view: View, image: FloatArray, variance: FloatArray, good: FloatArray, source: str) -> View:
+def centre_on(
+    view: View, image: FloatArray, variance: FloatArray, good: FloatArray, source: str
+) -> tuple[View, FringeBasis]:
     """Move the view's centre to the star, by Gauss–Newton on the phases of its fringes.
+
+    Returns
+    -------
+    View, FringeBasis
+        The basis is that of the view.
 
     Raises
     ------
@@ -132,17 +139,15 @@ def centre_on(view: View, image: FloatArray, variance: FloatArray, good: FloatAr
     """
     pixels = np.where(good, image, 0.0).reshape(1, -1)
     for _ in range(MOST_STEPS):
-        fit = fringe_fit(view, variance, good)
-        flux, samples = fringe_sampling(fit, view).apply(pixels)
-        if not flux[0] > 0.0:
-            break
+        basis = view.basis()
+        flux, samples = fringe_sampling(fringe_fit(basis, variance, good), view).apply(pixels)
         step = shift_of(view, samples, np.abs(samples[0]))[0]
-        x, y = view.centre_px + step
-        if np.hypot(x - view.centre_px[0], y - view.centre_px[1]) < CONVERGED_PX:
-            return view
-        view = replace(view, centre_px=(float(x), float(y)))
-        if max(abs(x), abs(y)) > 0.5 * max(view.shape):
+        x, y = (float(c) for c in view.centre_px + step)
+        if not flux[0] > 0.0 or max(abs(x), abs(y)) > 0.5 * max(view.shape):
             break
+        if np.hypot(*step) < CONVERGED_PX:
+            return view, basis
+        view = replace(view, centre_px=(x, y))
     raise DataError(
         "no fringes of this mask are found in the images",
         source=source,

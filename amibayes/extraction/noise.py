@@ -71,22 +71,45 @@ def noise_model(mean: FloatArray, measured: FloatArray, good: FloatArray) -> Noi
     return NoiseModel(np.maximum(variance, floor), constant, per_signal)
 
 
-def misfit_variance(residual: FloatArray, mean: FloatArray, good: FloatArray) -> FloatArray:
-    """Variance that stands for what a model cannot follow, a + b·mean + c·mean².
+def scatter_about_pointing(residual: FloatArray, shift_px: FloatArray) -> FloatArray:
+    """Variance of every pixel between integrations, what goes with the pointing taken out.
 
-    Errors of the optics are the same in every integration; without their share in the
-    weights the brightest pixels would decide alone.
+    Parameters
+    ----------
+    residual : (n, n_pixels) array
+    shift_px : (n, 2) array
+        Pointing of each integration.
+
+    Returns
+    -------
+    (n_pixels,) array
     """
-    signal = np.maximum(gaussian_filter(np.where(good, mean, 0.0), 1.0), 0.0)
-    columns = np.stack([np.ones_like(signal), signal, signal**2], axis=-1)
-    data = residual[good] ** 2
-    weight = np.full(len(data), 1.0 / max(float(data.mean()), 1e-300))
-    found = np.zeros(3)
-    for _ in range(_ROUNDS):
-        used = columns[good] * weight[:, None]
-        scale = np.linalg.norm(used, axis=0)
-        scale[scale == 0.0] = 1.0
-        found = nnls(used / scale, data * weight)[0] / scale
-        level = columns[good] @ found
-        weight = 1.0 / np.maximum(level, max(1e-3 * float(level.mean()), 1e-300))
-    return np.asarray(columns @ found)
+    n, (x, y) = len(residual), shift_px.T
+    terms = [np.ones(n), x, y, x * x, x * y, y * y]
+    # Never more terms than half of what there is to fit.
+    kept = 6 if n >= 12 else 3 if n >= 6 else 1
+    basis = np.linalg.qr(np.stack(terms[:kept], axis=1))[0]
+    rest = residual - basis @ (basis.T @ residual)
+    return np.asarray((rest**2).sum(axis=0) / (n - kept))
+
+
+def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:
+    """Part of the detector."""
+    return NoiseModel(noise.variance[part], noise.constant, noise.per_signal)
+
+
+def misfit_level(residual: FloatArray, good: FloatArray, noise: NoiseModel) -> float:
+    """Mean square of what the fringe model cannot follow, beyond the noise.
+
+    Errors of the optics are the same in every integration. As an even variance on top of
+    the noise they keep a few faint or bright pixels from deciding alone.
+
+    Parameters
+    ----------
+    residual : (n, n_y, n_x) array
+        Of integrations fitted by themselves.
+    good : (n_y, n_x) bool array
+    noise : NoiseModel
+    """
+    mean = residual.mean(axis=0)[good]
+    return max(float(np.mean(mean**2 - noise.variance[good] / len(residual))), 0.0)

@@ -18,7 +18,7 @@ from amibayes.units import FloatArray
 LARGEST = 1.25
 """Images wider than this many times the instrument's usual subarray are cropped to it."""
 
-CONVERGED_PX = 1e-4
+CONVERGED_PX = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
