@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import Calibration, Method, calibrate
 from amibayes.errors import DataError, UsageError
+from amibayes.extraction.reading import ImageOptions, read_observations
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit

@@ -51,9 +51,7 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("image cubes")
     group.add_argument("--instrument", metavar="NAME", help="name or TOML file, such as niriss")
     group.add_argument("--filter", metavar="NAME", help="such as F480M")
-    group.add_argument(
-        "--pixel-scale", type=positive_float, metavar="MAS", help="side of a pixel"
-    )
+    group.add_argument("--pixel-scale", type=positive_float, metavar="MAS", help="side of a pixel")
     group.add_argument(
         "--position-angle",
         type=finite_float,

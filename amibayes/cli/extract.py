@@ -25,7 +25,9 @@ SUMMARY = "extract.json"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.epilog = EXAMPLES
-    parser.add_argument("cubes", nargs="+", metavar="CUBE", help="image cube(s), or exposures of one")
+    parser.add_argument(
+        "cubes", nargs="+", metavar="CUBE", help="image cube(s), or exposures of one"
+    )
     common.add_image_options(parser)
     group = parser.add_argument_group("extraction")
     group.add_argument(
@@ -47,9 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="shrunk",
         help="scatter weighed with photon noise, or one of them alone (default: %(default)s)",
     )
-    group.add_argument(
-        "--per-integration", action="store_true", help="write every integration too"
-    )
+    group.add_argument("--per-integration", action="store_true", help="write every integration too")
     common.add_output_options(parser, "extract")
 
 

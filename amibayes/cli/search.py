@@ -24,7 +24,9 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``search``."""
     parser.epilog = EXAMPLES
-    parser.add_argument("targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)")
+    parser.add_argument(
+        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+    )
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )

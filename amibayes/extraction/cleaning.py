@@ -98,7 +98,9 @@ def reference_of(file: Source) -> Reference:
     image = _filled(image, good)
     measured = _measured_variance(cube, keep, lit, spread, len(images))
     noise = noise_model(image, measured, good & np.isfinite(measured) & (measured > 0.0))
-    scatter = np.sqrt(np.maximum(spread**2, noise.variance) + (0.03 * maximum_filter(np.abs(image), 3)) ** 2)
+    scatter = np.sqrt(
+        np.maximum(spread**2, noise.variance) + (0.03 * maximum_filter(np.abs(image), 3)) ** 2
+    )
     return Reference(
         image, scatter, good, noise, int((~good).sum()), images, cube.error is not None
     )

@@ -16,7 +16,13 @@ from amibayes.extraction.cleaning import Reference, reference_of
 from amibayes.extraction.fourier import fourier_sampling
 from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
 from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
-from amibayes.extraction.noise import NoiseModel, cropped, misfit_level, noise_model, scatter_about_pointing
+from amibayes.extraction.noise import (
+    NoiseModel,
+    cropped,
+    misfit_level,
+    noise_model,
+    scatter_about_pointing,
+)
 from amibayes.extraction.options import ExtractOptions, Method
 from amibayes.extraction.response import off_axis_response
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
@@ -192,7 +198,9 @@ def _noise_and_misfit(
     sample = reference.sample[(slice(None), *part)]
     fit = fringe_fit(basis, np.full(view.shape, 1.0), good)
     missing = np.isnan(sample) | ~good
-    pixels = fit.fill(np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1))
+    pixels = fit.fill(
+        np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
+    )
     coefficients = fit.solve(pixels)
     residual = pixels - coefficients @ fit.design.T
     noise = cropped(reference.noise, part)

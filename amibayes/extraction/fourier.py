@@ -73,7 +73,9 @@ def _half_width(view: View, method: str) -> int:
     if method in ("square", "gauss"):
         return SQUARE if method == "square" else GAUSS
     size = 2.0 / np.sqrt(3.0) * view.instrument.mask.size_m
-    return int(np.ceil(size * view.instrument.pixel_scale_rad / view.wavelength_m * max(view.shape)))
+    return int(
+        np.ceil(size * view.instrument.pixel_scale_rad / view.wavelength_m * max(view.shape))
+    )
 
 
 def _lattice(view: View, half_width: int) -> _Cells:
@@ -113,7 +115,9 @@ class _Levels:
         r2 = y[:, None] ** 2 + x**2
         side = min(view.shape)
         radius = DEFAULT_WINDOW * side if options.window_px is None else options.window_px
-        window = np.ones(view.shape) if radius == 0.0 else np.exp(-np.log(2.0) * (r2 / radius**2) ** 2)
+        window = (
+            np.ones(view.shape) if radius == 0.0 else np.exp(-np.log(2.0) * (r2 / radius**2) ** 2)
+        )
         ring = (r2 > (RING * 0.5 * side) ** 2).astype(float)
         both = np.stack([window.ravel(), ring.ravel()])
         system = np.stack([both @ star, both.sum(axis=1)], axis=1)

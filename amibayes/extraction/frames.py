@@ -181,7 +181,9 @@ def select(frames: Frames, limit: float, largest_shift_px: float) -> FloatArray:
         if used.sum() < 3:
             break
         middle = np.median(values[used])
-        spread = max(TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor * abs(middle), 1e-300)
+        spread = max(
+            TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor * abs(middle), 1e-300
+        )
         off = (values - middle) / spread
         hit = used & (np.abs(off) > look_elsewhere(limit, int(used.sum())))
         reason[hit] = [f"{name} stands off by {o:.1f} sigma" for o in off[hit]]

@@ -68,9 +68,7 @@ def _places(view: View) -> FloatArray:
     return np.stack([r * np.cos(a), r * np.sin(a)], axis=1)
 
 
-def _measured(
-    view: View, sampling: Sampling, place: FloatArray
-) -> tuple[FloatArray, ComplexArray]:
+def _measured(view: View, sampling: Sampling, place: FloatArray) -> tuple[FloatArray, ComplexArray]:
     """Flux and samples of a point of unit flux at places (n, 2)."""
     pixel, mask = view.instrument.pixel_scale_rad, view.instrument.mask.rotated(view.rotation_rad)
     reach = float(np.abs(place).max() / pixel)

@@ -163,7 +163,9 @@ def closing_products(
     closing : (n, 3) int array
     triangle : (n,) int array
     """
-    place = {(int(b), *map(int, o)): k for k, (b, o) in enumerate(zip(baseline, offsets, strict=True))}
+    place = {
+        (int(b), *map(int, o)): k for k, (b, o) in enumerate(zip(baseline, offsets, strict=True))
+    }
     members = [np.flatnonzero(baseline == b) for b in range(int(baseline.max()) + 1)]
     closing, triangle = [], []
     for t, (ij, jk, ik) in enumerate(triangle_baselines):

@@ -55,7 +55,11 @@ class Shrunk:
 
 
 def shrunk_covariance(
-    deviation: FloatArray, physical: FloatArray, basis: FloatArray, n_vis2: int, kind: str = "shrunk"
+    deviation: FloatArray,
+    physical: FloatArray,
+    basis: FloatArray,
+    n_vis2: int,
+    kind: str = "shrunk",
 ) -> Shrunk:
     """Covariance of the observables of one integration.
 
@@ -114,7 +118,8 @@ def _most_likely(white: FloatArray, groups: FloatArray) -> tuple[float, tuple[fl
 
     bounds = [(-2.0, np.log(MOST_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
     tries = [
-        minimize(cost, [first, *start], bounds=bounds, method="L-BFGS-B") for first in (1.0, 4.0, 7.0)
+        minimize(cost, [first, *start], bounds=bounds, method="L-BFGS-B")
+        for first in (1.0, 4.0, 7.0)
     ]
     best = min(tries, key=lambda t: float(t.fun)).x
     return float(p + 2.0 + np.exp(best[0])), (float(np.exp(best[1])), float(np.exp(best[2])))

@@ -60,7 +60,9 @@ def header_of(extraction: Extraction) -> dict[str, str | int | float | bool]:
     for name, value in extraction.options.as_mapping().items():
         if name != "method" and value is not None:
             header[f"HIERARCH AMIBAYES OPTION {name.upper()}"] = value
-    for k, (source, bench) in enumerate(zip(extraction.sources, extraction.benches, strict=True), 1):
+    for k, (source, bench) in enumerate(
+        zip(extraction.sources, extraction.benches, strict=True), 1
+    ):
         header[f"HIERARCH AMIBAYES SOURCE{k}"] = Path(source).name
         header[f"HIERARCH AMIBAYES PIXEL{k}"] = bench.view.instrument.pixel_scale_rad
     header["HIERARCH AMIBAYES CHARGE"] = float(extraction.benches[0].reference.image.max())

@@ -112,8 +112,13 @@ def look_at(image: FloatArray, cube: Cube, options: ExtractOptions) -> View:
     channels = instrument.bandpass.channels(spectrum)
     _refuse_small(image, instrument, cube.source)
     place = _peak(image, instrument, channels)
-    sides = [_part(size, instrument.n_pixels, at) for size, at in zip(image.shape, place, strict=True)]
-    offset = [at - part.start - 0.5 * (part.stop - part.start - 1) for at, part in zip(place, sides, strict=True)]
+    sides = [
+        _part(size, instrument.n_pixels, at) for size, at in zip(image.shape, place, strict=True)
+    ]
+    offset = [
+        at - part.start - 0.5 * (part.stop - part.start - 1)
+        for at, part in zip(place, sides, strict=True)
+    ]
     reach = [min(at, size - 1 - at) for at, size in zip(place, image.shape, strict=True)]
     if min(reach) * instrument.pixel_scale_rad < 1.5 * instrument.resolution_rad:
         raise DataError(

@@ -252,9 +252,7 @@ class TemplateBank:
         for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
             span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
             cosine, sine = waves(span, int(rows[index[0]]))
-            self._let_through(
-                cosine, sine, self.grid.east_mas[index], self.grid.north_mas[index]
-            )
+            self._let_through(cosine, sine, self.grid.east_mas[index], self.grid.north_mas[index])
             even = self._even.matrix @ cosine - self._offset[:, None]
             yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
 

@@ -163,7 +163,10 @@ class _Seen:
         return cls(
             wave * fringe,
             flux,
-            (fringe * (slopes[0] + wave * of_fringe[0]), fringe * (slopes[1] + wave * of_fringe[1])),
+            (
+                fringe * (slopes[0] + wave * of_fringe[0]),
+                fringe * (slopes[1] + wave * of_fringe[1]),
+            ),
             (flux * of_flux[0], flux * of_flux[1]),
         )
 

@@ -80,7 +80,9 @@ def observables_of(
         _in_written_order(_stack([p for p in parts if p.u == 2], 2)),
     )
     covariance, kind, count, notes = stated_covariance(oifits, content, closure_covariance)
-    unused = tuple(f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused if t.name != RESPONSE)
+    unused = tuple(
+        f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused if t.name != RESPONSE
+    )
     trailing = (f"{oifits.trailing_bytes} bytes after the last table",)
     return Observables(
         content.vis2.measurements,
