@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from amibayes.calibration import Calibration, calibrate
     from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
+    from amibayes.extraction import extract
     from amibayes.inference.bank import TemplateBank
     from amibayes.inference.likelihood import Likelihood
     from amibayes.inference.limits import DetectionLimit, detection_limit
@@ -77,6 +78,7 @@ _HOME = {
     "calibrate": "amibayes.calibration",
     "detection_limit": "amibayes.inference.limits",
     "expect": "amibayes.planning",
+    "extract": "amibayes.extraction",
     "fringe_basis": "amibayes.optics",
     "instrument_names": "amibayes.instrument",
     "join": "amibayes.observables",
@@ -135,6 +137,7 @@ __all__ = [
     "calibrate",
     "detection_limit",
     "expect",
+    "extract",
     "fringe_basis",
     "instrument_names",
     "join",

@@ -52,6 +52,10 @@ class Setup:
         The file the data come from.
     right_ascension_deg, declination_deg : float
         Of the target (0 where unknown).
+    response : (n_stations, n_stations, n_coefficients) float array, optional
+        Logarithm of what the extraction lets through of light off the axis, in
+        `amibayes.response.even_powers` of east and north (radians): of a baseline's
+        visibility, and on the diagonal of the flux.
     """
 
     insname: str
@@ -66,6 +70,7 @@ class Setup:
     source: str = ""
     right_ascension_deg: float = 0.0
     declination_deg: float = 0.0
+    response: FloatArray | None = None
 
     def __post_init__(self) -> None:
         _freeze(self)

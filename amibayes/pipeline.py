@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import Calibration, Method, calibrate
 from amibayes.errors import DataError, UsageError
+from amibayes.extraction.reading import ImageOptions, read_observations
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
@@ -26,7 +27,6 @@ from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
 from amibayes.inference.significance import ALPHA, Significance, bank_statistic, significance
 from amibayes.observables import Observables, join
-from amibayes.oifits import read_oifits
 from amibayes.parallel import Executor, Progress
 from amibayes.vetting import Vetting, doubts, vet
 
@@ -68,6 +68,8 @@ class SearchOptions:
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
     seed : int
+    images : ImageOptions, optional
+        How image cubes are turned into observables.
     """
 
     separation_mas: tuple[float, float] | None = None
@@ -87,6 +89,7 @@ class SearchOptions:
     posterior: bool = True
     limits: bool = True
     seed: int = 1
+    images: ImageOptions | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +149,8 @@ def search_companion(
     Parameters
     ----------
     targets, calibrators : sequence of path
-        OIFITS files. Targets are fitted together; without calibrators they are taken as
-        calibrated.
+        OIFITS files or image cubes. Targets are fitted together; without calibrators they
+        are taken as calibrated.
     options : SearchOptions, optional
     chain : path, optional
         HDF5 file for the chain of the posterior.
@@ -253,8 +256,9 @@ def search_companion(
 
 
 def _read(path: str | Path, options: SearchOptions) -> Observables:
-    return read_oifits(
+    return read_observations(
         path,
+        options.images,
         insname=options.insname,
         target=options.target,
         closure_covariance=options.closure_covariance,

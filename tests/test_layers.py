@@ -25,6 +25,7 @@ LAYERS = [
     "optics",
     "cube",
     "simulation",
+    "response",
     "closure",
     "covariance",
     "observables",

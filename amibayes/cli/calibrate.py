@@ -26,12 +26,15 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``calibrate``."""
     parser.epilog = EXAMPLES
-    parser.add_argument("targets", nargs="+", metavar="TARGET", help="OIFITS file(s) of the target")
+    parser.add_argument(
+        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+    )
     parser.add_argument(
         "--cal", nargs="+", required=True, metavar="CAL", help="calibrators, any order"
     )
     _add_method(parser.add_argument_group("calibration"))
     _add_data(parser.add_argument_group("data"))
+    common.add_image_options(parser)
     common.add_output_options(parser, "calibrate")
 
 
@@ -128,10 +131,11 @@ def run(arguments: argparse.Namespace) -> int:
 def _prepared(path: str, arguments: argparse.Namespace, target: str | None) -> Observables:
     """Read a file, flag, average."""
     from amibayes.calibration import average_polarisations, bin_channels, flag_by_rule
-    from amibayes.oifits import read_oifits
+    from amibayes.extraction.reading import read_observations
 
-    observables = read_oifits(
+    observables = read_observations(
         path,
+        common.image_options_of(arguments),
         insname=arguments.insname,
         target=target,
         closure_covariance=arguments.closure_covariance,

@@ -14,8 +14,13 @@ from typing import TYPE_CHECKING, Any
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
+    from amibayes.extraction.reading import ImageOptions
     from amibayes.parallel import Executor
     from amibayes.parallel import Progress as Told
+
+
+METHODS = ("fringes", "matched", "fft", "gauss", "square", "unique")
+"""Those of `amibayes.extraction`, which would take a second to import for ``--help``."""
 
 
 def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
@@ -39,6 +44,53 @@ def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
     loudness.add_argument("--quiet", action="store_true", help="no progress, no summary")
     loudness.add_argument("--verbose", action="store_true", help="say what is being done")
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
+
+
+def add_image_options(parser: argparse.ArgumentParser) -> None:
+    """Add what image cubes may need: what their header does not say, and the method."""
+    group = parser.add_argument_group("image cubes")
+    group.add_argument("--instrument", metavar="NAME", help="name or TOML file, such as niriss")
+    group.add_argument("--filter", metavar="NAME", help="such as F480M")
+    group.add_argument("--pixel-scale", type=positive_float, metavar="MAS", help="side of a pixel")
+    group.add_argument(
+        "--position-angle",
+        type=finite_float,
+        metavar="DEG",
+        help="of the image's +y, east of north",
+    )
+    group.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="fit of the images (fringes), or a way to sample their Fourier transform "
+        "(default: %(default)s)",
+    )
+
+
+def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
+    """Collect the options for image cubes."""
+    from amibayes.extraction import ExtractOptions
+    from amibayes.extraction.reading import ImageOptions
+    from amibayes.units import MAS
+
+    header = {
+        "instrument": arguments.instrument,
+        "filter": arguments.filter,
+        "pixel_scale_rad": arguments.pixel_scale * MAS if arguments.pixel_scale else None,
+        "position_angle_deg": arguments.position_angle,
+    }
+    return ImageOptions(ExtractOptions(method=arguments.method), header)
+
+
+def finite_float(text: str) -> float:
+    """Parse a finite number."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    if not abs(value) < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not finite")
+    return value
 
 
 def add_seed_option(parser: argparse._ActionsContainer) -> None:

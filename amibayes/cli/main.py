@@ -17,6 +17,7 @@ COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
     "calibrate": "divide the instrument out of a target's data with calibrators",
     "vet": "say which calibrators may be believed, and why",
+    "extract": "measure V² and closure phases in image cubes",
     "audit": "say what is wrong or doubtful in OIFITS files",
     "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",

@@ -24,12 +24,15 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``search``."""
     parser.epilog = EXAMPLES
-    parser.add_argument("targets", nargs="+", metavar="TARGET", help="OIFITS file(s) of the target")
+    parser.add_argument(
+        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+    )
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
     _add_model(parser.add_argument_group("model"))
     _add_data(parser.add_argument_group("data"))
+    common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
     data_options.add_null_draws(stages, 10_000)
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
@@ -153,6 +156,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,
         seed=arguments.seed,
+        images=common.image_options_of(arguments),
     )
 
 

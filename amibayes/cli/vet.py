@@ -18,7 +18,7 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``vet``."""
     parser.epilog = EXAMPLES
-    parser.add_argument("calibrators", nargs="+", metavar="CAL", help="OIFITS files")
+    parser.add_argument("calibrators", nargs="+", metavar="CAL", help="OIFITS files or image cubes")
     group = parser.add_argument_group("tests")
     group.add_argument(
         "--calibrated",
@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     data_options.add_closure_covariance(group)
     data_options.add_insname(group)
     common.add_seed_option(group)
+    common.add_image_options(parser)
     common.add_output_options(parser, "vet")
 
 
@@ -57,16 +58,19 @@ def run(arguments: argparse.Namespace) -> int:
             f"needs {1 + len(arguments.calibrators)} numbers, the target's first",
             source="--charge-levels",
         )
+    from amibayes.extraction.reading import read_observations
     from amibayes.files import output_folder, write_json
-    from amibayes.oifits import read_oifits
     from amibayes.plots.style import save
     from amibayes.vetting import vet
     from amibayes.vetting_report import vetting_json, vetting_picture, vetting_table
 
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
     data = [
-        read_oifits(
-            path, insname=arguments.insname, closure_covariance=arguments.closure_covariance
+        read_observations(
+            path,
+            common.image_options_of(arguments),
+            insname=arguments.insname,
+            closure_covariance=arguments.closure_covariance,
         )
         for path in arguments.calibrators
     ]

@@ -116,7 +116,8 @@ class TemplateBank:
         self.n_data = likelihood.n_independent
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
-        self._even, self._odd, self._offset = _linear_response(likelihood, nuisance)
+        self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
+        self._offset = np.asarray(self._even.matrix @ self._primary)
         self._basis = _nuisance_basis(likelihood, nuisance)
 
     def __len__(self) -> int:
@@ -211,7 +212,22 @@ class TemplateBank:
             damping = np.sinc((0.5 / np.pi) * self._samples.relative_band[:, None] * angle)
             cosine *= damping
             sine *= damping
+        self._let_through(cosine, sine, east_mas, north_mas)
         return self._even.matrix @ cosine - self._offset[:, None], self._odd.matrix @ sine
+
+    def _let_through(
+        self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
+    ) -> None:
+        """Apply the extraction's response to light off the axis, in place.
+
+        dV/dc = ρE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
+        """
+        if self._samples.off_axis is None:
+            return
+        fringe, flux = self._samples.off_axis.at(east_mas, north_mas)
+        cosine *= fringe
+        cosine -= (flux - 1.0) * self._primary[:, None]
+        sine *= fringe
 
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
@@ -236,6 +252,7 @@ class TemplateBank:
         for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
             span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
             cosine, sine = waves(span, int(rows[index[0]]))
+            self._let_through(cosine, sine, self.grid.east_mas[index], self.grid.north_mas[index])
             even = self._even.matrix @ cosine - self._offset[:, None]
             yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
 
@@ -337,7 +354,7 @@ def _part(matrix: csr_array) -> _Part:
 def _linear_response(
     likelihood: Likelihood, nuisance: FloatArray
 ) -> tuple[_Part, _Part, FloatArray]:
-    """Matrices A, B and offset a with template = (A·Re(E) − a) + B·Im(−E).
+    """Matrices A, B and V₀ with template = A·(Re(E) − V₀) + B·Im(−E).
 
     With V₀ = D/(1 + f) real, dV/dc = (E − V₀)/(1 + f), hence dV² = 2V₀ Re dV and
     dφ = Im dV / V₀.
@@ -351,7 +368,7 @@ def _linear_response(
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
     even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary))
     odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale / primary))
-    return even, odd, np.asarray(even.matrix @ primary)
+    return even, odd, np.asarray(primary)
 
 
 def _nuisance_basis(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:

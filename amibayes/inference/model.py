@@ -73,11 +73,23 @@ class BinaryModel:
     def visibility(self, samples: Samples, theta: FloatArray) -> ComplexArray:
         """Complex visibilities, (n_samples, n), of parameter sets theta (n, n_dim)."""
         pairs, diameter, background = self.split(theta)
-        total = 1.0 + pairs[:, 2].sum(axis=0) + background
+        total = 1.0 + background
         light = disc(samples, diameter).astype(complex)
         for east, north, contrast in pairs:
-            light += contrast * self.companion(samples, east, north)
+            wave, seen = self._seen(samples, east, north)
+            light += contrast * wave
+            total = total + contrast * seen
         return np.asarray(light / total)
+
+    def _seen(
+        self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
+    ) -> tuple[ComplexArray, FloatArray | float]:
+        """Visibility and flux of a point as the extraction lets them through."""
+        wave = self.companion(samples, east_mas, north_mas)
+        if samples.off_axis is None:
+            return wave, 1.0
+        fringe, flux = samples.off_axis.at(east_mas, north_mas)
+        return wave * fringe, flux
 
     def companion(
         self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
@@ -90,22 +102,21 @@ class BinaryModel:
     def gradient(self, samples: Samples, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
         pairs, diameter, background = self.split(theta)
-        total = 1.0 + pairs[:, 2].sum(axis=0) + background
+        total = 1.0 + background
         primary, by_diameter = uniform_disc(samples.frequency[:, None], diameter)
-        light, slopes = primary.astype(complex), []
+        light, found = primary.astype(complex), []
         for east, north, contrast in pairs:
             wave, slope = self._companion_slope(samples, east, north)
-            light = light + contrast * wave
-            slopes.append((wave, contrast * slope))
+            seen = _Seen.of(samples, east, north, wave, slope)
+            light = light + contrast * seen.wave
+            total = total + contrast * seen.flux
+            found.append((contrast, seen))
         value = light / total
         out = []
-        for wave, slope in slopes:
-            scaled = slope * (2.0 * np.pi * MAS / total)
-            out += [
-                scaled * samples.u[:, None],
-                scaled * samples.v[:, None],
-                (wave - value) / total,
-            ]
+        for contrast, seen in found:
+            moved = [w - value * f for w, f in zip(seen.wave_slopes, seen.flux_slopes, strict=True)]
+            out += [contrast * m / total for m in moved]
+            out.append((seen.wave - value * seen.flux) / total)
         if self.diameter_mas == "free":
             out.append((by_diameter / total).astype(complex))
         if self.background == "free":
@@ -123,6 +134,41 @@ class BinaryModel:
         half = _half_band(samples)
         value, slope = _sinc(angle * half)
         return value * wave, (half * slope - 1j * value) * wave
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Visibility and flux of a point as the extraction lets them through; slopes per mas."""
+
+    wave: ComplexArray
+    flux: FloatArray | float
+    wave_slopes: tuple[ComplexArray, ComplexArray]
+    flux_slopes: tuple[FloatArray | float, FloatArray | float]
+
+    @classmethod
+    def of(
+        cls,
+        samples: Samples,
+        east_mas: FloatArray,
+        north_mas: FloatArray,
+        wave: ComplexArray,
+        slope: ComplexArray,
+    ) -> _Seen:
+        by_angle = slope * (2.0 * np.pi * MAS)
+        slopes = (by_angle * samples.u[:, None], by_angle * samples.v[:, None])
+        if samples.off_axis is None:
+            return cls(wave, 1.0, slopes, (0.0, 0.0))
+        fringe, flux = samples.off_axis.at(east_mas, north_mas)
+        of_fringe, of_flux = samples.off_axis.slopes(east_mas, north_mas)
+        return cls(
+            wave * fringe,
+            flux,
+            (
+                fringe * (slopes[0] + wave * of_fringe[0]),
+                fringe * (slopes[1] + wave * of_fringe[1]),
+            ),
+            (flux * of_flux[0], flux * of_flux[1]),
+        )
 
 
 def _angle(samples: Samples, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:

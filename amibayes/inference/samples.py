@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from amibayes.inference.off_axis import OffAxis, off_axis_of
 from amibayes.observables import Observables
 from amibayes.units import FloatArray
 
@@ -31,6 +32,8 @@ class Samples:
         V² = squares · |V|²; one entry 1 in each row.
     legs : (n_closure, n) sparse array
         Closure phase = legs · phase; entries are ±1.
+    off_axis : OffAxis, optional
+        Response of the extraction to light off the axis; 1 where there is none.
     """
 
     u: FloatArray
@@ -38,6 +41,7 @@ class Samples:
     relative_band: FloatArray
     squares: csr_array
     legs: csr_array
+    off_axis: OffAxis | None = None
 
     def __len__(self) -> int:
         return len(self.u)
@@ -69,6 +73,7 @@ def samples_of(observables: Observables) -> Samples:
         (band / wavelength)[first],
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
+        off_axis_of(data, first),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from amibayes.errors import DataError
 from amibayes.observables import IntArray, Measurements, Observables, Setup
+from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.rows import Rows, channel_count, read_rows
 from amibayes.oifits.setups import (
     DATA_TABLES,
@@ -79,7 +80,9 @@ def observables_of(
         _in_written_order(_stack([p for p in parts if p.u == 2], 2)),
     )
     covariance, kind, count, notes = stated_covariance(oifits, content, closure_covariance)
-    unused = tuple(f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused)
+    unused = tuple(
+        f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused if t.name != RESPONSE
+    )
     trailing = (f"{oifits.trailing_bytes} bytes after the last table",)
     return Observables(
         content.vis2.measurements,
@@ -156,9 +159,8 @@ def _parts(
         own = table.header.get(f"{OWN_KEY} SETUP", 0)
         key = (wavelengths.number, 0 if array is None else array.number, own)
         if key not in setups:
-            setups[key] = make_setup(
-                oifits, wavelengths, array, stations, targets[int(ids[chosen[0]])]
-            )
+            made = make_setup(oifits, wavelengths, array, stations, targets[int(ids[chosen[0]])])
+            setups[key] = with_response(oifits, made, own)
         setup = setups[key]
         index = integers(oifits, table, "STA_INDEX", 2 + (table.name == "OI_T3"))
         rows = read_rows(

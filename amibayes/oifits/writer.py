@@ -25,6 +25,7 @@ from amibayes.observables import BoolArray, IntArray, Observables
 from amibayes.oifits.correlations import pair_covariance
 from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of
+from amibayes.oifits.off_axis import response_tables
 from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
@@ -79,6 +80,7 @@ def to_hdus(observables: Observables, header: Mapping[str, HeaderValue]) -> fits
     tables += [_data_table(observables, layout, grid, correlated) for grid in grids]
     if correlated:
         tables.append(_correlation_table(observables, grids))
+    tables += response_tables(layout, observables.setups)
     seen: dict[str, int] = {}
     for table in tables:
         seen[table.name] = table.header["EXTVER"] = seen.get(table.name, 0) + 1

@@ -1,0 +1,65 @@
+"""From integrations to one set of observables with its joint covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.extraction.cleaning import TO_SIGMA, BoolArray
+from amibayes.extraction.frames import Frames, look_elsewhere
+from amibayes.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Average:
+    """Mean observables of some integrations.
+
+    Parameters
+    ----------
+    vis2 : (n_baselines,) array
+    closure_phase : (n_triangles,) array
+        Phase of the mean bispectrum, radians.
+    deviation : (n, n_baselines + n_triangles) array
+        What each integration deviates from the mean by, V² and closure phase, to first
+        order in its noise; its mean is zero.
+    """
+
+    vis2: FloatArray
+    closure_phase: FloatArray
+    deviation: FloatArray
+
+
+def average(frames: Frames, attenuation: FloatArray) -> Average:
+    """Average power and bispectrum, not their ratios and phases.
+
+    Parameters
+    ----------
+    frames : Frames
+        The integrations to be used.
+    attenuation : (n, n_baselines) array
+        Loss of V² at each integration's pointing.
+    """
+    power = frames.power / attenuation
+    square = frames.square.mean()
+    vis2 = power.mean(axis=0) / square
+    by_vis2 = (power - frames.square[:, None] * vis2) / square
+    total = frames.bispectrum.mean(axis=0)
+    by_closure = (frames.bispectrum / total).imag
+    return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))
+
+
+def standing_off(deviation: FloatArray, limit: float) -> BoolArray:
+    """Integrations whose observables stand off the others', on a robust scale, (n,).
+
+    The statistic is the largest deviation over all observables in units of its scatter,
+    and the limit allows for how many there are.
+    """
+    if len(deviation) < 5:
+        return np.zeros(len(deviation), dtype=bool)
+    middle = np.median(deviation, axis=0)
+    scatter = TO_SIGMA * np.median(np.abs(deviation - middle), axis=0)
+    # A robust scatter of few integrations is uncertain itself.
+    slack = 1.0 + 3.0 / np.sqrt(len(deviation))
+    off = np.abs(deviation - middle) / np.maximum(scatter, 1e-300)
+    return np.asarray(off.max(axis=1) > slack * look_elsewhere(limit, deviation.size))

@@ -1,0 +1,168 @@
+"""Clean reference of a cube, pixels that are bad, and integrations that are not like the rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from amibayes.cube import Cube
+from amibayes.errors import DataError
+from amibayes.extraction.noise import NoiseModel, noise_model
+from amibayes.extraction.source import Source
+from amibayes.units import FloatArray, read_only
+
+BoolArray = NDArray[np.bool_]
+
+SAMPLE = 100
+"""Integrations, evenly over the cube, that the reference is the median of."""
+
+MOST_BAD = 0.2
+"""An integration with a larger fraction of bad pixels is not used."""
+
+ALWAYS_BAD = 0.5
+"""A pixel bad in a larger fraction of the integrations is never used."""
+
+TO_SIGMA = 1.4826
+"""From the median absolute deviation to a standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What an integration of the cube looks like.
+
+    Parameters
+    ----------
+    image : (n_y, n_x) array
+        Median image, bad pixels given a value from their surroundings.
+    scatter : (n_y, n_x) array
+        Robust standard deviation of a pixel between integrations, pointing and noise.
+    good : (n_y, n_x) bool array
+        Pixels that can be used at all.
+    noise : NoiseModel
+    n_bad : int
+        Pixels that are never used.
+    sample : (k, n_y, n_x) array
+        The integrations it was made of, NaN at bad pixels.
+    has_errors : bool
+        Whether the noise is that of the cube's own errors.
+    """
+
+    image: FloatArray
+    scatter: FloatArray
+    good: BoolArray
+    noise: NoiseModel
+    n_bad: int
+    sample: FloatArray
+    has_errors: bool
+
+    def __post_init__(self) -> None:
+        read_only(self, "image", "scatter")
+
+    def outliers(self, images: FloatArray, bad: BoolArray, limit: float) -> BoolArray:
+        """Pixels (n, n_y, n_x) that stand off the reference, scaled to each image's flux."""
+        usable = self.good & ~bad
+        flux = np.einsum("nyx,yx->n", np.where(usable, images, 0.0), self.image)
+        own = np.einsum("nyx,yx->n", usable, self.image**2)
+        scale = flux / np.maximum(own, 1e-300)
+        off = np.abs(images - scale[:, None, None] * self.image) > limit * self.scatter
+        return np.asarray(off & usable)
+
+
+def reference_of(file: Source) -> Reference:
+    """Look at some integrations, and make the reference.
+
+    Raises
+    ------
+    DataError
+        Where no integration holds light.
+    """
+    cube = _sample(file)
+    bad = cube.bad
+    keep = bad.mean(axis=(1, 2)) <= max(MOST_BAD, 1.5 * float(np.median(bad.mean(axis=(1, 2)))))
+    images = np.where(bad, np.nan, cube.images)[keep]
+    flux = np.nansum(images, axis=(1, 2)) if len(images) else np.zeros(0)
+    lit = flux > 0.2 * max(float(np.median(flux[flux > 0.0])) if np.any(flux > 0.0) else 0.0, 0.0)
+    if not lit.any():
+        raise DataError("no integration holds light", source=cube.source)
+    images, flux = images[lit], flux[lit]
+    good = np.isnan(images).mean(axis=0) <= ALWAYS_BAD
+    with np.errstate(invalid="ignore"):
+        scaled = images * (np.median(flux) / flux)[:, None, None]
+    scaled = np.where(good, scaled, 0.0)
+    image = np.nanmedian(scaled, axis=0)
+    spread = TO_SIGMA * np.nanmedian(np.abs(scaled - image), axis=0)
+    good &= ~_hot(image, good)
+    image = _filled(image, good)
+    measured = _measured_variance(cube, keep, lit, spread, len(images))
+    noise = noise_model(image, measured, good & np.isfinite(measured) & (measured > 0.0))
+    scatter = np.sqrt(
+        np.maximum(spread**2, noise.variance) + (0.03 * maximum_filter(np.abs(image), 3)) ** 2
+    )
+    return Reference(
+        image, scatter, good, noise, int((~good).sum()), images, cube.error is not None
+    )
+
+
+def _sample(file: Source) -> Cube:
+    """Integrations spread evenly over the cube."""
+    n = file.n_integrations
+    if n <= SAMPLE:
+        return file.read()
+    picks = np.unique(np.linspace(0, n - 1, SAMPLE).astype(int))
+    parts = [file.read(int(i), int(i) + 1) for i in picks]
+    stacked = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("images", "error", "dq")
+        if getattr(parts[0], name) is not None
+    }
+    return replace(parts[0], mjd=None, **stacked)
+
+
+def _measured_variance(
+    cube: Cube, keep: BoolArray, lit: BoolArray, spread: FloatArray, n: int
+) -> FloatArray:
+    """Variance of each pixel: the errors that came with it, else its scatter."""
+    if cube.error is not None:
+        error = np.where(cube.bad, np.nan, cube.error)[keep][lit]
+        known = np.isfinite(error).any(axis=0)
+        out = np.full(spread.shape, np.nan)
+        out[known] = np.nanmean(error[:, known] ** 2, axis=0)
+        return out
+    return spread**2 * (n / (n - 1.0) if n > 1 else 1.0)
+
+
+def _hot(image: FloatArray, good: BoolArray) -> BoolArray:
+    """Pixels that no optics could light: they stand off all that surrounds them.
+
+    A telescope's image is smooth on the scale of a pixel where it is sampled well; a pixel
+    is called hot or dead where it differs from what its neighbours predict by more than
+    the neighbours differ among themselves, several times over.
+    """
+    found = np.zeros_like(good)
+    padded = np.pad(np.where(good, image, np.nan), 2, constant_values=np.nan)
+    ny, nx = image.shape
+    around = np.stack(
+        [
+            padded[2 + dy : 2 + dy + ny, 2 + dx : 2 + dx + nx]
+            for dy in range(-2, 3)
+            for dx in range(-2, 3)
+            if (dy, dx) != (0, 0)
+        ]
+    )
+    with np.errstate(invalid="ignore"):
+        high, low = np.nanmax(around, axis=0), np.nanmin(around, axis=0)
+        size = high - low
+    found = good & ((image > high + 2.0 * size) | (image < low - 2.0 * size)) & (size > 0.0)
+    return found
+
+
+def _filled(image: FloatArray, good: BoolArray) -> FloatArray:
+    """Gaussian-weighted mean of good neighbours at bad pixels."""
+    if good.all():
+        return image
+    weight = gaussian_filter(good.astype(float), 1.0)
+    smooth = gaussian_filter(np.where(good, image, 0.0), 1.0) / np.maximum(weight, 1e-12)
+    return np.where(good, image, smooth)

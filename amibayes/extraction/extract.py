@@ -1,0 +1,288 @@
+"""The whole way from images to observables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amibayes.cube import Cube
+from amibayes.errors import DataError
+from amibayes.extraction.averaging import Average, average, standing_off
+from amibayes.extraction.cleaning import Reference, reference_of
+from amibayes.extraction.fourier import fourier_sampling
+from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
+from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
+from amibayes.extraction.noise import (
+    NoiseModel,
+    cropped,
+    misfit_level,
+    noise_model,
+    scatter_about_pointing,
+)
+from amibayes.extraction.options import ExtractOptions, Method
+from amibayes.extraction.response import off_axis_response
+from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
+from amibayes.extraction.source import Source, opened
+from amibayes.extraction.table import independent_basis, observables_of
+from amibayes.extraction.view import View, look_at
+from amibayes.observables import Observables, join
+from amibayes.optics import FringeBasis
+from amibayes.response import even_powers
+from amibayes.units import FloatArray
+
+LARGEST_SHIFT_PX = 1.5
+"""Integrations that point farther from the others are not used."""
+
+
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """Everything that came out of the cubes of one instrument, filter and orientation.
+
+    Parameters
+    ----------
+    observables : Observables
+    frames : Frames
+        All integrations, those that were not used too.
+    average : Average
+        Of those that were used.
+    covariance : Shrunk
+        Of one integration.
+    physical : (m, m) array
+        Covariance of one integration that photon and read noise make.
+    benches : tuple of Bench
+        One per file: view, reference image, operators.
+    options : ExtractOptions
+    sources : tuple of str
+    """
+
+    observables: Observables
+    frames: Frames
+    average: Average
+    covariance: Shrunk
+    physical: FloatArray
+    benches: tuple[Bench, ...]
+    options: ExtractOptions
+    sources: tuple[str, ...]
+
+    @property
+    def rejected(self) -> list[tuple[str, int, str]]:
+        """File, number and reason of the integrations that were not used."""
+        frames = self.frames
+        return [
+            (self.sources[int(frames.file[k])], int(frames.number[k]), str(frames.reason[k]))
+            for k in np.flatnonzero(~frames.used)
+        ]
+
+
+def extract(
+    cubes: Cube | str | Path | Sequence[Cube | str | Path],
+    method: Method = "fringes",
+    *,
+    options: ExtractOptions | None = None,
+    **header: Any,
+) -> Observables:
+    """Measure V², closure phases and their joint covariance in images.
+
+    Parameters
+    ----------
+    cubes : Cube, path, or a sequence of them
+        Files of one instrument, filter and orientation are one exposure; others are laid
+        side by side.
+    method : {"fringes", "matched", "fft", "gauss", "square", "unique"}
+        Fit of the images, or ways to sample their Fourier transform.
+    options : ExtractOptions, optional
+        Everything else; ``method`` goes before its own.
+    **header
+        ``instrument``, ``filter``, ``pixel_scale_rad``, ``position_angle_deg`` in place of
+        what the files say.
+
+    Returns
+    -------
+    Observables
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be read, or nothing in it can be measured.
+    """
+    chosen = replace(options or ExtractOptions(), method=method)
+    return join([e.observables for e in extract_all(cubes, chosen, **header)])
+
+
+def extract_all(
+    cubes: Cube | str | Path | Sequence[Cube | str | Path],
+    options: ExtractOptions | None = None,
+    **header: Any,
+) -> list[Extraction]:
+    """As `extract`, with everything that was found on the way, one for each exposure."""
+    given = [cubes] if isinstance(cubes, Cube | str | Path) else list(cubes)
+    if not given:
+        raise DataError("no cube to extract", remedy="give at least one file")
+    chosen = options or ExtractOptions()
+    parts = [_measured(cube, index, chosen, header) for index, cube in enumerate(given)]
+    groups: dict[tuple[Any, ...], list[_Part]] = {}
+    for part in parts:
+        t = part.template
+        key = (t.instrument.upper(), t.filter.upper(), t.orientation, round(t.pixel_scale_rad, 12))
+        groups.setdefault(key, []).append(part)
+    return [_finished(group, chosen) for group in groups.values()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One file."""
+
+    template: Cube
+    bench: Bench
+    frames: Frames
+    physical: FloatArray
+    response: FloatArray
+    attenuation: FloatArray
+
+
+def _measured(
+    cube: Cube | str | Path, index: int, options: ExtractOptions, header: dict[str, Any]
+) -> _Part:
+    with opened(cube, **header) as file:
+        bench = make_bench(file, options)
+        frames, samples, flux = measure(bench, file, index)
+    template = file.template
+    if not options.keep_all:
+        frames = replace(frames, reason=select(frames, options.clip, LARGEST_SHIFT_PX))
+    if not frames.used.any():
+        raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
+    jacobian = bench.sampling.jacobian(flux, samples)
+    response = off_axis_response(bench.view, bench.sampling, template.orientation)
+    return _Part(
+        template,
+        bench,
+        frames,
+        jacobian @ bench.noise @ jacobian.T,
+        response,
+        _attenuation(bench.view, template, response, frames.shift_px),
+    )
+
+
+def make_bench(file: Source, options: ExtractOptions) -> Bench:
+    """Look at a cube once, and prepare all that its integrations go through."""
+    template = file.template
+    reference = reference_of(file)
+    view = look_at(reference.image, template, options)
+    part = (view.rows, view.columns)
+    image, good = reference.image[part], reference.good[part]
+    view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
+    noise, level = _noise_and_misfit(view, basis, reference)
+    fit = fringe_fit(basis, noise.variance + level, good)
+    if options.method == "fringes":
+        sampling = fringe_sampling(fit, view)
+    else:
+        sampling = fourier_sampling(view, basis, options)
+    covariance = sampling.noise(np.where(good, noise.variance, 0.0))
+    return Bench(view, reference, fit, sampling, covariance, options)
+
+
+def _noise_and_misfit(
+    view: View, basis: FringeBasis, reference: Reference
+) -> tuple[NoiseModel, float]:
+    """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
+
+    Where the cube has no errors of its own, the noise is what differs between the
+    residuals: the fits have followed the pointing.
+    """
+    part = (view.rows, view.columns)
+    image, good = reference.image[part], reference.good[part]
+    sample = reference.sample[(slice(None), *part)]
+    fit = fringe_fit(basis, np.full(view.shape, 1.0), good)
+    missing = np.isnan(sample) | ~good
+    pixels = fit.fill(
+        np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
+    )
+    coefficients = fit.solve(pixels)
+    residual = pixels - coefficients @ fit.design.T
+    noise = cropped(reference.noise, part)
+    if not reference.has_errors and len(sample) > 2:
+        _, samples = fringe_sampling(fit, view).split(coefficients)
+        spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
+        noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
+    return noise, misfit_level(residual.reshape(sample.shape), good, noise)
+
+
+def _attenuation(
+    view: View, template: Cube, response: FloatArray, shift_px: FloatArray
+) -> FloatArray:
+    """Loss of V² (n, n_baselines) of the star itself where it is off the centre."""
+    place = shift_px * view.instrument.pixel_scale_rad
+    log = response @ even_powers(*template.orientation.to_sky(place).T)
+    return np.asarray(np.exp(2.0 * (log[1:] - log[0])).T)
+
+
+def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
+    first = parts[0]
+    frames = concatenated([p.frames for p in parts])
+    attenuation = np.concatenate([p.attenuation for p in parts])
+    if not options.keep_all:
+        found = average(frames.select(frames.used), attenuation[frames.used])
+        off = np.zeros(len(frames), dtype=bool)
+        off[frames.used] = standing_off(found.deviation, options.clip)
+        reason = np.where(off, "observables stand off the others'", frames.reason)
+        frames = replace(frames, reason=reason)
+    used = frames.used
+    mean = average(frames.select(used), attenuation[used])
+    count = np.array([p.frames.used.sum() for p in parts], dtype=float)
+    physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
+    basis = independent_basis(first.bench.view)
+    n_vis2 = first.bench.view.instrument.mask.n_baselines
+    shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
+    n = int(used.sum())
+    time = first.template.integration_time_s or 0.0
+    observables = observables_of(
+        first.bench.view,
+        first.template,
+        mean,
+        shrunk.matrix / n,
+        n_integrations=n if n > 1 else None,
+        kind="estimated" if n > 1 else "given",
+        response=first.response,
+        mjd=_mjd(frames, first.template),
+        integration_s=n * time,
+        notes=_notes(frames, shrunk),
+    )
+    return Extraction(
+        observables,
+        frames,
+        mean,
+        shrunk,
+        physical,
+        tuple(p.bench for p in parts),
+        options,
+        tuple(p.template.source for p in parts),
+    )
+
+
+def _mjd(frames: Frames, template: Cube) -> float:
+    """Mean time of what was used; 0 where nothing tells it."""
+    known = frames.mjd[frames.used & np.isfinite(frames.mjd)]
+    if len(known):
+        return float(known.mean())
+    for key in ("EXPMID", "MJD-AVG", "MJD-OBS"):
+        value = template.header.get(key)
+        if isinstance(value, int | float):
+            return float(value)
+    return 0.0
+
+
+def _notes(frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
+    notes = []
+    lost = int((~frames.used).sum())
+    if lost:
+        notes.append(f"{lost} of {len(frames)} integrations not used")
+    if shrunk.block > 1:
+        notes.append(
+            f"integrations are correlated in time ({shrunk.correlation:.2f} from one to the "
+            f"next): the covariance rests on means of {shrunk.block}"
+        )
+    return tuple(notes)

@@ -1,0 +1,197 @@
+"""The Fourier-plane methods: the transform of a windowed image where the splodges are.
+
+Window, background and transform are linear, hence one matrix. The background is the level
+that a ring far from the star and the window's own sum agree on, the star's light in both
+accounted for by the model of the image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.sampling import IntArray, Sampling, closing_products
+from amibayes.extraction.view import View
+from amibayes.optics import FringeBasis
+from amibayes.optics.psf import ComplexArray
+from amibayes.units import FloatArray
+
+RING = 0.8
+"""The background is taken outside this fraction of the half width of the image."""
+
+DEFAULT_WINDOW = 0.45
+"""Half-power radius of the window in units of the image's side."""
+
+SQUARE, GAUSS = 1, 2
+"""Half widths, in cells, of the patches of these methods."""
+
+GAUSS_SIGMA = 1.2
+"""Cells."""
+
+FAINTEST = 0.2
+"""Cells where the modelled splodge is below this fraction of its peak are not sampled."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Samples on a lattice: baseline, offset from its reference point, frequency."""
+
+    baseline: IntArray
+    offset: IntArray
+    frequency_px: FloatArray
+
+    def select(self, keep: FloatArray) -> _Cells:
+        return _Cells(self.baseline[keep], self.offset[keep], self.frequency_px[keep])
+
+
+def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) -> Sampling:
+    """Make the operator of one of the Fourier methods; ``fringes`` is the view's basis."""
+    mask = view.instrument.mask
+    star = fringes.image().ravel()
+    level = _Levels.of(view, options, star)
+    if options.method == "unique":
+        cells = _Cells(np.arange(mask.n_baselines), np.zeros((0, 2), np.intp), view.frequency_px)
+        closing, triangle = mask.triangle_baselines, np.arange(len(mask.triangles))
+        return _assembled(view, cells, level, star, np.ones(len(cells.baseline)), closing, triangle)
+    cells = _lattice(view, _half_width(view, options.method))
+    if options.method == "matched":
+        return _matched(view, cells, level, fringes.matrix)
+    gain = np.ones(len(cells.baseline))
+    if options.method == "gauss":
+        away = cells.frequency_px - view.frequency_px[cells.baseline]
+        gain = np.exp(-0.25 * np.sum((away * max(view.shape) / GAUSS_SIGMA) ** 2, axis=1))
+    if options.method == "fft":
+        keep = _bright(cells.baseline, _own(view, cells, level, fringes.matrix), FAINTEST)
+        cells, gain = cells.select(keep), gain[keep]
+    closing, triangle = closing_products(mask.triangle_baselines, cells.offset, cells.baseline)
+    return _assembled(view, cells, level, star, gain, closing, triangle)
+
+
+def _half_width(view: View, method: str) -> int:
+    if method in ("square", "gauss"):
+        return SQUARE if method == "square" else GAUSS
+    size = 2.0 / np.sqrt(3.0) * view.instrument.mask.size_m
+    return int(
+        np.ceil(size * view.instrument.pixel_scale_rad / view.wavelength_m * max(view.shape))
+    )
+
+
+def _lattice(view: View, half_width: int) -> _Cells:
+    """Cells about every splodge, of the lattice that an FFT of the image would have."""
+    step = 1.0 / max(view.shape)
+    mask = view.instrument.mask.rotated(view.rotation_rad)
+    holes = mask.holes_m * (view.instrument.pixel_scale_rad / view.wavelength_m / step)
+    holes = np.rint(holes)
+    reference = holes[mask.pairs[:, 1]] - holes[mask.pairs[:, 0]]
+    nearest = np.rint(view.frequency_px / step - reference)
+    side = np.arange(-half_width, half_width + 1)
+    patch = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    offset = nearest[:, None, :] + patch
+    baseline = np.repeat(np.arange(mask.n_baselines), len(patch))
+    frequency = (reference[:, None, :] + offset) * step
+    return _Cells(baseline, offset.reshape(-1, 2).astype(np.intp), frequency.reshape(-1, 2))
+
+
+def _bright(baseline: IntArray, model: ComplexArray, faintest: float) -> FloatArray:
+    """Cells of the splodges themselves."""
+    peak = np.zeros(int(baseline.max()) + 1)
+    np.maximum.at(peak, baseline, np.abs(model))
+    return np.asarray(np.abs(model) > faintest * peak[baseline])
+
+
+@dataclass(frozen=True, eq=False)
+class _Levels:
+    """The window, and the linear functionals for flux and background, (n_pixels,)."""
+
+    window: FloatArray
+    flux: FloatArray
+    background: FloatArray
+
+    @classmethod
+    def of(cls, view: View, options: ExtractOptions, star: FloatArray) -> _Levels:
+        x, y = view.axes_px()
+        r2 = y[:, None] ** 2 + x**2
+        side = min(view.shape)
+        radius = DEFAULT_WINDOW * side if options.window_px is None else options.window_px
+        window = (
+            np.ones(view.shape) if radius == 0.0 else np.exp(-np.log(2.0) * (r2 / radius**2) ** 2)
+        )
+        ring = (r2 > (RING * 0.5 * side) ** 2).astype(float)
+        both = np.stack([window.ravel(), ring.ravel()])
+        system = np.stack([both @ star, both.sum(axis=1)], axis=1)
+        flux, background = np.linalg.solve(system, both)
+        return cls(window.ravel(), flux, background)
+
+    def transform(self, view: View, frequency_px: FloatArray) -> ComplexArray:
+        """Operator (n_pixels, n) from pixels to the transform less the background's."""
+        x, y = view.axes_px()
+        along_x = np.exp(-2j * np.pi * np.outer(x, frequency_px[:, 0]))
+        along_y = np.exp(-2j * np.pi * np.outer(y, frequency_px[:, 1]))
+        wave = (along_y[:, None, :] * along_x).reshape(-1, len(frequency_px))
+        wave *= self.window[:, None]
+        return np.asarray(wave - np.outer(self.background, wave.sum(axis=0)))
+
+
+def _matched(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Sampling:
+    """One sample per baseline: cells weighted with the splodge that is expected there.
+
+    The outskirts of neighbouring splodges overlap; what each sample sees of the others is
+    known from the model and taken out.
+    """
+    mask = view.instrument.mask
+    n = mask.n_baselines
+    own = _own(view, cells, level, basis)
+    keep = _bright(cells.baseline, own, FAINTEST)
+    cells, own = cells.select(keep), own[keep]
+    share = np.zeros((len(own), n), dtype=complex)
+    share[np.arange(len(own)), cells.baseline] = own.conj()
+    operator = level.transform(view, cells.frequency_px) @ share
+    matrix = np.column_stack([level.flux, operator.real, operator.imag])
+    seen = basis.T @ matrix
+    scale = np.abs(seen).max(axis=0)
+    return Sampling(
+        np.linalg.solve((seen / scale).T, (matrix / scale).T).T,
+        np.arange(n),
+        np.ones(n),
+        mask.triangle_baselines,
+        np.arange(len(mask.triangles)),
+        view.frequency_px,
+        np.ones(n, dtype=complex),
+    )
+
+
+def _own(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> ComplexArray:
+    """Transform at every cell of its own baseline's fringe."""
+    out = np.empty(len(cells.baseline), dtype=complex)
+    n = view.instrument.mask.n_baselines
+    for b in range(n):
+        here = cells.baseline == b
+        fringe = basis[:, 1 + b] - 1j * basis[:, 1 + n + b]
+        out[here] = fringe @ level.transform(view, cells.frequency_px[here])
+    return out
+
+
+def _assembled(
+    view: View,
+    cells: _Cells,
+    level: _Levels,
+    star: FloatArray,
+    gain: FloatArray,
+    closing: IntArray,
+    triangle: IntArray,
+) -> Sampling:
+    """Samples as they are, normalised so that a point source has V² = 1."""
+    operator = level.transform(view, cells.frequency_px) * np.sqrt(gain)
+    reference = star @ operator
+    total = np.bincount(cells.baseline, np.abs(reference) ** 2)
+    return Sampling(
+        np.column_stack([level.flux, operator.real, operator.imag]),
+        cells.baseline,
+        1.0 / total[cells.baseline],
+        closing,
+        triangle,
+        cells.frequency_px,
+        reference,
+    )

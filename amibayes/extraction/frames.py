@@ -1,0 +1,208 @@
+"""Numbers of every integration, and which of the integrations are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from scipy.stats import norm
+
+from amibayes.cube import Cube
+from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
+from amibayes.extraction.image_plane import FringeFit, shift_of
+from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.sampling import Sampling
+from amibayes.extraction.source import Source
+from amibayes.extraction.view import View
+from amibayes.optics.psf import ComplexArray
+from amibayes.units import FloatArray
+
+CHUNK = 64
+"""Integrations that are worked on together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What was measured in every integration.
+
+    Parameters
+    ----------
+    flux : (n,) array
+    shift_px : (n, 2) array
+        Of the star from the centre of the view.
+    power : (n, n_baselines) array
+        V² times flux², noise bias taken off.
+    square : (n,) array
+        Flux², noise bias taken off.
+    bispectrum : (n, n_triangles) complex array
+    misfit : (n,) array
+        Weighted squared residual of the fringe fit.
+    n_bad : (n,) array
+        Pixels left out.
+    mjd : (n,) array
+    file : (n,) int array
+        Which of the files it is in.
+    number : (n,) int array
+        Its number there.
+    reason : (n,) array of str
+        Why it is not used; empty where it is.
+    """
+
+    flux: FloatArray
+    shift_px: FloatArray
+    power: FloatArray
+    square: FloatArray
+    bispectrum: ComplexArray
+    misfit: FloatArray
+    n_bad: FloatArray
+    mjd: FloatArray
+    file: FloatArray
+    number: FloatArray
+    reason: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+    @property
+    def used(self) -> BoolArray:
+        """Integrations without a reason against them."""
+        return np.asarray(self.reason == "")
+
+    def select(self, keep: BoolArray) -> Frames:
+        """The integrations ``keep``."""
+        return Frames(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Everything that an integration goes through."""
+
+    view: View
+    reference: Reference
+    fit: FringeFit
+    sampling: Sampling
+    noise: FloatArray
+    options: ExtractOptions
+
+
+def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
+    """Measure every integration of a file, which is number ``index`` of its set.
+
+    Returns
+    -------
+    frames : Frames
+    samples : (n_samples,) complex array
+        Mean of the samples, each integration moved back to the centre.
+    flux : float
+        Mean flux.
+    """
+    parts, flux, count = [], 0.0, 0
+    total = np.zeros(bench.sampling.n_samples, dtype=complex)
+    for cube in _chunks(file):
+        frames, samples = _measure_chunk(bench, cube)
+        lit = frames.used
+        turn = np.exp(2j * np.pi * frames.shift_px[lit] @ bench.sampling.frequency_px.T)
+        total += (samples[lit] * turn).sum(axis=0)
+        flux, count = flux + float(frames.flux[lit].sum()), count + int(lit.sum())
+        parts.append(frames)
+    joined = concatenated(parts)
+    number = np.arange(len(joined))
+    return (
+        replace(joined, number=number, file=np.full(len(number), index)),
+        total / max(count, 1),
+        flux / max(count, 1),
+    )
+
+
+def concatenated(parts: list[Frames]) -> Frames:
+    """Lay integrations end to end."""
+    return Frames(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Frames)}
+    )
+
+
+def _chunks(file: Source) -> Iterator[Cube]:
+    for start in range(0, file.n_integrations, CHUNK):
+        yield file.read(start, min(start + CHUNK, file.n_integrations))
+
+
+def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
+    view, reference = bench.view, bench.reference
+    bad = cube.bad
+    images = np.where(bad, 0.0, cube.images)
+    bad |= reference.outliers(images, bad, bench.options.outlier)
+    part = np.s_[:, view.rows, view.columns]
+    n = cube.n_integrations
+    pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
+    never = bench.fit.weight == 0.0
+    count = missing[:, ~never].sum(axis=1)
+    hopeless = count > MOST_BAD * missing.shape[1]
+    filled = bench.fit.fill(pixels, (missing | never) & ~hopeless[:, None])
+    coefficients = bench.fit.solve(filled)
+    flux, samples = bench.sampling.apply(filled)
+    shift = _shift(bench, samples)
+    own, extra = bench.sampling.bias(bench.noise)
+    mjd = np.full(n, np.nan) if cube.mjd is None else cube.mjd
+    reason = np.where(hopeless, "too many bad pixels", np.where(flux > 0.0, "", "no light"))
+    return (
+        Frames(
+            flux,
+            shift,
+            bench.sampling.power(samples) - extra,
+            flux**2 - own,
+            bench.sampling.bispectrum(samples),
+            bench.fit.misfit(filled, coefficients),
+            count,
+            mjd,
+            np.zeros(n, dtype=int),
+            np.zeros(n, dtype=int),
+            reason.astype("U60"),
+        ),
+        samples,
+    )
+
+
+def _shift(bench: Bench, samples: ComplexArray) -> FloatArray:
+    return shift_of(bench.view, bench.sampling.fringes(samples))
+
+
+def select(frames: Frames, limit: float, largest_shift_px: float) -> FloatArray:
+    """Say why integrations are not to be used: flux, pointing, shape.
+
+    Returns
+    -------
+    (n,) array of str
+        Empty where nothing speaks against an integration.
+    """
+    reason = frames.reason.copy()
+    for name, values, floor in _criteria(frames):
+        used = reason == ""
+        if used.sum() < 3:
+            break
+        middle = np.median(values[used])
+        spread = max(
+            TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor * abs(middle), 1e-300
+        )
+        off = (values - middle) / spread
+        hit = used & (np.abs(off) > look_elsewhere(limit, int(used.sum())))
+        reason[hit] = [f"{name} stands off by {o:.1f} sigma" for o in off[hit]]
+    used = reason == ""
+    if used.any():
+        away = np.hypot(*(frames.shift_px - np.median(frames.shift_px[used], axis=0)).T)
+        hit = used & (away > largest_shift_px)
+        reason[hit] = [f"star is {a:.2f} pixels off" for a in away[hit]]
+    return np.asarray(reason)
+
+
+def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
+    """Names, values, and the relative scatter below which nothing stands off."""
+    light = np.where(frames.flux > 0.0, frames.flux, np.nan)
+    with np.errstate(invalid="ignore"):
+        shape = np.sqrt(frames.misfit) / light
+    return [("flux", np.nan_to_num(light), 1e-3), ("shape", np.nan_to_num(shape), 0.1)]
+
+
+def look_elsewhere(limit: float, n: int) -> float:
+    """The limit that one of ``n`` exceeds as rarely as a single one exceeds ``limit``."""
+    return float(norm.isf(norm.sf(limit) / max(n, 1)))

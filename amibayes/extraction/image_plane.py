@@ -1,0 +1,155 @@
+"""The image-plane fit: flux, pedestal, and a cosine and a sine for every baseline.
+
+Least squares with weights that all integrations share is one matrix, so that a cube is
+one matrix product. A pixel that is bad in one integration only is left out of it exactly:
+it is given the value that the fit then predicts, for which a small system is solved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amibayes.errors import DataError
+from amibayes.extraction.sampling import Sampling
+from amibayes.extraction.view import CONVERGED_PX, View
+from amibayes.optics import FringeBasis
+from amibayes.optics.psf import ComplexArray
+from amibayes.units import FloatArray, read_only
+
+MOST_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class FringeFit:
+    """The weighted fit of one view.
+
+    Parameters
+    ----------
+    design : (n_pixels, 2 + 2·n_baselines) array
+        Columns: envelope, cosines, sines, pedestal.
+    inverse : (n_pixels, 2 + 2·n_baselines) array
+        Images times this matrix are the coefficients.
+    weight : (n_pixels,) array
+        Inverse variances; 0 where a pixel is never used.
+    """
+
+    design: FloatArray
+    inverse: FloatArray
+    weight: FloatArray
+
+    def __post_init__(self) -> None:
+        read_only(self, "design", "inverse", "weight")
+
+    @property
+    def n_baselines(self) -> int:
+        """How many baselines."""
+        return self.design.shape[1] // 2 - 1
+
+    def solve(self, pixels: FloatArray) -> FloatArray:
+        """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
+        return np.asarray(pixels @ self.inverse)
+
+    def fill(self, pixels: FloatArray, missing: FloatArray) -> FloatArray:
+        """Give missing pixels the values that a fit without them predicts.
+
+        Parameters
+        ----------
+        pixels : (n, n_pixels) array
+        missing : (n, n_pixels) bool array
+
+        Returns
+        -------
+        (n, n_pixels) array
+        """
+        frame, pixel = np.nonzero(missing)
+        if not len(frame):
+            return pixels
+        filled = pixels.copy()
+        filled[frame, pixel] = 0.0
+        count = np.bincount(frame, minlength=len(pixels))
+        first = np.concatenate([[0], np.cumsum(count)])
+        for k in np.unique(count[count > 0]):
+            frames = np.flatnonzero(count == k)
+            index = pixel[first[frames][:, None] + np.arange(k)]
+            filled[frames[:, None], index] = self._predicted(filled[frames], index)
+        return filled
+
+    def _predicted(self, pixels: FloatArray, index: FloatArray) -> FloatArray:
+        """Predictions (n, k) of the pixels ``index`` (n, k), which are 0 in ``pixels``."""
+        design, inverse = self.design[index], self.inverse[index]
+        system = np.eye(index.shape[1]) - design @ inverse.swapaxes(1, 2)
+        start = np.einsum("nkp,np->nk", design, self.solve(pixels))
+        return np.asarray(np.linalg.solve(system, start[..., None])[..., 0])
+
+    def misfit(self, pixels: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Weighted sum of squared residuals of every image, (n,)."""
+        return np.asarray(((pixels - coefficients @ self.design.T) ** 2) @ self.weight)
+
+
+def fringe_fit(basis: FringeBasis, variance: FloatArray, good: FloatArray) -> FringeFit:
+    """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only."""
+    design = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
+    weight = np.where(good, 1.0 / variance, 0.0).ravel()
+    # Columns of like size keep the factorisation well conditioned.
+    scale = np.sqrt(weight @ design**2)
+    q, r = np.linalg.qr(design * np.sqrt(weight)[:, None] / scale)
+    inverse = np.linalg.solve(r, q.T).T * np.sqrt(weight)[:, None] / scale
+    return FringeFit(design, inverse, weight)
+
+
+def fringe_sampling(fit: FringeFit, view: View) -> Sampling:
+    """Coefficients of the fit as flux and one complex sample per baseline."""
+    mask = view.instrument.mask
+    n = mask.n_baselines
+    return Sampling(
+        fit.inverse[:, : 1 + 2 * n],
+        np.arange(n),
+        np.ones(n),
+        mask.triangle_baselines,
+        np.arange(len(mask.triangles)),
+        view.frequency_px,
+        np.ones(n, dtype=complex),
+    )
+
+
+def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None) -> FloatArray:
+    """Displacement (n, 2) in pixels that the phases (n, n_baselines) of fringes tell of."""
+    phase = np.angle(samples) / (2.0 * np.pi)
+    w = np.ones(phase.shape[1]) if weight is None else weight
+    design = view.frequency_px * w[:, None]
+    return np.asarray(-(phase * w) @ np.linalg.pinv(design).T)
+
+
+def centre_on(
+    view: View, image: FloatArray, variance: FloatArray, good: FloatArray, source: str
+) -> tuple[View, FringeBasis]:
+    """Move the view's centre to the star, by Gauss–Newton on the phases of its fringes.
+
+    Returns
+    -------
+    View, FringeBasis
+        The basis is that of the view.
+
+    Raises
+    ------
+    DataError
+        Where it does not settle: another mask, filter or pixel scale made the image.
+    """
+    pixels = np.where(good, image, 0.0).reshape(1, -1)
+    for _ in range(MOST_STEPS):
+        basis = view.basis()
+        flux, samples = fringe_sampling(fringe_fit(basis, variance, good), view).apply(pixels)
+        step = shift_of(view, samples, np.abs(samples[0]))[0]
+        x, y = (float(c) for c in view.centre_px + step)
+        if not flux[0] > 0.0 or max(abs(x), abs(y)) > 0.5 * max(view.shape):
+            break
+        if np.hypot(*step) < CONVERGED_PX:
+            return view, basis
+        view = replace(view, centre_px=(x, y))
+    raise DataError(
+        "no fringes of this mask are found in the images",
+        source=source,
+        remedy="check instrument, filter and pixel scale",
+    )

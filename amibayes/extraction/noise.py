@@ -1,0 +1,115 @@
+"""How noisy each pixel is: one model of the mean image, shared by all integrations.
+
+Variances taken from the noisy pixels themselves favour those that happen to be low, and
+bias fluxes and V² (Neyman's χ²). The model is a + b·mean: read noise, background and
+photons, whatever the unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import nnls
+
+from amibayes.units import FloatArray, read_only
+
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Variance of a pixel of one integration.
+
+    Parameters
+    ----------
+    variance : (n_y, n_x) array
+        In the square of the images' unit.
+    constant, per_signal : float
+        Of variance = constant + per_signal · mean.
+    """
+
+    variance: FloatArray
+    constant: float
+    per_signal: float
+
+    def __post_init__(self) -> None:
+        read_only(self, "variance")
+
+
+def noise_model(mean: FloatArray, measured: FloatArray, good: FloatArray) -> NoiseModel:
+    """Fit the variance that was measured at each pixel.
+
+    Parameters
+    ----------
+    mean : (n_y, n_x) array
+        Mean image.
+    measured : (n_y, n_x) array
+        Mean of the squared errors, or scatter between integrations. What moves with the
+        pointing is told apart by the image's slopes.
+    good : (n_y, n_x) bool array
+        Pixels to use.
+    """
+    signal = np.maximum(gaussian_filter(np.where(good, mean, 0.0), 0.5), 0.0)
+    slope_y, slope_x = np.gradient(np.where(good, mean, 0.0))
+    columns = np.stack([np.ones_like(signal), signal, slope_x**2, slope_y**2], axis=-1)[good]
+    data = measured[good]
+    weight = np.full(len(data), 1.0 / max(float(np.median(data)), 1e-300))
+    found = np.zeros(4)
+    for _ in range(_ROUNDS):
+        scale = np.linalg.norm(columns * weight[:, None], axis=0)
+        scale[scale == 0.0] = 1.0
+        found = nnls(columns * weight[:, None] / scale, data * weight)[0] / scale
+        model = columns @ found
+        # Every relative deviation counts alike; outliers count for little.
+        level = np.maximum(model, 1e-6 * max(float(model.max()), 1e-300))
+        weight = 1.0 / level / np.maximum(1.0, np.abs(data - model) / (4.0 * level))
+    constant, per_signal = float(found[0]), float(found[1])
+    variance = constant + per_signal * np.maximum(mean, 0.0)
+    floor = max(1e-6 * float(variance.max()), 1e-300)
+    return NoiseModel(np.maximum(variance, floor), constant, per_signal)
+
+
+def scatter_about_pointing(residual: FloatArray, shift_px: FloatArray) -> FloatArray:
+    """Variance of every pixel between integrations, what goes with the pointing taken out.
+
+    Parameters
+    ----------
+    residual : (n, n_pixels) array
+    shift_px : (n, 2) array
+        Pointing of each integration.
+
+    Returns
+    -------
+    (n_pixels,) array
+    """
+    n, (x, y) = len(residual), shift_px.T
+    terms = [np.ones(n), x, y, x * x, x * y, y * y]
+    # Never more terms than half of what there is to fit.
+    kept = 6 if n >= 12 else 3 if n >= 6 else 1
+    basis = np.linalg.qr(np.stack(terms[:kept], axis=1))[0]
+    rest = residual - basis @ (basis.T @ residual)
+    return np.asarray((rest**2).sum(axis=0) / (n - kept))
+
+
+def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:
+    """Part of the detector."""
+    return NoiseModel(noise.variance[part], noise.constant, noise.per_signal)
+
+
+def misfit_level(residual: FloatArray, good: FloatArray, noise: NoiseModel) -> float:
+    """Mean square of what the fringe model cannot follow, beyond the noise.
+
+    Errors of the optics are the same in every integration. As an even variance on top of
+    the noise they keep a few faint or bright pixels from deciding alone.
+
+    Parameters
+    ----------
+    residual : (n, n_y, n_x) array
+        Of integrations fitted by themselves.
+    good : (n_y, n_x) bool array
+    noise : NoiseModel
+    """
+    mean = residual.mean(axis=0)[good]
+    return max(float(np.mean(mean**2 - noise.variance[good] / len(residual))), 0.0)

@@ -1,0 +1,69 @@
+"""What an extraction is asked to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+from amibayes.errors import UsageError
+
+Method = Literal["fringes", "matched", "fft", "gauss", "square", "unique"]
+
+METHODS: tuple[str, ...] = get_args(Method)
+
+
+@dataclass(frozen=True)
+class ExtractOptions:
+    """What an extraction is asked to do.
+
+    Parameters
+    ----------
+    method : {"fringes", "matched", "fft", "gauss", "square", "unique"}
+        ``fringes`` fits the images; the others sample their Fourier transform.
+    clip : float
+        Integrations whose observables stand off by more standard deviations are left out.
+    outlier : float
+        Pixels that stand off their own in other integrations by more are left out.
+    window_px : float, optional
+        Radius at which the window of the Fourier methods has fallen to a half; 0 for no
+        window. By default 0.45 of the image's side.
+    covariance : {"shrunk", "scatter", "physical"}
+        Scatter and photon noise weighed against each other, or one of them alone.
+    temperature_k : float, optional
+        Blackbody that stands for the star's spectrum; as many photons at every wavelength
+        unless given.
+    fit_scale : bool
+        Fit pixel scale and rotation of the mask as well as the centre.
+    keep_all : bool
+        Leave no integration out that can be measured at all.
+
+    Raises
+    ------
+    UsageError
+        Where a value makes no sense.
+    """
+
+    method: Method = "fringes"
+    clip: float = 5.0
+    outlier: float = 7.0
+    window_px: float | None = None
+    covariance: Literal["shrunk", "scatter", "physical"] = "shrunk"
+    temperature_k: float | None = None
+    fit_scale: bool = False
+    keep_all: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UsageError(
+                f"method '{self.method}' is not known", remedy=f"choose from {', '.join(METHODS)}"
+            )
+        for name in ("clip", "outlier"):
+            if not getattr(self, name) > 0.0:
+                raise UsageError(f"{name} is {getattr(self, name):g}; it must be above 0")
+        if self.window_px is not None and not self.window_px >= 0.0:
+            raise UsageError(f"window is {self.window_px:g} pixels; it must be at least 0")
+
+    def as_mapping(self) -> Mapping[str, Any]:
+        """Every option with its value."""
+        return asdict(self)

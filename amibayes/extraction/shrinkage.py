@@ -1,0 +1,150 @@
+"""The covariance of the mean: scatter between integrations, weighed with what physics expects.
+
+The scatter of N integrations knows N − 1 directions of p; for few of them its inverse is
+far too sure of itself. The covariance is given an inverse-Wishart prior whose mean is the
+covariance that photons and read noise make, each kind of observable with a scale of its
+own, and as many degrees of freedom as the scatter itself supports (marginal likelihood).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import multigammaln
+
+from amibayes.units import FloatArray, read_only
+
+MOST_FREEDOM = 1e4
+"""The prior never counts for more integrations than this."""
+
+SIGNIFICANT = 4.0
+"""Standard deviations of the correlation from one integration to the next that count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shrunk:
+    """Covariance of one integration, and what it rests on.
+
+    Parameters
+    ----------
+    matrix : (m, m) array
+    prior_freedom : float
+        Integrations that the physical covariance counts for (infinite: it alone).
+    freedom : float
+        Degrees of freedom of the t-distribution of new data of this covariance.
+    scale_vis2, scale_closure : float
+        Measured variances in units of the physical ones.
+    block : int
+        Integrations that were averaged because they are correlated in time; 1 where not.
+    correlation : float
+        From one integration to the next, over all observables.
+    """
+
+    matrix: FloatArray
+    prior_freedom: float
+    freedom: float
+    scale_vis2: float
+    scale_closure: float
+    block: int
+    correlation: float
+
+    def __post_init__(self) -> None:
+        read_only(self, "matrix")
+
+
+def shrunk_covariance(
+    deviation: FloatArray,
+    physical: FloatArray,
+    basis: FloatArray,
+    n_vis2: int,
+    kind: str = "shrunk",
+) -> Shrunk:
+    """Covariance of the observables of one integration.
+
+    Parameters
+    ----------
+    deviation : (n, m) array
+        Of each integration from the mean, in order of time.
+    physical : (m, m) array
+        Covariance that noise of known size makes.
+    basis : (m, p) array
+        Orthonormal basis of the independent observables, those of V² first.
+    n_vis2 : int
+        How many of the independent observables are V².
+    kind : {"shrunk", "scatter", "physical"}
+    """
+    lower = np.linalg.cholesky(basis.T @ physical @ basis)
+    white = np.linalg.solve(lower, basis.T @ deviation.T)
+    white, block, correlation = _uncorrelated(white)
+    p, n = white.shape
+    groups = np.arange(p) < n_vis2
+    if kind == "physical" or n < 2:
+        inner, prior, freedom, scales = np.eye(p), np.inf, np.inf, (1.0, 1.0)
+    elif kind == "scatter":
+        inner, prior, freedom = white @ white.T / (n - 1), 0.0, float(n - p)
+        scales = _scales(inner, groups)
+    else:
+        prior, scales = _most_likely(white, groups)
+        psi = (prior - p - 1.0) * np.where(groups, scales[0], scales[1])
+        freedom = prior + n - 1.0 - p + 1.0
+        inner = (np.diag(psi) + white @ white.T) / (prior + n - 1.0 - p - 1.0)
+    spread = basis @ lower
+    return Shrunk(spread @ inner @ spread.T, prior, freedom, *scales, block, correlation)
+
+
+def _scales(inner: FloatArray, groups: FloatArray) -> tuple[float, float]:
+    diagonal = np.diag(inner)
+    return tuple(float(diagonal[g].mean()) if g.any() else 1.0 for g in (groups, ~groups))  # type: ignore[return-value]
+
+
+def _most_likely(white: FloatArray, groups: FloatArray) -> tuple[float, tuple[float, float]]:
+    """Prior degrees of freedom and the two scales of greatest marginal likelihood."""
+    p, n = white.shape
+    m, scatter = n - 1, white @ white.T
+    start = np.log(np.maximum(_scales(scatter / m, groups), 1e-3))
+
+    def cost(at: FloatArray) -> float:
+        nu = p + 2.0 + np.exp(at[0])
+        psi = (nu - p - 1.0) * np.where(groups, np.exp(at[1]), np.exp(at[2]))
+        logdet = np.linalg.slogdet(np.diag(psi) + scatter)[1]
+        return float(
+            multigammaln(nu / 2.0, p)
+            - multigammaln((nu + m) / 2.0, p)
+            - 0.5 * nu * np.log(psi).sum()
+            + 0.5 * (nu + m) * logdet
+        )
+
+    bounds = [(-2.0, np.log(MOST_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
+    tries = [
+        minimize(cost, [first, *start], bounds=bounds, method="L-BFGS-B")
+        for first in (1.0, 4.0, 7.0)
+    ]
+    best = min(tries, key=lambda t: float(t.fun)).x
+    return float(p + 2.0 + np.exp(best[0])), (float(np.exp(best[1])), float(np.exp(best[2])))
+
+
+def _uncorrelated(white: FloatArray) -> tuple[FloatArray, int, float]:
+    """Average neighbours in time until one says nothing of the next.
+
+    Block means are scaled by √(length), so that their covariance is that of one
+    integration if nothing is correlated.
+    """
+    block, series = 1, white
+    first = lag_one(series)
+    while series.shape[1] >= 12 and lag_one(series) > SIGNIFICANT / np.sqrt(series.size):
+        block *= 2
+        n = white.shape[1] // block
+        series = white[:, : n * block].reshape(len(white), n, block).mean(axis=2) * np.sqrt(block)
+        series = series - series.mean(axis=1, keepdims=True)
+    return series, block, first
+
+
+def lag_one(series: FloatArray) -> float:
+    """Correlation of neighbours in time, over all rows, freed of its bias −1/n."""
+    n = series.shape[1]
+    if n < 3:
+        return 0.0
+    power = float((series**2).sum())
+    return float((series[:, 1:] * series[:, :-1]).sum() / max(power, 1e-300) + 1.0 / n)

@@ -1,0 +1,64 @@
+"""Where integrations come from: a file that is read a few at a time, or a cube in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from amibayes.cube import Cube, open_cube
+
+
+class Source(Protocol):
+    """A cube that is read in parts; `amibayes.cube.CubeFile` is one."""
+
+    @property
+    def template(self) -> Cube:
+        """Everything but the images."""
+
+    @property
+    def n_integrations(self) -> int:
+        """How many images."""
+
+    def read(self, start: int = 0, stop: int | None = None) -> Cube:
+        """Read the integrations from ``start`` up to ``stop``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A cube in memory."""
+
+    cube: Cube
+
+    @property
+    def template(self) -> Cube:
+        """Everything but the images."""
+        return self.read(0, 0)
+
+    @property
+    def n_integrations(self) -> int:
+        """How many images."""
+        return self.cube.n_integrations
+
+    def read(self, start: int = 0, stop: int | None = None) -> Cube:
+        """Give the integrations from ``start`` up to ``stop``."""
+        cube, part = self.cube, slice(start, stop)
+        return replace(
+            cube,
+            images=cube.images[part],
+            error=None if cube.error is None else cube.error[part],
+            dq=None if cube.dq is None else cube.dq[part],
+            mjd=None if cube.mjd is None else cube.mjd[part],
+        )
+
+
+@contextmanager
+def opened(cube: Cube | str | Path, **header: Any) -> Iterator[Source]:
+    """Open a path, with `open_cube`'s options in place of its header, or a cube."""
+    if isinstance(cube, Cube):
+        yield Held(cube)
+        return
+    with open_cube(cube, **header) as file:
+        yield file

@@ -1,0 +1,111 @@
+"""Averages as `Observables`: stations are holes, baselines lie on the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amibayes.closure import closure_matrix, kernel_basis
+from amibayes.covariance import Block, BlockCovariance
+from amibayes.cube import Cube
+from amibayes.extraction.averaging import Average
+from amibayes.extraction.response import relative_band
+from amibayes.extraction.view import View
+from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
+from amibayes.units import FloatArray
+
+
+def independent_basis(view: View) -> FloatArray:
+    """(n_baselines + n_triangles, p): every V², then the kernel basis of closure phases."""
+    mask = view.instrument.mask
+    closures = kernel_basis(closure_matrix(mask.triangles)[0])
+    n = mask.n_baselines
+    basis = np.zeros((n + len(closures), n + closures.shape[1]))
+    basis[:n, :n] = np.eye(n)
+    basis[n:, n:] = closures
+    return basis
+
+
+def observables_of(
+    view: View,
+    template: Cube,
+    average: Average,
+    covariance: FloatArray,
+    *,
+    n_integrations: int | None,
+    kind: CovarianceKind,
+    response: FloatArray,
+    mjd: float,
+    integration_s: float,
+    notes: tuple[str, ...],
+) -> Observables:
+    """Lay one average out as a table; ``covariance`` is that of the mean."""
+    mask = view.instrument.mask
+    holes = template.orientation.to_sky(mask.rotated(view.rotation_rad).holes_m)
+    setup = _setup(view, template, holes, response)
+    timing = (mjd, integration_s)
+    vis2 = _rows(setup, holes, mask.pairs, [(0, 1)], average.vis2, timing)
+    closure = _rows(setup, holes, mask.triangles, [(0, 1), (1, 2)], average.closure_phase, timing)
+    block = Block(np.arange(len(covariance)), covariance, independent_basis(view))
+    return Observables(
+        vis2,
+        closure,
+        BlockCovariance(len(covariance), [block]),
+        kind,
+        (setup,),
+        n_integrations,
+        notes,
+    )
+
+
+def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) -> Setup:
+    mask, header = view.instrument.mask, template.header
+    n = mask.n_holes
+    target = str(header.get("TARGNAME") or header.get("TARGPROP") or header.get("OBJECT") or "")
+    right, down = (header.get(key) for key in ("TARG_RA", "TARG_DEC"))
+    between = np.zeros((n, n, response.shape[1]))
+    between[np.arange(n), np.arange(n)] = response[0]
+    for at in (mask.pairs, mask.pairs[:, ::-1]):
+        between[at[:, 0], at[:, 1]] = response[1:]
+    return Setup(
+        f"{template.instrument.upper()}_{view.instrument.bandpass.name}",
+        mask.name[:40],
+        target.strip(),
+        tuple(f"H{k + 1}" for k in range(n)),
+        np.arange(1, n + 1),
+        np.array([view.wavelength_m]),
+        np.array([view.wavelength_m * relative_band(view)]),
+        np.column_stack([holes, np.zeros(n)]),
+        np.full(n, mask.size_m),
+        template.source,
+        float(right) if isinstance(right, int | float) else 0.0,
+        float(down) if isinstance(down, int | float) else 0.0,
+        response=between,
+    )
+
+
+def _rows(
+    setup: Setup,
+    holes: FloatArray,
+    members: IntArray,
+    legs: list[tuple[int, int]],
+    value: FloatArray,
+    timing: tuple[float, float],
+) -> Measurements:
+    n = len(members)
+    leg = np.array(legs)
+    vector = holes[members[:, leg[:, 1]]] - holes[members[:, leg[:, 0]]]
+    zeros = np.zeros(n, dtype=np.intp)
+    return Measurements(
+        value=value,
+        u_m=vector[..., 0],
+        v_m=vector[..., 1],
+        wavelength_m=np.full(n, setup.wavelength_m[0]),
+        band_m=np.full(n, setup.band_m[0]),
+        mjd=np.full(n, timing[0]),
+        integration_s=np.full(n, timing[1]),
+        stations=members,
+        setup=zeros,
+        row=np.arange(n),
+        channel=zeros,
+        flag=~np.isfinite(value),
+    )

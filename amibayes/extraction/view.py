@@ -1,0 +1,157 @@
+"""A cube as extraction sees it: the mask behind it, and where on the detector to look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from amibayes.cube import Cube
+from amibayes.errors import DataError, UsageError
+from amibayes.extraction.options import ExtractOptions
+from amibayes.instrument import Channels, Instrument, load_instrument
+from amibayes.optics import FringeBasis, fringe_basis, psf
+from amibayes.spectrum import Blackbody
+from amibayes.units import FloatArray
+
+LARGEST = 1.25
+"""Images wider than this many times the instrument's usual subarray are cropped to it."""
+
+CONVERGED_PX = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The part of the detector that is used, and the mask that made the image.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        With the cube's pixel scale.
+    channels : Channels
+        Wavelengths of the star's light.
+    rows, columns : slice
+        Part of the detector.
+    centre_px : (x, y)
+        Place of the star relative to the middle of that part.
+    rotation_rad : float
+        Of the mask in the image.
+    """
+
+    instrument: Instrument
+    channels: Channels
+    rows: slice
+    columns: slice
+    centre_px: tuple[float, float] = (0.0, 0.0)
+    rotation_rad: float = 0.0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_y, n_x) of the part that is used."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength whose frequency is the mean of the photons', metres."""
+        return float(1.0 / (self.channels.weight @ (1.0 / self.channels.wavelength_m)))
+
+    @property
+    def uv_m(self) -> FloatArray:
+        """(n_baselines, 2) baselines in the image's axes, metres."""
+        return self.instrument.mask.rotated(self.rotation_rad).uv_m
+
+    @property
+    def frequency_px(self) -> FloatArray:
+        """(n_baselines, 2) fringe frequencies, cycles per pixel."""
+        return np.asarray(self.uv_m * (self.instrument.pixel_scale_rad / self.wavelength_m))
+
+    def basis(self) -> FringeBasis:
+        """Make the fringe model of this image."""
+        return fringe_basis(
+            self.instrument,
+            self.channels,
+            self.shape,
+            centre_px=self.centre_px,
+            rotation_rad=self.rotation_rad,
+        )
+
+    def axes_px(self) -> tuple[FloatArray, FloatArray]:
+        """Coordinates x (n_x,) and y (n_y,) of the pixels, from the star."""
+        ny, nx = self.shape
+        x = np.arange(nx) - 0.5 * (nx - 1) - self.centre_px[0]
+        y = np.arange(ny) - 0.5 * (ny - 1) - self.centre_px[1]
+        return x, y
+
+
+def instrument_of(cube: Cube) -> Instrument:
+    """Find the instrument that a cube says it is of, with the cube's pixel scale.
+
+    Raises
+    ------
+    DataError
+        Where no such instrument or filter is known.
+    """
+    try:
+        found = load_instrument(cube.instrument, cube.filter)
+    except UsageError as error:
+        raise DataError(error.what, source=cube.source, remedy=error.remedy) from None
+    return replace(found, pixel_scale_rad=cube.pixel_scale_rad)
+
+
+def look_at(image: FloatArray, cube: Cube, options: ExtractOptions) -> View:
+    """Find the star in a clean image (n_y, n_x) of the whole detector.
+
+    Raises
+    ------
+    DataError
+        Where the image is too small, or the star stands at its edge.
+    """
+    instrument = instrument_of(cube)
+    spectrum = None if options.temperature_k is None else Blackbody(options.temperature_k)
+    channels = instrument.bandpass.channels(spectrum)
+    _refuse_small(image, instrument, cube.source)
+    place = _peak(image, instrument, channels)
+    sides = [
+        _part(size, instrument.n_pixels, at) for size, at in zip(image.shape, place, strict=True)
+    ]
+    offset = [
+        at - part.start - 0.5 * (part.stop - part.start - 1)
+        for at, part in zip(place, sides, strict=True)
+    ]
+    reach = [min(at, size - 1 - at) for at, size in zip(place, image.shape, strict=True)]
+    if min(reach) * instrument.pixel_scale_rad < 1.5 * instrument.resolution_rad:
+        raise DataError(
+            f"the star stands at the edge of the image, at x = {place[1]}, y = {place[0]}",
+            source=cube.source,
+            remedy="give images with the star inside",
+        )
+    return View(instrument, channels, sides[0], sides[1], (float(offset[1]), float(offset[0])))
+
+
+def _refuse_small(image: FloatArray, instrument: Instrument, source: str) -> None:
+    needed = int(np.ceil(instrument.field_rad / instrument.pixel_scale_rad))
+    if min(image.shape) < needed:
+        raise DataError(
+            f"images of {image.shape[1]} x {image.shape[0]} pixels do not hold one fringe of the "
+            f"shortest baseline ({needed} pixels)",
+            source=source,
+            remedy="give larger images, or check instrument, filter and pixel scale",
+        )
+
+
+def _peak(image: FloatArray, instrument: Instrument, channels: Channels) -> tuple[int, int]:
+    """Pixel (y, x) at which the image is most like that of a star."""
+    side = min(*image.shape, 31)
+    few = Channels.monochromatic(channels.mean_m)
+    star = psf(instrument, few, side - 1 + side % 2)
+    found = fftconvolve(image - np.median(image), star, mode="same")
+    y, x = np.unravel_index(int(found.argmax()), image.shape)
+    return int(y), int(x)
+
+
+def _part(size: int, usual: int, place: int) -> slice:
+    if size <= LARGEST * usual:
+        return slice(0, size)
+    start = min(max(place - usual // 2, 0), size - usual)
+    return slice(start, start + usual)
