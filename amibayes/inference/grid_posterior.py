@@ -448,7 +448,8 @@ class _Work:
         low = np.maximum((best - CONTRAST_REACH * sigma).min(axis=1), 0.3 * small)
         high = (np.maximum(best, 0.0) + CONTRAST_REACH * sigma).max(axis=1)
         low = np.clip(low, p.contrast_min, 0.9 * p.contrast_max)
-        high = np.clip(high, np.minimum(2.0 * low, p.contrast_max), p.contrast_max)
+        # Where the data want less than the prior allows, what lies above its lower end counts.
+        high = np.minimum(np.maximum(high, low + CONTRAST_REACH * small), p.contrast_max)
         faint = np.geomspace(np.full(len(low), p.contrast_min), low, FAINT_BOXES + 1, axis=1)
         fine = np.linspace(low, high, self.n_boxes - FAINT_BOXES + 1, axis=1)
         return np.hstack([faint, fine[:, 1:]])
