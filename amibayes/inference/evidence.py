@@ -14,16 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import factorial
 from typing import Literal
 
 import numpy as np
-from scipy import stats
 from scipy.special import gammaln, logsumexp
 
 from amibayes.errors import UsageError
 from amibayes.inference.grid_posterior import GridPosterior, log_evidence_none
-from amibayes.inference.likelihood import LOG_TWO_PI, Likelihood
+from amibayes.inference.laplace import (
+    gaussian_of,
+    log_evidence_laplace,
+    physical,
+    sampled,
+)
+from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.multiplicity import TwoCompanions
 from amibayes.inference.priors import Prior
 from amibayes.inference.refine import single_likelihood
@@ -185,22 +189,6 @@ def log_evidence_halo(likelihood: Likelihood, prior: Prior) -> float:
     )
 
 
-def log_evidence_laplace(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> float:
-    """ln Z as the sum of the modes' Gaussians, cut off at the ranges of the nuisance."""
-    k = likelihood.model.companions
-    parts = []
-    for mode in modes:
-        centre, scatter = gaussian_of(likelihood, np.array(mode.theta), prior)
-        theta = _physical(centre[None], k)
-        sigma = np.sqrt(np.diag(scatter @ scatter.T))[3 * k :]
-        pull = (np.array(prior.nuisance).reshape(-1, 2) - centre[3 * k :, None]) / sigma[:, None]
-        inside = np.prod(stats.norm.cdf(pull[:, 1]) - stats.norm.cdf(pull[:, 0]))
-        volume = np.log(np.abs(np.linalg.det(scatter))) + 0.5 * len(centre) * LOG_TWO_PI
-        density = float(prior.log_density(centre[None])[0] + likelihood.log_prob(theta)[0])
-        parts.append(density + volume + float(np.log(inside)))
-    return float(logsumexp(parts) + np.log(factorial(k)))
-
-
 def log_evidence_importance(
     likelihood: Likelihood,
     modes: Sequence[Mode],
@@ -231,11 +219,11 @@ def log_evidence_importance(
     n = int(np.clip(wanted, FEWEST_DRAWS, MOST_DRAWS))
     counts = [int(share * n)] * len(sources)
     drawn = [s.draw(rng, m) for s, m in zip(sources, counts, strict=True)]
-    drawn.append(_sampled(prior.draw(rng, n - sum(counts), k), k))
+    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), k))
     x = np.concatenate(drawn)
     log_prior = prior.log_density(x)
     x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
-    log_f = log_prior + _in_batches(likelihood, _physical(x, k))
+    log_f = log_prior + _in_batches(likelihood, physical(x, k))
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)
@@ -288,7 +276,7 @@ class _Gaussians:
         self.companions = likelihood.model.companions + n_free
         self.prior, self.n_free = prior, n_free
         fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
-        at_peak = [likelihood.log_prob(_physical(c[None], likelihood.model.companions))[0]
+        at_peak = [likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
                    + np.log(np.abs(np.linalg.det(s))) for c, s in fits]
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
@@ -302,7 +290,7 @@ class _Gaussians:
         )
         if not self.n_free:
             return x
-        free = _sampled(self.prior.draw(rng, n, 1), 1)[:, :3]
+        free = sampled(self.prior.draw(rng, n, 1), 1)[:, :3]
         return np.hstack([x[:, :3], free, x[:, 3:]])
 
     def log_density(self, x: FloatArray) -> FloatArray:
@@ -318,43 +306,6 @@ class _Gaussians:
             log, x = bare.log_density(x[:, 3:6]), np.delete(x, np.s_[3:6], axis=1)
         parts = [t.log_density(x) for t in self.mixture]
         return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
-
-
-def gaussian_of(
-    likelihood: Likelihood, theta: FloatArray, prior: Prior
-) -> tuple[FloatArray, FloatArray]:
-    """Centre and scatter matrix of a mode in the sampled coordinates (ln contrast).
-
-    Contrasts below their error are moved up to it: there the posterior in ln contrast ends.
-    """
-    k = likelihood.model.companions
-    bright = np.arange(2, 3 * k, 3)
-    sigma = np.sqrt(np.diag(likelihood.errors(theta)))
-    theta = np.array(theta)
-    least = np.maximum(np.minimum(sigma[bright], 0.1), 1.01 * prior.contrast_min)
-    theta[bright] = np.clip(theta[bright], least, prior.contrast_max)
-    nuisance = np.array(prior.nuisance).reshape(-1, 2)
-    theta[3 * k :] = np.clip(theta[3 * k :], nuisance[:, 0], nuisance[:, 1])
-    stretch = np.ones(len(theta))
-    stretch[bright] = 1.0 / theta[bright]
-    values, vectors = np.linalg.eigh(likelihood.errors(theta) * np.outer(stretch, stretch))
-    theta[bright] = np.log(theta[bright])
-    limit = max(0.5 * prior.outer_mas, 1.0)
-    return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
-
-
-def _physical(x: FloatArray, companions: int) -> FloatArray:
-    """From the sampled coordinates to the model's."""
-    theta = x.copy()
-    theta[:, 2 : 3 * companions : 3] = np.exp(theta[:, 2 : 3 * companions : 3])
-    return theta
-
-
-def _sampled(theta: FloatArray, companions: int) -> FloatArray:
-    """From the model's coordinates to the sampled ones."""
-    x = theta.copy()
-    x[:, 2 : 3 * companions : 3] = np.log(x[:, 2 : 3 * companions : 3])
-    return x
 
 
 def log_evidence_nested(
