@@ -28,10 +28,10 @@ from amibayes.units import MAS, FloatArray
 CELLS_PER_FRINGE = 8
 """Cells per λ/B_max to begin with."""
 
-FLOOR = 14.0
+FLOOR = 10.0
 """Cells whose logarithm of the mass is this far below the largest are not cut any more."""
 
-STEP = 1.0
+STEP = 1.5
 """Longest side of a cell that counts, in units of the shortest error a position can have."""
 
 CONTRAST_REACH = 7.0
@@ -316,13 +316,9 @@ def _to_cut(
     rate = np.maximum(2.0 * np.pi / fringe_mas, 2.0 / cells.centre[0])
     too_large = cells.size * rate * np.sqrt(gain) > step
     missed = 0.25 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max()
-    share = log_mass - np.log(cells.size**2)
-    return np.asarray(too_large & (_total(log_mass, share) > -FLOOR - missed))
-
-
-def _total(log_mass: FloatArray, share: FloatArray) -> FloatArray:
-    """How far below the largest mass, or the largest density, a cell stands; the better one."""
-    return np.maximum(log_mass - log_mass.max(), share - share.max())
+    density = log_mass - 2.0 * np.log(cells.size)
+    below = np.maximum(log_mass - log_mass.max(), density - density.max())
+    return np.asarray(too_large & (below > -FLOOR - missed))
 
 
 class _Work:
@@ -452,7 +448,8 @@ class _Work:
         low = np.maximum((best - CONTRAST_REACH * sigma).min(axis=1), 0.3 * small)
         high = (np.maximum(best, 0.0) + CONTRAST_REACH * sigma).max(axis=1)
         low = np.clip(low, p.contrast_min, 0.9 * p.contrast_max)
-        high = np.clip(high, np.minimum(2.0 * low, p.contrast_max), p.contrast_max)
+        # Where the data want less than the prior allows, what lies above its lower end counts.
+        high = np.minimum(np.maximum(high, low + CONTRAST_REACH * small), p.contrast_max)
         faint = np.geomspace(np.full(len(low), p.contrast_min), low, FAINT_BOXES + 1, axis=1)
         fine = np.linspace(low, high, self.n_boxes - FAINT_BOXES + 1, axis=1)
         return np.hstack([faint, fine[:, 1:]])

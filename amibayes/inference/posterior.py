@@ -11,16 +11,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import emcee
 import h5py
 import numpy as np
 
-from amibayes.errors import DataError
+from amibayes.errors import DataError, UsageError
 from amibayes.files import atomic_path
+from amibayes.inference.grid_posterior import GridPosterior
+from amibayes.inference.laplace import gaussian_of, log_masses, physical
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Mode, SearchResult
+from amibayes.inference.search import resolution_mas
 from amibayes.units import FloatArray, contrast_to_delta_mag, position_angle_deg, separation
 
 N_WALKERS = 32
@@ -31,6 +35,9 @@ ENOUGH = 50.0
 """Autocorrelation times a chain must be long (Foreman-Mackey et al. 2013)."""
 
 GOOD_RHAT = 1.02
+
+START_WIDTH = 0.05
+"""Longest scatter of the walkers' start, in units of the field."""
 
 STRONG = 30.0
 """Δχ² above which a mode is an island: no chain leaves it."""
@@ -54,6 +61,7 @@ class Posterior:
     log_prob : (n,) float array
     chain : (n_steps, n_walkers, n_dim) float array
         All of it, burn-in included.
+    chain_log_prob : (n_steps, n_walkers) float array
     autocorrelation_time : float
         Longest of the parameters', in steps.
     n_steps, n_burn : int
@@ -66,13 +74,19 @@ class Posterior:
         Longer than 50 autocorrelation times and split-R̂ below 1.02.
     prior : Prior
     mode_probability : (n_modes,) float array
-        Probability of each mode of the search (Laplace), in their order.
+        Probability of each mode of the search among the modes, in their order.
+    mode_method : {"grid", "laplace"}
+    elsewhere : float
+        Probability farther than λ/2B from every mode; NaN without a grid posterior.
+    times, rhats : (n_dim,) float array
+        Autocorrelation time (steps) and split-R̂ of each parameter.
     """
 
     names: tuple[str, ...]
     samples: FloatArray
     log_prob: FloatArray
     chain: FloatArray
+    chain_log_prob: FloatArray
     autocorrelation_time: float
     n_steps: int
     n_burn: int
@@ -82,6 +96,10 @@ class Posterior:
     converged: bool
     prior: Prior
     mode_probability: FloatArray
+    mode_method: str
+    elsewhere: float
+    times: FloatArray
+    rhats: FloatArray
 
     @property
     def n_effective(self) -> int:
@@ -113,6 +131,47 @@ class Posterior:
         turn = 360.0 * (mid // 360.0) if name == "position_angle_deg" else 0.0
         return float(mid - turn), float(low - turn), float(high - turn)
 
+    def convergence(self) -> dict[str, dict[str, float]]:
+        """How far each parameter can be trusted: autocorrelation time, split-R̂, samples."""
+        kept = self.n_walkers * (self.n_steps - self.n_burn)
+        each = zip(self.names, self.times, self.rhats, strict=True)
+        return {
+            name: {
+                "autocorrelation_time": float(time),
+                "split_rhat": float(rhat),
+                "n_effective": float(kept / time),
+            }
+            for name, time, rhat in each
+        }
+
+    def to_inference_data(self) -> Any:
+        """Give the chain, burn-in removed, to ArviZ (extra ``amibayes[arviz]``).
+
+        Returns
+        -------
+        arviz.InferenceData, or xarray.DataTree from ArviZ 1.0 on
+            Walkers are chains; ``lp`` is the log-posterior.
+
+        Raises
+        ------
+        UsageError
+            Where ArviZ is not installed.
+        """
+        try:
+            import arviz
+        except ImportError as error:
+            raise UsageError(
+                "InferenceData needs ArviZ", remedy="pip install 'amibayes[arviz]'"
+            ) from error
+        kept = self.chain[self.n_burn :].swapaxes(0, 1)
+        groups = {
+            "posterior": {name: kept[..., k] for k, name in enumerate(self.names)},
+            "sample_stats": {"lp": self.chain_log_prob[self.n_burn :].T},
+        }
+        # Version 1 takes one dictionary of groups and returns an xarray.DataTree.
+        old = hasattr(arviz, "InferenceData")
+        return arviz.from_dict(**groups) if old else arviz.from_dict(groups)
+
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT converged"
         return f"<Posterior: {len(self.samples)} samples of {', '.join(self.names)}; {state}>"
@@ -125,6 +184,7 @@ def sample(
     *,
     path: str | Path | None = None,
     resume: bool = False,
+    grid: GridPosterior | None = None,
     max_steps: int = MAX_STEPS,
     progress: Progress | None = None,
 ) -> Posterior:
@@ -140,6 +200,8 @@ def sample(
         HDF5 file of the chain, readable by `emcee.backends.HDFBackend`.
     resume : bool
         Go on from ``path`` if it holds the chain of the same data, prior and seed.
+    grid : GridPosterior, optional
+        Of the same likelihood and prior: gives the modes' probabilities.
     max_steps : int
         Steps after which a chain that has not converged is given up (and said to be so).
     progress : callable, optional
@@ -165,7 +227,7 @@ def sample(
             _save(sampler, path, digest)
         if progress:
             progress(sampler.iteration, int(ENOUGH * _time(sampler)))
-    return _posterior(sampler, result, prior, done)
+    return _posterior(sampler, result, prior, grid, done)
 
 
 def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray], FloatArray]:
@@ -173,24 +235,33 @@ def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray
         density = prior.log_density(x)
         inside = np.isfinite(density)
         if inside.any():
-            density[inside] += likelihood.log_prob(_physical(x[inside]))
+            density[inside] += likelihood.log_prob(physical(x[inside], 1))
         return density
 
     return log_posterior
 
 
-def _physical(x: FloatArray) -> FloatArray:
-    """From the sampled coordinates to the model's: exp of the ln contrast."""
-    theta = x.copy()
-    theta[..., 2] = np.exp(theta[..., 2])
-    return theta
+def mode_probabilities(
+    result: SearchResult, prior: Prior, grid: GridPosterior | None = None
+) -> FloatArray:
+    """Probability of each mode among the modes, (n_modes,).
 
-
-def mode_probabilities(result: SearchResult, prior: Prior) -> FloatArray:
-    """Probability of each mode among the modes, by Laplace's approximation, (n_modes,)."""
-    log_weight = np.array([_laplace(result.likelihood, m, prior)[2] for m in result.modes])
-    weight = np.exp(log_weight - log_weight.max())
+    By the grid posterior within λ/2B of each mode, where there is one; else by Laplace's
+    approximation.
+    """
+    if grid is not None:
+        mass = mode_masses(result, grid)
+        if mass.sum() > 0.0:
+            return np.asarray(mass / mass.sum())
+    log_mass = log_masses(result.likelihood, result.modes, prior)
+    weight = np.exp(log_mass - log_mass.max())
     return np.asarray(weight / weight.sum())
+
+
+def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
+    """Posterior probability within λ/2B of each mode; what is missing to 1 is elsewhere."""
+    places = np.array([m.theta[:2] for m in result.modes])
+    return grid.mass_near(places, 0.5 * resolution_mas(result.likelihood))
 
 
 def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
@@ -205,84 +276,83 @@ def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
 
 def _start(result: SearchResult, prior: Prior, rng: np.random.Generator) -> FloatArray:
     """Walkers (n, n_dim) around the modes, each by its own covariance, inside the prior."""
-    chosen = modes_to_sample(result)
-    laplace = [_laplace(result.likelihood, m, prior) for m in chosen]
-    log_weight = np.array([w for _, _, w in laplace])
+    chosen, likelihood = modes_to_sample(result), result.likelihood
+    # A weak mode's errors reach past the prior's edges; a walker needs only a fair start.
+    fits = [gaussian_of(likelihood, np.array(m.theta), prior, START_WIDTH) for m in chosen]
+    log_weight = log_masses(likelihood, chosen, prior)
     weight = np.exp(log_weight - log_weight.max())
-    n_dim, n_trials = len(laplace[0][0]), 100 * N_WALKERS
-    which = rng.choice(len(laplace), size=n_trials, p=weight / weight.sum())
-    centre = np.array([c for c, _, _ in laplace])[which]
-    scatter = np.array([s for _, s, _ in laplace])[which]
+    n_dim, n_trials = len(fits[0][0]), 100 * N_WALKERS
+    which = rng.choice(len(fits), size=n_trials, p=weight / weight.sum())
+    centre = np.array([c for c, _ in fits])[which]
+    scatter = np.array([s for _, s in fits])[which]
     trial = centre + np.einsum("nij,nj->ni", scatter, rng.standard_normal((n_trials, n_dim)))
     inside = trial[np.isfinite(prior.log_density(trial))]
     if len(inside) < N_WALKERS:
-        raise DataError(
-            "the best fit lies outside the prior", source=result.likelihood.observables.source
-        )
+        raise DataError("the best fit lies outside the prior", source=likelihood.observables.source)
     return np.asarray(inside[:N_WALKERS])
 
 
-def _laplace(
-    likelihood: Likelihood, mode: Mode, prior: Prior
-) -> tuple[FloatArray, FloatArray, float]:
-    """Centre, scatter matrix and log-weight of a mode in the sampled coordinates."""
-    theta = np.array(mode.theta)
-    theta[2] = np.clip(theta[2], 2.0 * prior.contrast_min, prior.contrast_max)
-    stretch = np.ones(len(theta))
-    stretch[2] = 1.0 / theta[2]
-    # A weak mode's errors reach past the prior's edges; a walker needs only a fair start.
-    wide = likelihood.errors(theta) * np.outer(stretch, stretch)
-    values, vectors = np.linalg.eigh(wide)
-    limit = np.max([0.05 * prior.outer_mas, 1.0])
-    scatter = vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
-    theta[2] = np.log(theta[2])
-    return theta, scatter, 0.5 * mode.delta_chi2 + float(np.log(np.abs(np.linalg.det(scatter))))
+def _times(sampler: emcee.EnsembleSampler) -> FloatArray:
+    """Integrated autocorrelation times of the second two thirds of the chain, steps, (n_dim,)."""
+    chain = sampler.get_chain()[sampler.iteration // 3 :]
+    return np.asarray(emcee.autocorr.integrated_time(chain, tol=0))
+
+
+def _longest(times: FloatArray) -> float:
+    return float(np.nanmax(times)) if np.isfinite(times).any() else np.inf
 
 
 def _time(sampler: emcee.EnsembleSampler) -> float:
-    """Longest integrated autocorrelation time of the second two thirds of the chain, steps."""
-    chain = sampler.get_chain()[sampler.iteration // 3 :]
-    times = emcee.autocorr.integrated_time(chain, tol=0)
-    return float(np.nanmax(times)) if np.isfinite(times).any() else np.inf
+    return _longest(_times(sampler))
 
 
 def _long_enough(sampler: emcee.EnsembleSampler) -> bool:
     if sampler.iteration < 2 * SEGMENT:
         return False
     kept = sampler.iteration - sampler.iteration // 3
-    return kept > ENOUGH * _time(sampler) and _split_rhat(sampler) < GOOD_RHAT
+    return kept > ENOUGH * _time(sampler) and _split_rhat(sampler).max() < GOOD_RHAT
 
 
-def _split_rhat(sampler: emcee.EnsembleSampler) -> float:
-    """Largest split-R̂ of the parameters, every walker's second two thirds cut in two."""
+def _split_rhat(sampler: emcee.EnsembleSampler) -> FloatArray:
+    """Split-R̂ of the parameters, every walker's second two thirds cut in two, (n_dim,)."""
     chain = sampler.get_chain()[sampler.iteration // 3 :]
     half = len(chain) // 2
     halves = np.concatenate([chain[:half], chain[half : 2 * half]], axis=1)
     within = halves.var(axis=0, ddof=1).mean(axis=0)
     between = halves.mean(axis=0).var(axis=0, ddof=1)
-    return float(np.sqrt(((half - 1) / half * within + between) / within).max())
+    return np.asarray(np.sqrt(((half - 1) / half * within + between) / within))
 
 
 def _posterior(
-    sampler: emcee.EnsembleSampler, result: SearchResult, prior: Prior, converged: bool
+    sampler: emcee.EnsembleSampler,
+    result: SearchResult,
+    prior: Prior,
+    grid: GridPosterior | None,
+    converged: bool,
 ) -> Posterior:
-    time = _time(sampler)
+    times = _times(sampler)
+    time = _longest(times)
     burn = sampler.iteration // 3
     thin = max(1, int(0.5 * time)) if np.isfinite(time) else 1
     return Posterior(
         names=result.likelihood.parameters,
-        samples=_physical(sampler.get_chain(discard=burn, thin=thin, flat=True)),
+        samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), 1),
         log_prob=sampler.get_log_prob(discard=burn, thin=thin, flat=True),
-        chain=_physical(sampler.get_chain()),
+        chain=physical(sampler.get_chain(), 1),
+        chain_log_prob=sampler.get_log_prob(),
         autocorrelation_time=time,
         n_steps=sampler.iteration,
         n_burn=burn,
         n_walkers=sampler.nwalkers,
-        split_rhat=_split_rhat(sampler),
+        split_rhat=float(_split_rhat(sampler).max()),
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=converged,
         prior=prior,
-        mode_probability=mode_probabilities(result, prior),
+        mode_probability=mode_probabilities(result, prior, grid),
+        mode_method="laplace" if grid is None else "grid",
+        elsewhere=float("nan") if grid is None else 1.0 - float(mode_masses(result, grid).sum()),
+        times=times,
+        rhats=_split_rhat(sampler),
     )
 
 

@@ -72,13 +72,15 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
 
 def refine(likelihood: Likelihood, seed: FloatArray, box: Box, chi2_single: float) -> Mode:
     """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
-    near = np.array([[x - box.fringe_mas, x + box.fringe_mas] for x in seed[:2]])
-    nuisance = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
-    bounds = np.vstack([near, [[0.0, MAX_CONTRAST]], nuisance])
+    n_pairs = 3 * likelihood.model.companions
+    bounds = np.empty((len(seed), 2))
+    bounds[:n_pairs] = seed[:n_pairs, None] + box.fringe_mas * np.array([-1.0, 1.0])
+    bounds[2:n_pairs:3] = 0.0, MAX_CONTRAST
+    bounds[n_pairs:] = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
     theta, chi2 = seed, np.inf
     for _ in range(MOST_ROUNDS):
         scale = _natural_scale(likelihood, theta, box)
-        limits = _field_limits(seed, box, scale)
+        limits = [x for k in range(0, n_pairs, 3) for x in _field_limits(seed, box, scale, k)]
         before = chi2
         theta, chi2 = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
         if chi2 > before - SETTLED:
@@ -89,8 +91,9 @@ def refine(likelihood: Likelihood, seed: FloatArray, box: Box, chi2_single: floa
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
     """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
     length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
+    n_pairs = 3 * likelihood.model.companions
     widest = np.full(len(theta), 1.0)
-    widest[:2], widest[2] = 0.3 * box.fringe_mas, 0.3
+    widest[:n_pairs], widest[2:n_pairs:3] = 0.3 * box.fringe_mas, 0.3
     return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
 
 
@@ -138,26 +141,29 @@ def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:
     return chi2
 
 
-def _field_limits(seed: FloatArray, box: Box, scale: FloatArray) -> list[Objective]:
-    """Constraints ≤ 0 that keep the separation inside the field, where it might leave it."""
-    rho = float(np.hypot(seed[0], seed[1]))
+def _field_limits(seed: FloatArray, box: Box, scale: FloatArray, at: int) -> list[Objective]:
+    """Constraints ≤ 0 that keep the companion at ``at`` inside the field, if it might leave it."""
+    rho = float(np.hypot(seed[at], seed[at + 1]))
     reach = 1.5 * box.fringe_mas
     limits: list[Objective] = []
     if rho + reach > box.outer_mas:
-        limits.append(_separation_limit(box, scale, +1.0, box.outer_mas))
+        limits.append(_separation_limit(box, scale, at, +1.0, box.outer_mas))
     if rho - reach < box.inner_mas:
-        limits.append(_separation_limit(box, scale, -1.0, box.inner_mas))
+        limits.append(_separation_limit(box, scale, at, -1.0, box.inner_mas))
     return limits
 
 
-def _separation_limit(box: Box, scale: FloatArray, sign: float, limit_mas: float) -> Objective:
-    squared = (scale[:2] / box.fringe_mas) ** 2
+def _separation_limit(
+    box: Box, scale: FloatArray, at: int, sign: float, limit_mas: float
+) -> Objective:
+    place = slice(at, at + 2)
+    squared = (scale[place] / box.fringe_mas) ** 2
 
     def excess(x: FloatArray, gradient: FloatArray) -> float:
         if gradient.size:
             gradient[:] = 0.0
-            gradient[:2] = 2.0 * sign * squared * x[:2]
-        return float(sign * (squared @ x[:2] ** 2 - (limit_mas / box.fringe_mas) ** 2))
+            gradient[place] = 2.0 * sign * squared * x[place]
+        return float(sign * (squared @ x[place] ** 2 - (limit_mas / box.fringe_mas) ** 2))
 
     return excess
 
