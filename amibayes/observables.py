@@ -302,7 +302,7 @@ def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:
 def kernel_blocks(
     closure_phase: Measurements, sigma: FloatArray, *, correlated: bool = True
 ) -> list[Block]:
-    """Covariance blocks of closure phases given by their errors alone (METHODS: K Σ Kᵀ).
+    """Covariance blocks of closure phases given by their errors alone, K Σ Kᵀ.
 
     Parameters
     ----------

@@ -117,6 +117,9 @@ FEWEST_TO_VET = 3
 
 VETTING_DRAWS = 1000
 
+MOST_FIELDS = 3
+"""How often the default field is widened."""
+
 
 class _Clock:
     """Times the stages and announces them."""
@@ -173,70 +176,36 @@ def search_companion(
     options = options or SearchOptions()
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
-    streams = np.random.SeedSequence(options.seed).spawn(4)
+    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(4)]
     clock = _Clock(announce)
+    weight, posterior, limits = None, None, None
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
         with clock.stage("read"):
             parts = [_read(path, options) for path in targets]
             references = [_read(path, options) for path in calibrators]
-        vetting, believed = None, references
-        if len(references) >= FEWEST_TO_VET and not options.keep_all:
-            with clock.stage("vet"):
-                vetting = vet(
-                    references,
-                    separation_mas=options.separation_mas,
-                    null_draws=VETTING_DRAWS,
-                    limits=False,
-                    seed=options.seed,
-                )
-                believed = _believed(references, vetting)
-        calibration, observables = None, join(parts)
-        if references:
-            with clock.stage("calibrate"):
-                calibration = calibrate(
-                    parts,
-                    believed,
-                    method=options.calibration,
-                    clip=options.clip,
-                    rng=np.random.default_rng(streams[3]),
-                )
-                observables = calibration.observables
+        vetting, calibration, observables = _calibrated(
+            parts, references, options, streams[3], clock
+        )
         with clock.stage("search"):
-            likelihood = Likelihood(observables.only(options.observables))
-            likelihood = likelihood.with_model(_model(likelihood, options))
-            if options.extra_noise:
-                result, noise = search_with_noise(likelihood, options.separation_mas)
-            else:
-                result, noise = search(likelihood, options.separation_mas), ExtraNoise()
-            likelihood = result.likelihood
-        weight = None
+            result, noise, widened = _searched(observables, options)
         if options.null_draws:
             with clock.stage("significance"):
-                weight = _weigh(
-                    result, noise, options, np.random.default_rng(streams[0]), executor, progress
-                )
-        posterior = None
+                weight = _weigh(result, options, streams[0], executor, progress)
         if options.posterior:
             with clock.stage("posterior"):
-                posterior = sample(
-                    result,
-                    default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas),
-                    np.random.default_rng(streams[1]),
-                    path=chain,
-                    resume=resume,
-                    progress=progress,
+                prior = default_prior(
+                    result.likelihood, result.grid.inner_mas, result.grid.outer_mas
                 )
-        limits = None
+                posterior = sample(
+                    result, prior, streams[1], path=chain, resume=resume, progress=progress
+                )
         if options.limits and weight is not None:
             with clock.stage("limits"):
                 limits = detection_limit(
-                    result,
-                    weight,
-                    np.random.default_rng(streams[2]),
-                    executor=executor,
-                    progress=progress,
+                    result, weight, streams[2], executor=executor, progress=progress
                 )
+    said = [*_vetting_warnings(vetting), *widened, *_different_targets(parts)]
     return SearchReport(
         options,
         tuple(str(p) for p in targets),
@@ -250,9 +219,67 @@ def search_companion(
         weight,
         posterior,
         limits,
-        (*_vetting_warnings(vetting), *_warnings(observables, result, noise, weight, posterior)),
+        (*said, *_warnings(observables, result, noise, weight, posterior)),
         clock.seconds,
     )
+
+
+def _calibrated(
+    parts: list[Observables],
+    references: list[Observables],
+    options: SearchOptions,
+    rng: np.random.Generator,
+    clock: _Clock,
+) -> tuple[Vetting | None, Calibration | None, Observables]:
+    """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
+    if not references:
+        return None, None, join(parts)
+    vetting, believed = None, references
+    if len(references) >= FEWEST_TO_VET and not options.keep_all:
+        with clock.stage("vet"):
+            vetting = vet(
+                references,
+                separation_mas=options.separation_mas,
+                null_draws=VETTING_DRAWS,
+                limits=False,
+                seed=options.seed,
+            )
+            believed = _believed(references, vetting)
+    with clock.stage("calibrate"):
+        calibration = calibrate(
+            parts, believed, method=options.calibration, clip=options.clip, rng=rng
+        )
+    return vetting, calibration, calibration.observables
+
+
+def _searched(
+    observables: Observables, options: SearchOptions
+) -> tuple[SearchResult, ExtraNoise, list[str]]:
+    """Search the field; the default one is widened where something around it fits better."""
+    likelihood = Likelihood(observables.only(options.observables))
+    likelihood = likelihood.with_model(_model(likelihood, options))
+    field, said = options.separation_mas, []
+    for _ in range(MOST_FIELDS):
+        if options.extra_noise:
+            result, noise = search_with_noise(likelihood, field)
+        else:
+            result, noise = search(likelihood, field), ExtraNoise()
+        place = None if options.separation_mas else look_outside(result)
+        if place is None:
+            break
+        field = (result.grid.inner_mas, 1.5 * place)
+        said = [
+            f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
+            "default one, a companion fits better than anywhere inside"
+        ]
+    return result, noise, said
+
+
+def _different_targets(parts: list[Observables]) -> list[str]:
+    names = dict.fromkeys(s.target for p in parts for s in p.setups if s.target)
+    if len(names) < 2:
+        return []
+    return [f"targets of different names are fitted as one: {', '.join(names)}"]
 
 
 def _read(path: str | Path, options: SearchOptions) -> Observables:
@@ -306,22 +333,26 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
 
 def _weigh(
     result: SearchResult,
-    noise: ExtraNoise,
     options: SearchOptions,
     rng: np.random.Generator,
     executor: Executor | None,
     progress: Progress | None,
 ) -> Significance:
+    """Weigh the search; unless errors are to be trusted, by a statistic free of their scale.
+
+    Whether noise was added depends on the data, and a false companion can hide that it
+    should have been: a statistic that does not know the scale needs no such decision.
+    """
     bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
     residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
-    statistic = float(bank_statistic(bank, residuals, free_scale=noise.any)[0])
+    statistic = float(bank_statistic(bank, residuals, free_scale=options.extra_noise)[0])
     return significance(
         bank,
         statistic,
         options.null_draws,
         rng,
         options.alpha,
-        free_scale=noise.any,
+        free_scale=options.extra_noise,
         executor=executor,
         progress=progress,
     )
@@ -334,8 +365,7 @@ def _warnings(
     weight: Significance | None,
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
-    outside = look_outside(result)
-    found = [*([outside] if outside else []), *result.warnings, *observables.notes]
+    found = [*result.warnings, *observables.notes]
     if noise.any:
         found.append(
             f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "
@@ -348,7 +378,12 @@ def _warnings(
             "errors are too small or the model is incomplete, and significance and errors are "
             "too optimistic"
         )
-    if weight is not None and weight.tail is not None:
+    if weight is not None and weight.detected is None:
+        found.append(
+            f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
+            f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
+        )
+    elif weight is not None and weight.tail is not None:
         found.append(
             f"none or few of the {weight.n_draws} null draws reach the observed statistic: the "
             f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "

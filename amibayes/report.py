@@ -225,7 +225,9 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
         f"{len(result.grid)} positions",
         _verdict(report),
-        f"best fit    {c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
+        "best fit    no companion improves the fit"
+        if c.contrast <= 0.0
+        else f"best fit    {c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
         f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
         f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)",
         f"contrast    {c.contrast:.5f} +/- {c.contrast_error:.5f} "
@@ -252,6 +254,8 @@ def _verdict(report: SearchReport) -> str:
     weight = report.significance
     if weight is None:
         return "companion   not judged: no false-alarm probability was asked for"
+    if weight.detected is None:
+        return f"companion   not judged: {weight.n_draws} null draws are too few"
     low, high = weight.interval
     chance = f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g})"
     verdict = "DETECTED" if weight.detected else "not detected"

@@ -14,6 +14,7 @@ from helpers import niriss, simulated
 from amibayes.cli import main
 from amibayes.oifits import read_oifits, write_oifits
 
+RESULT = "result.json"
 TRUTH = [110.0, -75.0, 0.02]
 
 
@@ -188,9 +189,36 @@ def test_folder_that_cannot_be_made(target, tmp_path, capsys) -> None:
     assert "cannot be made a folder" in error_of(capsys)
 
 
-def test_companion_outside_the_default_field_is_pointed_out(data: Path, tmp_path, capsys) -> None:
+def test_default_field_is_widened_to_a_companion_outside_it(data: Path, tmp_path, capsys) -> None:
     path = data / "oifits" / "axcir_pionier.oifits"
     assert run(path, *FAST, "--out", tmp_path / "out", "--json") == 0
     result = json.loads(capsys.readouterr().out)
-    assert any("28.9 mas, outside the field" in w for w in result["warnings"])
+    assert any("field was widened" in w and "28.9 mas" in w for w in result["warnings"])
+    assert result["fit"]["separation_mas"] == pytest.approx(29.2, abs=0.1)
     assert result["fit"]["diameter_mas"] > 0.5
+
+
+def test_too_few_null_draws_say_nothing(target, tmp_path, capsys) -> None:
+    words = (target, "--separation", "50:400", "--null-draws", 100, "--no-posterior", "--json")
+    assert run(*words, "--out", tmp_path / "out") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["significance"]["detected"] is None
+    assert any("100 null draws cannot tell" in w for w in result["warnings"])
+
+
+def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    other = tmp_path / "other.oifits"
+    write_oifits(other, simulated(niriss(), TRUTH, np.random.default_rng(99)))
+    assert run(target, "--separation", "50:400", "--null-draws", 1000, "--out", out) == 0
+    capsys.readouterr()
+    assert run(other, *FAST, "--out", out, "--resume") == 2
+    assert "result of other data" in error_of(capsys)
+    assert run(other, *FAST, "--out", out, "--overwrite", "--quiet") == 0
+    left = sorted(p.name for p in out.iterdir())
+    assert left == ["correlation.png", "coverage.png", "fit.png", "map.png", "maps.fits", RESULT]
+
+
+def test_absurd_field_is_refused(target, tmp_path, capsys) -> None:
+    assert run(target, *FAST, "--separation", "1:100000000", "--out", tmp_path / "out") == 2
+    assert "positions between" in error_of(capsys)

@@ -1,6 +1,6 @@
 """Which way round the image is, and the hexagons: settled against images made elsewhere.
 
-The cubes are ami_sim's and MIRAGE's (see shared/data/README.md); nothing here made them.
+The cubes are ami_sim's and MIRAGE's (ImPlaneIA and others); nothing here made them.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def test_reads_what_is_in_the_file(made: HandMade, tmp_path: Path) -> None:
     np.testing.assert_allclose(data.closure_phase.value, made.phase_deg.ravel() * DEGREE)
     vis2_error, phase_error = data.errors
     np.testing.assert_allclose(vis2_error, made.vis2_error.ravel())
-    # The ridge of METHODS 6 reproduces errors to 1e-3 where baselines can.
+    # The ridge reproduces errors to 1e-3 where baselines can.
     assert phase_error.shape == (12,)
     np.testing.assert_array_equal(data.vis2.stations[::3] + 1, made.baselines)
     np.testing.assert_array_equal(data.closure_phase.stations[::3] + 1, made.triangles)

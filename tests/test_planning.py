@@ -136,7 +136,7 @@ def test_predicted_errors_are_those_of_simulated_fringe_fits() -> None:
 
 
 def test_photon_noise_curve_is_the_published_bound() -> None:
-    # METHODS: closure phases of the fringe fit, photon noise alone, 1e7 photons, 50-400 mas
+    # Closure phases of the fringe fit, photon noise alone, 1e7 photons, 50-400 mas
     bounds = {"F380M": (5.5, 7.2), "F430M": (5.3, 7.3), "F480M": (5.05, 7.4)}
     quiet = Detector(read_noise_e=0.0, dark_e_s=0.0, background_e_s=0.0)
     for name, (low, high) in bounds.items():

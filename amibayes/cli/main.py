@@ -77,6 +77,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(f"amibayes: {error}", file=sys.stderr)
         return error.exit_status
+    except MemoryError as error:
+        if getattr(arguments, "debug", False):
+            raise
+        print(f"amibayes: not enough memory: {error} (ask for less)", file=sys.stderr)
+        return 4
     except KeyboardInterrupt:
         print("amibayes: interrupted (run again with --resume to go on)", file=sys.stderr)
         return 4

@@ -100,19 +100,43 @@ def run(arguments: argparse.Namespace) -> int:
 
     options = _options(arguments)
     overwrite = arguments.overwrite or arguments.resume
-    folder = output_folder(arguments.out, _names(arguments, options), overwrite=overwrite)
+    names = _names(options, calibrated=bool(arguments.cal))
+    folder = output_folder(arguments.out, names, overwrite=overwrite)
+    if arguments.resume and not arguments.overwrite:
+        _refuse_other_data(folder / RESULT, [*arguments.targets, *arguments.cal])
     report = _search(arguments, options, folder)
+    for stale in set(_names(type(options)(), calibrated=True)) - set(names):
+        (folder / stale).unlink(missing_ok=True)
     _write(report, folder)
     common.finish(arguments, _json(report), lambda: _summary(report, folder))
     return 0
 
 
-def _names(arguments: argparse.Namespace, options: SearchOptions) -> list[str]:
+def _names(options: SearchOptions, *, calibrated: bool) -> list[str]:
+    """List the files of a run."""
     from amibayes.pictures import picture_names
 
-    names = [RESULT, *picture_names(options, calibrated=bool(arguments.cal))]
+    names = [RESULT, *picture_names(options, calibrated=calibrated)]
     names += [CHAIN] if options.posterior else []
-    return [*names, CALIBRATED] if arguments.cal else names
+    return [*names, CALIBRATED] if calibrated else names
+
+
+def _refuse_other_data(path: Path, inputs: list[str]) -> None:
+    """Refuse to go on in a folder whose result is that of other files."""
+    import json
+
+    from amibayes.files import sha256
+
+    if not path.is_file():
+        return
+    try:
+        before = {entry["sha256"] for entry in json.loads(path.read_text())["inputs"]}
+    except (ValueError, KeyError, TypeError):
+        before = set()
+    if before != {sha256(p) for p in inputs if Path(p).is_file()}:
+        raise UsageError(
+            "is the result of other data", source=path, remedy="give --overwrite or another --out"
+        )
 
 
 def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path) -> SearchReport:

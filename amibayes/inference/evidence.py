@@ -162,8 +162,12 @@ def _weigh(
 ) -> tuple[float, float, str]:
     """(ln Z, error, method) of one model."""
     none = single_likelihood(result.likelihood)
-    likelihood = none if companions == 0 else two.likelihood if two and companions == 2 else (
-        result.likelihood
+    likelihood = (
+        none
+        if companions == 0
+        else two.likelihood
+        if two and companions == 2
+        else (result.likelihood)
     )
     if companions == 0 and (method != "nested" or not none.parameters):
         return log_evidence_none(result.likelihood, prior), GRID_ERROR, "quadrature"
@@ -276,8 +280,11 @@ class _Gaussians:
         self.companions = likelihood.model.companions + n_free
         self.prior, self.n_free = prior, n_free
         fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
-        at_peak = [likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
-                   + np.log(np.abs(np.linalg.det(s))) for c, s in fits]
+        at_peak = [
+            likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
+            + np.log(np.abs(np.linalg.det(s)))
+            for c, s in fits
+        ]
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
         self.weight = weight / weight.sum()
@@ -285,9 +292,7 @@ class _Gaussians:
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         counts = rng.multinomial(n, self.weight)
-        x = np.concatenate(
-            [t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)]
-        )
+        x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
         if not self.n_free:
             return x
         free = sampled(self.prior.draw(rng, n, 1), 1)[:, :3]

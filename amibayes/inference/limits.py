@@ -19,7 +19,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolution_mas
-from amibayes.inference.significance import Significance
+from amibayes.inference.significance import Significance, profiled
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray, contrast_to_delta_mag, offset
@@ -113,7 +113,7 @@ def detection_limit(
     bank = TemplateBank(likelihood, result.grid, result.single_theta)
     threshold = significance.threshold()
     rho = np.linspace(result.grid.inner_mas, result.grid.outer_mas, n_separations + 2)[1:-1]
-    half = _linear_half(result, rho, threshold)
+    half = _linear_half(result, rho, _gain_at(significance, bank))
     level = half[:, None] * np.geomspace(*LEVELS, N_LEVELS)
     shape = (n_separations, N_LEVELS, trials_per_cell)
     angle = rng.uniform(0.0, 360.0, shape)
@@ -127,6 +127,7 @@ def detection_limit(
         theta,
         threshold,
         rng,
+        free_scale=significance.free_scale,
         executor=executor,
         progress=progress,
     ).reshape(shape)
@@ -157,6 +158,7 @@ def recover(
     threshold: float,
     rng: np.random.Generator,
     *,
+    free_scale: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> BoolArray:
@@ -171,8 +173,10 @@ def recover(
     theta : (n, 3) float array
         east_mas, north_mas, contrast of each trial.
     threshold : float
-        Gain in χ² that counts as a detection.
+        Statistic that counts as a detection.
     rng : numpy.random.Generator
+    free_scale : bool
+        The statistic is `profiled`, else the gain in χ².
     executor : Executor, optional
         Where it is computed; the result does not depend on it.
     progress : callable, optional
@@ -184,7 +188,7 @@ def recover(
     """
     parts = slices(len(theta), TRIALS_AT_ONCE)
     pieces = [(theta[p], seed) for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)]
-    work = partial(_recover_piece, likelihood, bank, single, threshold)
+    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale)
     return np.concatenate(
         list(run_job(work, pieces, executor or SerialExecutor(), progress=progress))
     )
@@ -195,12 +199,16 @@ def _recover_piece(
     bank: TemplateBank,
     single: FloatArray,
     threshold: float,
+    free_scale: bool,
     piece: tuple[FloatArray, np.random.SeedSequence],
 ) -> BoolArray:
     theta, seed = piece
     signal = injected_signal(likelihood, single, theta)
     noise = np.random.default_rng(seed).standard_normal(signal.shape)
-    gain, position = bank.largest_gain(bank.project(signal + noise).astype(np.float32))
+    data = bank.project(signal + noise)
+    gain, position = bank.largest_gain(data.astype(np.float32))
+    if free_scale:
+        gain = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
     east, north = bank.grid.east_mas[position], bank.grid.north_mas[position]
     away = np.hypot(east - theta[:, 0], north - theta[:, 1])
     near = away < 0.5 * resolution_mas(likelihood)
@@ -224,6 +232,12 @@ def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArra
     return likelihood.observables.covariance.whiten(change)
 
 
+def _gain_at(significance: Significance, bank: TemplateBank) -> float:
+    """Gain in χ² that reaches the threshold, if the rest of χ² is its expectation."""
+    threshold, n = significance.threshold(), bank.n_data - bank.n_nuisance
+    return float(n * np.expm1(threshold / n)) if significance.free_scale else threshold
+
+
 def _linear_half(result: SearchResult, rho: FloatArray, threshold: float) -> FloatArray:
     """Contrast whose expected statistic equals the threshold, median over the azimuth."""
     distance = np.hypot(result.grid.east_mas, result.grid.north_mas)
@@ -235,6 +249,7 @@ def _linear_half(result: SearchResult, rho: FloatArray, threshold: float) -> Flo
 def _inside(log_contrast: FloatArray, level: FloatArray) -> FloatArray:
     """Contrasts that the injections bracket; NaN for what would be extrapolated."""
     bracketed = log_contrast <= np.log(np.minimum(level[:, -1], 1.0))
+    bracketed &= log_contrast >= np.log(level[:, 0])
     return np.exp(np.where(bracketed, log_contrast, np.nan))
 
 

@@ -172,15 +172,32 @@ def search_with_noise(
     noise : ExtraNoise
         None (zeros) where the stated errors explain the residuals.
     """
-    result = search(likelihood, separation_mas)
-    noise = ExtraNoise()
-    for _ in range(MOST_ROUNDS):
+    result, noise = search(likelihood, separation_mas), ExtraNoise()
+    tried = [(_score(result), result, noise)]
+    settled = False
+    while not settled and len(tried) <= MOST_ROUNDS:
         before, noise = noise, fit_noise(likelihood, result.theta)
-        if _same(before, noise):
-            break
-        noisy = Likelihood(add_noise(likelihood.observables, noise), likelihood.model)
-        result = search(noisy, separation_mas)
-    return result, noise
+        settled = _same(before, noise)
+        if not settled:
+            noisy = Likelihood(add_noise(likelihood.observables, noise), likelihood.model)
+            result = search(noisy, separation_mas)
+            tried.append((_score(result), result, noise))
+    if settled:
+        return tried[-1][1], tried[-1][2]
+    # Noise and position chase each other: the most likely pair of those tried stands.
+    _, result, noise = min(tried, key=lambda t: t[0])
+    return replace(result, warnings=(*result.warnings, UNSETTLED)), noise
+
+
+UNSETTLED = (
+    "companion and extra noise do not settle: the data fit neither, and the most likely of the "
+    "pairs tried is given"
+)
+
+
+def _score(result: SearchResult) -> float:
+    """−2 ln L of a best fit, up to a constant of the data."""
+    return result.chi2_binary + result.likelihood.observables.covariance.logdet()
 
 
 def _same(a: ExtraNoise, b: ExtraNoise) -> bool:

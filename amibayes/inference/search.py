@@ -26,8 +26,11 @@ FEWEST_SEEDS, MOST_SEEDS = 5, 24
 MODE_LIMIT = 25.0
 """Modes within this Δχ² of the best one are left standing."""
 
-MOST_POSITIONS = 40_000
+MOST_LOOKED_AT = 40_000
 """Positions of the look around the field."""
+
+MOST_POSITIONS = 2_000_000
+"""Positions of a search: more would take hours and all the memory."""
 
 BRIGHT = 0.1
 """Above this contrast the templates are no longer linear enough to rank positions."""
@@ -38,7 +41,8 @@ BRIGHT_CONTRASTS = (0.15, 0.3, 0.6, 1.0)
 def default_separation(likelihood: Likelihood) -> tuple[float, float]:
     """Range of separations the data can see: λ/2B_max to λ/B_min, mas."""
     frequency = likelihood.samples.frequency
-    return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
+    with np.errstate(divide="ignore"):
+        return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
 
 
 def resolution_mas(likelihood: Likelihood) -> float:
@@ -46,20 +50,26 @@ def resolution_mas(likelihood: Likelihood) -> float:
     return float(1.0 / likelihood.samples.frequency.max() / MAS)
 
 
-def look_outside(result: SearchResult) -> str:
-    """Say where outside the field a companion would fit much better; empty where nowhere.
+def look_outside(result: SearchResult) -> float | None:
+    """Find where outside the field a companion would fit much better.
 
     The scan reaches to where the width of the channels smears a companion out, or as far
-    as `MOST_POSITIONS` positions go. It is coarse: half the field's sampling.
+    as `MOST_LOOKED_AT` positions go. It is coarse: half the field's sampling.
+
+    Returns
+    -------
+    float or None
+        Its separation in mas; None where nothing outside is better.
     """
     likelihood, grid = result.likelihood, result.grid
     smallest_band = float(likelihood.samples.relative_band.min())
     reach = resolution_mas(likelihood) / max(smallest_band, 1e-6)
     step = 2.0 * grid.step_mas
-    farthest = min(reach, float(np.hypot(grid.outer_mas, step * np.sqrt(MOST_POSITIONS / np.pi))))
+    area = MOST_LOOKED_AT / np.pi
+    farthest = min(reach, float(np.hypot(grid.outer_mas, step * np.sqrt(area))))
     around = make_grid(grid.outer_mas, farthest, step)
     if not len(around):
-        return ""
+        return None
     bank = TemplateBank(likelihood, around, result.single_theta)
     residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
     contrast, sigma = bank.scan(residuals)
@@ -67,12 +77,8 @@ def look_outside(result: SearchResult) -> str:
     inside = float(result.bank_delta_chi2.max())
     best = int(gain.argmax())
     if gain[best] < inside + max(MODE_LIMIT, 0.1 * inside):
-        return ""
-    place = float(np.hypot(around.east_mas[best], around.north_mas[best]))
-    return (
-        f"a companion near {place:.1f} mas, outside the field, fits better by Δχ² "
-        f"{gain[best] - inside:.0f}: search with a wider --separation"
-    )
+        return None
+    return float(np.hypot(around.east_mas[best], around.north_mas[best]))
 
 
 def resolves_stars(likelihood: Likelihood) -> bool:
@@ -114,7 +120,9 @@ def search(
         )
     inner, outer = separation_mas or default_separation(likelihood)
     fringe = resolution_mas(likelihood)
-    grid = make_grid(inner, outer, fringe / GRID_STEPS_PER_FRINGE)
+    step = fringe / GRID_STEPS_PER_FRINGE
+    _refuse_huge(inner, outer, step, likelihood.observables.source)
+    grid = make_grid(inner, outer, step)
     if not len(grid):
         raise UsageError(
             f"no position between {inner:g} and {outer:g} mas on a grid of {grid.step_mas:.3g} mas",
@@ -131,7 +139,9 @@ def search(
     check = global_check(likelihood, bank, box, single, chi2_single)
     modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
     theta = np.array(modes[0].theta)
-    covariance = likelihood.errors(theta)
+    # Without a companion there is nothing whose errors could be told.
+    absent = theta[2] <= 0.0
+    covariance = np.full((len(theta),) * 2, np.nan) if absent else likelihood.errors(theta)
     return SearchResult(
         likelihood=likelihood,
         companion=companion_of(theta, covariance),
@@ -148,6 +158,22 @@ def search(
         global_check=check,
         warnings=_doubts(modes, aliases, found, check),
     )
+
+
+def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
+    if not np.isfinite([inner, outer, step]).all():
+        raise DataError(
+            "has baselines of zero or infinite length",
+            source=source,
+            remedy="check UCOORD and VCOORD",
+        )
+    positions = np.pi * (outer**2 - inner**2) / step**2
+    if positions > MOST_POSITIONS:
+        raise UsageError(
+            f"{positions:.2g} positions between {inner:.4g} and {outer:.4g} mas",
+            source="--separation",
+            remedy=f"narrow the range: at most {MOST_POSITIONS:.0e} are searched",
+        )
 
 
 def _seeds(
@@ -269,11 +295,15 @@ def _doubts(
             f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
         )
     if aliases:
-        far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in aliases)
-        doubts.append(
-            f"these baselines cannot tell the position from its alias(es) at {far} mas: "
-            "the innermost is reported"
-        )
+        opposite = [m for m in aliases if np.hypot(*np.add(m.theta[:2], modes[0].theta[:2])) < 1e-2]
+        far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite)
+        if opposite:
+            doubts.append("without closure phases a position cannot be told from its opposite")
+        if far:
+            doubts.append(
+                f"these baselines cannot tell the position from its alias(es) at {far} mas: "
+                "the innermost is reported"
+            )
     rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
     if rivals:
         doubts.append(f"{len(rivals)} other position(s) fit within Δχ² 9: it is not unique")

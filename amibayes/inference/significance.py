@@ -70,6 +70,8 @@ class Significance:
         Extrapolation, where the draws reach no further (fewer than 10 at least as large).
     alpha : float
         Detection means ``probability`` < ``alpha``.
+    free_scale : bool
+        The statistic is that of `profiled`: the size of the noise is not taken on trust.
     """
 
     statistic: float
@@ -78,6 +80,7 @@ class Significance:
     interval: tuple[float, float]
     tail: Tail | None
     alpha: float
+    free_scale: bool = False
 
     @property
     def n_draws(self) -> int:
@@ -85,8 +88,10 @@ class Significance:
         return len(self.null)
 
     @property
-    def detected(self) -> bool:
-        """Whether the false-alarm probability is below alpha."""
+    def detected(self) -> bool | None:
+        """Whether the false-alarm probability is below alpha; None where too few were drawn."""
+        if 1.0 / (1.0 + self.n_draws) >= self.alpha:
+            return None
         return self.probability < self.alpha
 
     def threshold(self, alpha: float | None = None) -> float:
@@ -204,6 +209,7 @@ def significance(
         clopper_pearson(above, n_draws),
         tail,
         alpha,
+        free_scale,
     )
 
 
