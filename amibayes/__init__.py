@@ -16,9 +16,12 @@ if TYPE_CHECKING:
     from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.inference.bank import TemplateBank
+    from amibayes.inference.evidence import Evidence, weigh_models
+    from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
     from amibayes.inference.likelihood import Likelihood
     from amibayes.inference.limits import DetectionLimit, detection_limit
     from amibayes.inference.model import BinaryModel
+    from amibayes.inference.multiplicity import TwoCompanions, search_second
     from amibayes.inference.posterior import Posterior, sample
     from amibayes.inference.priors import Prior
     from amibayes.inference.results import Companion, SearchResult
@@ -53,8 +56,10 @@ _HOME = {
     "DataError": "amibayes.errors",
     "DetectionLimit": "amibayes.inference.limits",
     "Detector": "amibayes.simulation",
+    "Evidence": "amibayes.inference.evidence",
     "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
+    "GridPosterior": "amibayes.inference.grid_posterior",
     "Instrument": "amibayes.instrument",
     "Likelihood": "amibayes.inference.likelihood",
     "OIFits": "amibayes.oifits",
@@ -72,12 +77,14 @@ _HOME = {
     "SearchResult": "amibayes.inference.results",
     "Significance": "amibayes.inference.significance",
     "TemplateBank": "amibayes.inference.bank",
+    "TwoCompanions": "amibayes.inference.multiplicity",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
     "calibrate": "amibayes.calibration",
     "detection_limit": "amibayes.inference.limits",
     "expect": "amibayes.planning",
     "fringe_basis": "amibayes.optics",
+    "grid_posterior": "amibayes.inference.grid_posterior",
     "instrument_names": "amibayes.instrument",
     "join": "amibayes.observables",
     "load_instrument": "amibayes.instrument",
@@ -94,9 +101,11 @@ _HOME = {
     "sample": "amibayes.inference.posterior",
     "scene_image": "amibayes.optics",
     "search": "amibayes.inference.search",
+    "search_second": "amibayes.inference.multiplicity",
     "search_companion": "amibayes.pipeline",
     "significance": "amibayes.inference.significance",
     "simulate": "amibayes.simulation",
+    "weigh_models": "amibayes.inference.evidence",
     "write_cube": "amibayes.cube",
     "write_oifits": "amibayes.oifits",
 }
@@ -110,8 +119,10 @@ __all__ = [
     "DataError",
     "DetectionLimit",
     "Detector",
+    "Evidence",
     "Exposure",
     "FringeBasis",
+    "GridPosterior",
     "Instrument",
     "Likelihood",
     "OIFits",
@@ -129,6 +140,7 @@ __all__ = [
     "SearchResult",
     "Significance",
     "TemplateBank",
+    "TwoCompanions",
     "UsageError",
     "Wavefront",
     "__version__",
@@ -136,6 +148,7 @@ __all__ = [
     "detection_limit",
     "expect",
     "fringe_basis",
+    "grid_posterior",
     "instrument_names",
     "join",
     "load_instrument",
@@ -153,8 +166,10 @@ __all__ = [
     "scene_image",
     "search",
     "search_companion",
+    "search_second",
     "significance",
     "simulate",
+    "weigh_models",
     "write_cube",
     "write_oifits",
 ]

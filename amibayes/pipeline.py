@@ -15,12 +15,16 @@ from threadpoolctl import threadpool_limits
 from amibayes.calibration import Calibration, Method, calibrate
 from amibayes.errors import DataError, UsageError
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.evidence import Evidence, weigh_models
+from amibayes.inference.evidence import Method as EvidenceMethod
+from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
+from amibayes.inference.multiplicity import search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
 from amibayes.inference.posterior import Posterior, modes_to_sample, sample
-from amibayes.inference.priors import default_prior
+from amibayes.inference.priors import Prior, PriorSetting, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
@@ -67,6 +71,13 @@ class SearchOptions:
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
+    companions : tuple of int, optional
+        Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
+        where the posterior is sampled.
+    evidence_method : {"direct", "laplace", "nested"}
+        See `amibayes.inference.evidence`.
+    prior : tuple of PriorSetting
+        Changes of the default prior.
     seed : int
     """
 
@@ -86,6 +97,9 @@ class SearchOptions:
     extra_noise: bool = True
     posterior: bool = True
     limits: bool = True
+    companions: tuple[int, ...] | None = None
+    evidence_method: EvidenceMethod = "direct"
+    prior: tuple[PriorSetting, ...] = ()
     seed: int = 1
 
 
@@ -106,6 +120,8 @@ class SearchReport:
     posterior: Posterior | None
     limits: DetectionLimit | None
     warnings: tuple[str, ...]
+    grid: GridPosterior | None = None
+    evidence: Evidence | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -170,7 +186,7 @@ def search_companion(
     options = options or SearchOptions()
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
-    streams = np.random.SeedSequence(options.seed).spawn(4)
+    streams = np.random.SeedSequence(options.seed).spawn(5)
     clock = _Clock(announce)
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
@@ -213,16 +229,32 @@ def search_companion(
                 weight = _weigh(
                     result, noise, options, np.random.default_rng(streams[0]), executor, progress
                 )
-        posterior = None
+        prior, counts = _prior(result, options), _counts(options)
+        grid, evidence, posterior = None, None, None
+        if (options.posterior or counts) and affordable(likelihood, prior):
+            with clock.stage("integrate"):
+                grid = grid_posterior(likelihood, prior)
         if options.posterior:
             with clock.stage("posterior"):
                 posterior = sample(
                     result,
-                    default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas),
+                    prior,
                     np.random.default_rng(streams[1]),
                     path=chain,
                     resume=resume,
+                    grid=grid,
                     progress=progress,
+                )
+        if counts:
+            with clock.stage("evidence"):
+                evidence = weigh_models(
+                    result,
+                    prior,
+                    np.random.default_rng(streams[4]),
+                    companions=counts,
+                    grid=grid,
+                    two=search_second(result) if 2 in counts else None,
+                    method=options.evidence_method,
                 )
         limits = None
         if options.limits and weight is not None:
@@ -248,6 +280,8 @@ def search_companion(
         posterior,
         limits,
         (*_vetting_warnings(vetting), *_warnings(observables, result, noise, weight, posterior)),
+        grid,
+        evidence,
         clock.seconds,
     )
 
@@ -298,6 +332,18 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
     if diameter is None:
         diameter = "free" if resolves_stars(likelihood) else 0.0
     return BinaryModel(1, diameter, options.background, options.smearing)
+
+
+def _prior(result: SearchResult, options: SearchOptions) -> Prior:
+    prior = default_prior(result.likelihood, result.grid.inner_mas, result.grid.outer_mas)
+    return edit_prior(prior, options.prior, result.likelihood.parameters[3:])
+
+
+def _counts(options: SearchOptions) -> tuple[int, ...]:
+    """Numbers of companions to compare."""
+    if options.companions is None:
+        return (0, 1) if options.posterior else ()
+    return options.companions
 
 
 def _weigh(
@@ -355,7 +401,7 @@ def _warnings(
         if share < 0.99 and len(modes_to_sample(result)) == 1:
             found.append(
                 f"the posterior is that of the reported position, whose probability among "
-                f"{len(posterior.mode_probability)} modes is {share:.2f} (Laplace)"
+                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
         found.append(

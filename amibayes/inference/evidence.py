@@ -74,6 +74,7 @@ class Evidence:
         Of over-resolved light instead of a companion; NaN where the light is in every model.
     two : TwoCompanions or None
         The joint fit, where two were asked for.
+    nuisance_names : tuple of str
     """
 
     companions: tuple[int, ...]
@@ -84,6 +85,7 @@ class Evidence:
     model_prior: tuple[float, ...]
     halo_log_z: float = float("nan")
     two: TwoCompanions | None = None
+    nuisance_names: tuple[str, ...] = ()
 
     @property
     def probability(self) -> FloatArray:
@@ -148,7 +150,8 @@ def weigh_models(
     log_z, error, how = zip(*found, strict=True)
     halo = log_evidence_halo(result.likelihood, prior)
     shares = tuple(float(w) for w in weights / weights.sum())
-    return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two)
+    names = result.likelihood.parameters[3:]
+    return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two, names)
 
 
 def _weigh(
@@ -162,8 +165,12 @@ def _weigh(
 ) -> tuple[float, float, str]:
     """(ln Z, error, method) of one model."""
     none = single_likelihood(result.likelihood)
-    likelihood = none if companions == 0 else two.likelihood if two and companions == 2 else (
-        result.likelihood
+    likelihood = (
+        none
+        if companions == 0
+        else two.likelihood
+        if two and companions == 2
+        else (result.likelihood)
     )
     if companions == 0 and (method != "nested" or not none.parameters):
         return log_evidence_none(result.likelihood, prior), GRID_ERROR, "quadrature"
@@ -276,8 +283,11 @@ class _Gaussians:
         self.companions = likelihood.model.companions + n_free
         self.prior, self.n_free = prior, n_free
         fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
-        at_peak = [likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
-                   + np.log(np.abs(np.linalg.det(s))) for c, s in fits]
+        at_peak = [
+            likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
+            + np.log(np.abs(np.linalg.det(s)))
+            for c, s in fits
+        ]
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
         self.weight = weight / weight.sum()
@@ -285,9 +295,7 @@ class _Gaussians:
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         counts = rng.multinomial(n, self.weight)
-        x = np.concatenate(
-            [t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)]
-        )
+        x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
         if not self.n_free:
             return x
         free = sampled(self.prior.draw(rng, n, 1), 1)[:, :3]
@@ -297,10 +305,10 @@ class _Gaussians:
         if self.companions == 1:
             return self._ordered(x)
         swapped = x[:, np.r_[3:6, 0:3, 6 : x.shape[1]]]
-        return np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0)
+        return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
 
     def _ordered(self, x: FloatArray) -> FloatArray:
-        log = 0.0
+        log = np.zeros(len(x))
         if self.n_free:
             bare = replace(self.prior, nuisance=())
             log, x = bare.log_density(x[:, 3:6]), np.delete(x, np.s_[3:6], axis=1)
@@ -334,7 +342,7 @@ def log_evidence_nested(
         theta = prior.from_cube(cube[None])[0]
         # Both orders are one solution: the brighter one first, at the same evidence.
         swap = k == 2 and theta[5] > theta[2]
-        return theta[np.r_[3:6, 0:3, 6 : len(theta)]] if swap else theta
+        return np.asarray(theta[np.r_[3:6, 0:3, 6 : len(theta)]] if swap else theta)
 
     sampler = dynesty.NestedSampler(
         lambda theta: float(likelihood.log_prob(theta[None])[0]),
