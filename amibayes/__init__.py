@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.extraction import extract
     from amibayes.inference.bank import TemplateBank
+    from amibayes.inference.evidence import Evidence, weigh_models
+    from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
     from amibayes.inference.likelihood import Likelihood
     from amibayes.inference.limits import DetectionLimit, detection_limit
     from amibayes.inference.model import BinaryModel
+    from amibayes.inference.multiplicity import TwoCompanions, search_second
     from amibayes.inference.posterior import Posterior, sample
     from amibayes.inference.priors import Prior
     from amibayes.inference.results import Companion, SearchResult
@@ -54,8 +57,10 @@ _HOME = {
     "DataError": "amibayes.errors",
     "DetectionLimit": "amibayes.inference.limits",
     "Detector": "amibayes.simulation",
+    "Evidence": "amibayes.inference.evidence",
     "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
+    "GridPosterior": "amibayes.inference.grid_posterior",
     "Instrument": "amibayes.instrument",
     "Likelihood": "amibayes.inference.likelihood",
     "OIFits": "amibayes.oifits",
@@ -73,6 +78,7 @@ _HOME = {
     "SearchResult": "amibayes.inference.results",
     "Significance": "amibayes.inference.significance",
     "TemplateBank": "amibayes.inference.bank",
+    "TwoCompanions": "amibayes.inference.multiplicity",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
     "calibrate": "amibayes.calibration",
@@ -80,6 +86,7 @@ _HOME = {
     "expect": "amibayes.planning",
     "extract": "amibayes.extraction",
     "fringe_basis": "amibayes.optics",
+    "grid_posterior": "amibayes.inference.grid_posterior",
     "instrument_names": "amibayes.instrument",
     "join": "amibayes.observables",
     "load_instrument": "amibayes.instrument",
@@ -96,9 +103,11 @@ _HOME = {
     "sample": "amibayes.inference.posterior",
     "scene_image": "amibayes.optics",
     "search": "amibayes.inference.search",
+    "search_second": "amibayes.inference.multiplicity",
     "search_companion": "amibayes.pipeline",
     "significance": "amibayes.inference.significance",
     "simulate": "amibayes.simulation",
+    "weigh_models": "amibayes.inference.evidence",
     "write_cube": "amibayes.cube",
     "write_oifits": "amibayes.oifits",
 }
@@ -112,8 +121,10 @@ __all__ = [
     "DataError",
     "DetectionLimit",
     "Detector",
+    "Evidence",
     "Exposure",
     "FringeBasis",
+    "GridPosterior",
     "Instrument",
     "Likelihood",
     "OIFits",
@@ -131,6 +142,7 @@ __all__ = [
     "SearchResult",
     "Significance",
     "TemplateBank",
+    "TwoCompanions",
     "UsageError",
     "Wavefront",
     "__version__",
@@ -139,6 +151,7 @@ __all__ = [
     "expect",
     "extract",
     "fringe_basis",
+    "grid_posterior",
     "instrument_names",
     "join",
     "load_instrument",
@@ -156,8 +169,10 @@ __all__ = [
     "scene_image",
     "search",
     "search_companion",
+    "search_second",
     "significance",
     "simulate",
+    "weigh_models",
     "write_cube",
     "write_oifits",
 ]

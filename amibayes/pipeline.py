@@ -16,12 +16,16 @@ from amibayes.calibration import Calibration, Method, calibrate
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import ImageOptions, read_observations
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.evidence import Evidence, weigh_models
+from amibayes.inference.evidence import Method as EvidenceMethod
+from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
+from amibayes.inference.multiplicity import search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
 from amibayes.inference.posterior import Posterior, modes_to_sample, sample
-from amibayes.inference.priors import default_prior
+from amibayes.inference.priors import Prior, PriorSetting, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
@@ -67,6 +71,13 @@ class SearchOptions:
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
+    companions : tuple of int, optional
+        Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
+        where the posterior is sampled.
+    evidence_method : {"direct", "laplace", "nested"}
+        See `amibayes.inference.evidence`.
+    prior : tuple of PriorSetting
+        Changes of the default prior.
     seed : int
     images : ImageOptions, optional
         How image cubes are turned into observables.
@@ -88,6 +99,9 @@ class SearchOptions:
     extra_noise: bool = True
     posterior: bool = True
     limits: bool = True
+    companions: tuple[int, ...] | None = None
+    evidence_method: EvidenceMethod = "direct"
+    prior: tuple[PriorSetting, ...] = ()
     seed: int = 1
     images: ImageOptions | None = None
 
@@ -109,6 +123,8 @@ class SearchReport:
     posterior: Posterior | None
     limits: DetectionLimit | None
     warnings: tuple[str, ...]
+    grid: GridPosterior | None = None
+    evidence: Evidence | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -176,7 +192,7 @@ def search_companion(
     options = options or SearchOptions()
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
-    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(4)]
+    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(5)]
     clock = _Clock(announce)
     weight, posterior, limits = None, None, None
     # One BLAS thread: the same bits on every machine and for any number of workers.
@@ -192,14 +208,20 @@ def search_companion(
         if options.null_draws:
             with clock.stage("significance"):
                 weight = _weigh(result, options, streams[0], executor, progress)
+        prior = _prior(result, options)
+        grid = _integrated(result, prior, options, clock)
         if options.posterior:
             with clock.stage("posterior"):
-                prior = default_prior(
-                    result.likelihood, result.grid.inner_mas, result.grid.outer_mas
-                )
                 posterior = sample(
-                    result, prior, streams[1], path=chain, resume=resume, progress=progress
+                    result,
+                    prior,
+                    streams[1],
+                    path=chain,
+                    resume=resume,
+                    grid=grid,
+                    progress=progress,
                 )
+        evidence = _compared(result, prior, grid, options, streams[4], clock)
         if options.limits and weight is not None:
             with clock.stage("limits"):
                 limits = detection_limit(
@@ -220,6 +242,8 @@ def search_companion(
         posterior,
         limits,
         (*said, *_warnings(observables, result, noise, weight, posterior)),
+        grid,
+        evidence,
         clock.seconds,
     )
 
@@ -331,6 +355,53 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
     return BinaryModel(1, diameter, options.background, options.smearing)
 
 
+def _prior(result: SearchResult, options: SearchOptions) -> Prior:
+    prior = default_prior(result.likelihood, result.grid.inner_mas, result.grid.outer_mas)
+    return edit_prior(prior, options.prior, result.likelihood.parameters[3:])
+
+
+def _integrated(
+    result: SearchResult, prior: Prior, options: SearchOptions, clock: _Clock
+) -> GridPosterior | None:
+    """Integrate the posterior over a grid where something needs it and it is cheap enough."""
+    wanted = options.posterior or _counts(options)
+    if not wanted or not affordable(result.likelihood, prior):
+        return None
+    with clock.stage("integrate"):
+        return grid_posterior(result.likelihood, prior)
+
+
+def _compared(
+    result: SearchResult,
+    prior: Prior,
+    grid: GridPosterior | None,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    clock: _Clock,
+) -> Evidence | None:
+    """Weigh the asked numbers of companions against each other."""
+    counts = _counts(options)
+    if not counts:
+        return None
+    with clock.stage("evidence"):
+        return weigh_models(
+            result,
+            prior,
+            rng,
+            companions=counts,
+            grid=grid,
+            two=search_second(result) if 2 in counts else None,
+            method=options.evidence_method,
+        )
+
+
+def _counts(options: SearchOptions) -> tuple[int, ...]:
+    """Numbers of companions to compare."""
+    if options.companions is None:
+        return (0, 1) if options.posterior else ()
+    return options.companions
+
+
 def _weigh(
     result: SearchResult,
     options: SearchOptions,
@@ -394,7 +465,7 @@ def _warnings(
         if share < 0.99 and len(modes_to_sample(result)) == 1:
             found.append(
                 f"the posterior is that of the reported position, whose probability among "
-                f"{len(posterior.mode_probability)} modes is {share:.2f} (Laplace)"
+                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
         found.append(

@@ -10,8 +10,11 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.files import sha256
+from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
 from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.multiplicity import TwoCompanions
 from amibayes.inference.posterior import Posterior
+from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.significance import Significance
 from amibayes.pipeline import SearchReport, calibrator_verdicts
@@ -45,14 +48,14 @@ def result_json(report: SearchReport) -> Json:
         "fit": _fit(result),
         "significance": _significance(result, report.significance, report.options.alpha),
         "modes": _modes(report),
-        "posterior": None if report.posterior is None else _posterior(report.posterior),
+        "posterior": None if report.posterior is None else _posterior(report, report.posterior),
         "calibration": _calibration(report),
         "limits": None if report.limits is None else limits_json(report.limits),
         "noise": {
             "extra_vis2": report.noise.vis2,
             "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
         },
-        "evidence": None,
+        "evidence": None if report.evidence is None else evidence_json(report.evidence),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
     }
@@ -94,6 +97,14 @@ def _fit(result: SearchResult) -> Json:
 
 
 def _errors(c: Companion, result: SearchResult) -> Json:
+    errors = companion_errors(c)
+    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
+        errors[name] = number(np.sqrt(result.theta_covariance[k, k]))
+    return errors
+
+
+def companion_errors(c: Companion) -> Json:
+    """1σ errors of a companion by the names of its quantities."""
     errors = {
         "separation_mas": c.separation_error_mas,
         "position_angle_deg": c.position_angle_error_deg,
@@ -102,8 +113,6 @@ def _errors(c: Companion, result: SearchResult) -> Json:
         "east_mas": c.east_error_mas,
         "north_mas": c.north_error_mas,
     }
-    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
-        errors[name] = float(np.sqrt(result.theta_covariance[k, k]))
     return {name: number(value) for name, value in errors.items()}
 
 
@@ -155,7 +164,7 @@ def _mode(mode: Mode) -> Json:
     }
 
 
-def _posterior(posterior: Posterior) -> Json:
+def _posterior(report: SearchReport, posterior: Posterior) -> Json:
     names = [*QUANTITIES, *posterior.names[3:]]
     out: Json = {}
     for name in names:
@@ -176,11 +185,77 @@ def _posterior(posterior: Posterior) -> Json:
         "acceptance": posterior.acceptance,
         "split_rhat": number(posterior.split_rhat),
         "converged": posterior.converged,
-        "prior": {
-            "separation_mas": [posterior.prior.inner_mas, posterior.prior.outer_mas],
-            "contrast": [posterior.prior.contrast_min, posterior.prior.contrast_max],
-            "form": "uniform in area, log-uniform in contrast",
+        "convergence": {
+            name: {key: number(value) for key, value in line.items()}
+            for name, line in posterior.convergence().items()
         },
+        "mode_method": posterior.mode_method,
+        "probability_elsewhere": number(posterior.elsewhere),
+        "upper_limit": upper_limit(report),
+        "prior": prior_json(posterior.prior, posterior.names[3:]),
+    }
+
+
+def prior_json(prior: Prior, nuisance: tuple[str, ...]) -> Json:
+    """State a prior: ranges, forms, and the uniform ranges of the nuisance parameters."""
+    return {
+        "separation_mas": [prior.inner_mas, prior.outer_mas],
+        "contrast": [prior.contrast_min, prior.contrast_max],
+        "form": prior.description,
+    } | {name: list(range_) for name, range_ in zip(nuisance, prior.nuisance, strict=True)}
+
+
+def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
+    """Contrast below which a companion is, where none was detected; null where one was.
+
+    At the stated prior, and with a contrast uniform in the same range, which unlike a
+    log-uniform one does not depend on its lower end.
+    """
+    weight, posterior, grid = report.significance, report.posterior, report.grid
+    if posterior is None or (weight is not None and weight.detected):
+        return None
+    if grid is None:
+        contrast, uniform = float(np.quantile(posterior.column("contrast"), level)), math.nan
+    else:
+        contrast, uniform = grid.upper_limit(level), grid.upper_limit(level, uniform=True)
+    return {
+        "level": level,
+        "contrast": contrast,
+        "delta_mag": float(contrast_to_delta_mag(contrast)),
+        "contrast_uniform_prior": number(uniform),
+        "method": "chain" if grid is None else "grid",
+    }
+
+
+def evidence_json(evidence: Evidence) -> Json:
+    """Build the content of ``evidence`` in ``result.json``."""
+    names = evidence.nuisance_names
+    return {
+        "companions": list(evidence.companions),
+        "log_z": list(evidence.log_z),
+        "log_z_error": [number(x) for x in evidence.log_z_error],
+        "method": list(evidence.method),
+        "probability": [float(x) for x in evidence.probability],
+        "model_prior": list(evidence.model_prior),
+        "prior": prior_json(evidence.prior, names),
+        "halo": {
+            "log_z": number(evidence.halo_log_z),
+            "background": [0.0, HALO_BACKGROUND],
+        },
+        "two_companions": None if evidence.two is None else _two(evidence.two),
+    }
+
+
+def _two(two: TwoCompanions) -> Json:
+    """The joint fit of two companions, the brighter one first."""
+    return {
+        "chi2": two.chi2,
+        "ndof": two.likelihood.n_independent - len(two.theta),
+        "companions": [
+            {name: number(getattr(c, name)) for name in QUANTITIES}
+            | {"errors": companion_errors(c)}
+            for c in two.companions
+        ],
     }
 
 
@@ -241,6 +316,9 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     lines += _nuisance_lines(result)
     if report.posterior is not None:
         lines += _posterior_lines(report.posterior)
+    lines += _upper_limit_lines(report)
+    if report.evidence is not None:
+        lines += _evidence_lines(report.evidence)
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     room = 19 - len(lines)
@@ -281,6 +359,22 @@ def _limit_lines(limits: DetectionLimit) -> list[str]:
         f"{rho.max():.0f} mas ({limits.completeness:.0%} recovered, false-positive rate "
         f"{limits.false_positive_rate:.2g})"
     ]
+
+
+def _upper_limit_lines(report: SearchReport) -> list[str]:
+    limit = upper_limit(report) if report.significance is not None else None
+    if limit is None:
+        return []
+    return [
+        f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
+        f"({limit['level']:.0%}, anywhere in the field, {report.posterior.prior.description if report.posterior else ''})"
+    ]
+
+
+def _evidence_lines(evidence: Evidence) -> list[str]:
+    shares = zip(evidence.companions, evidence.log_z, evidence.probability, strict=True)
+    parts = [f"{k}: ln Z {z:.1f} ({p:.2g})" for k, z, p in shares]
+    return [f"evidence    companions (probability) {', '.join(parts)}"]
 
 
 def _posterior_lines(posterior: Posterior) -> list[str]:

@@ -15,6 +15,7 @@ from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
+    from amibayes.inference.priors import PriorSetting
     from amibayes.parallel import Executor
     from amibayes.parallel import Progress as Told
 
@@ -239,6 +240,24 @@ def observable_kinds(text: str) -> tuple[str, ...]:
     if not set(kinds) <= {"vis2", "cp"} or len(set(kinds)) != len(kinds):
         raise argparse.ArgumentTypeError(f"{text!r} is not vis2, cp or vis2,cp")
     return kinds
+
+
+def companion_counts(text: str) -> tuple[int, ...]:
+    """Parse ``0,1,2``: one or more of them, once each, in rising order."""
+    counts = text.split(",")
+    if not set(counts) <= {"0", "1", "2"} or len(set(counts)) != len(counts):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list out of 0,1,2")
+    return tuple(sorted(int(c) for c in counts))
+
+
+def prior_setting(text: str) -> PriorSetting:
+    """Parse ``NAME=[FORM:]LOW:HIGH`` or ``NAME=FORM``."""
+    from amibayes.inference.priors import parse_setting
+
+    try:
+        return parse_setting(text)
+    except UsageError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 class Progress:

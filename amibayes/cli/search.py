@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
     _add_model(parser.add_argument_group("model"))
+    _add_weighing(parser.add_argument_group("prior and evidence"))
     _add_data(parser.add_argument_group("data"))
     common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
@@ -66,6 +67,34 @@ def _add_model(group: argparse._ArgumentGroup) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="average the model over the width of each channel (default: yes)",
+    )
+
+
+def _add_weighing(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--prior",
+        action="append",
+        default=[],
+        type=common.prior_setting,
+        metavar="NAME=PRIOR",
+        help="contrast=LOW:HIGH, contrast=log-uniform|uniform, contrast=uniform:LOW:HIGH; "
+        "position=area|separation (uniform in area, or in separation and angle); "
+        "diameter=LOW:HIGH in mas or background=LOW:HIGH where they are free (uniform); may be "
+        "repeated (default: contrast=log-uniform:1e-5:1 position=area)",
+    )
+    group.add_argument(
+        "--companions",
+        type=common.companion_counts,
+        metavar="0,1,2",
+        help="numbers of companions whose evidences are compared; 2 looks for a second one and "
+        "fits both (default: 0,1 with the posterior)",
+    )
+    group.add_argument(
+        "--evidence-method",
+        choices=["direct", "laplace", "nested"],
+        default="direct",
+        help="integrate directly, or by Laplace's approximation, or by nested sampling with "
+        "dynesty (default: %(default)s)",
     )
 
 
@@ -179,6 +208,9 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         null_draws=arguments.null_draws,
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,
+        companions=arguments.companions,
+        evidence_method=arguments.evidence_method,
+        prior=tuple(arguments.prior),
         seed=arguments.seed,
         images=common.image_options_of(arguments),
     )

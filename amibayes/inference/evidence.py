@@ -74,6 +74,7 @@ class Evidence:
         Of over-resolved light instead of a companion; NaN where the light is in every model.
     two : TwoCompanions or None
         The joint fit, where two were asked for.
+    nuisance_names : tuple of str
     """
 
     companions: tuple[int, ...]
@@ -84,6 +85,7 @@ class Evidence:
     model_prior: tuple[float, ...]
     halo_log_z: float = float("nan")
     two: TwoCompanions | None = None
+    nuisance_names: tuple[str, ...] = ()
 
     @property
     def probability(self) -> FloatArray:
@@ -148,7 +150,8 @@ def weigh_models(
     log_z, error, how = zip(*found, strict=True)
     halo = log_evidence_halo(result.likelihood, prior)
     shares = tuple(float(w) for w in weights / weights.sum())
-    return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two)
+    names = result.likelihood.parameters[3:]
+    return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two, names)
 
 
 def _weigh(
@@ -302,10 +305,10 @@ class _Gaussians:
         if self.companions == 1:
             return self._ordered(x)
         swapped = x[:, np.r_[3:6, 0:3, 6 : x.shape[1]]]
-        return np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0)
+        return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
 
     def _ordered(self, x: FloatArray) -> FloatArray:
-        log = 0.0
+        log = np.zeros(len(x))
         if self.n_free:
             bare = replace(self.prior, nuisance=())
             log, x = bare.log_density(x[:, 3:6]), np.delete(x, np.s_[3:6], axis=1)
@@ -339,7 +342,7 @@ def log_evidence_nested(
         theta = prior.from_cube(cube[None])[0]
         # Both orders are one solution: the brighter one first, at the same evidence.
         swap = k == 2 and theta[5] > theta[2]
-        return theta[np.r_[3:6, 0:3, 6 : len(theta)]] if swap else theta
+        return np.asarray(theta[np.r_[3:6, 0:3, 6 : len(theta)]] if swap else theta)
 
     sampler = dynesty.NestedSampler(
         lambda theta: float(likelihood.log_prob(theta[None])[0]),

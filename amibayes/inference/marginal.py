@@ -46,10 +46,12 @@ class Marginal:
 
     def cdf(self, x: ArrayLike) -> FloatArray:
         """Probability of a smaller value, any shape."""
-        return np.asarray(np.interp(x, *self._knots, left=0.0, right=1.0))
+        return np.asarray(np.interp(np.asarray(x, dtype=float), *self._knots, left=0.0, right=1.0))
 
     def quantile(self, probability: ArrayLike) -> FloatArray:
         """Value that is exceeded with 1 − probability, any shape."""
         value, cumulative = self._knots
         rising = np.concatenate([[True], np.diff(cumulative) > 0])
-        return np.asarray(np.interp(probability, cumulative[rising], value[rising]))
+        return np.asarray(
+            np.interp(np.asarray(probability, dtype=float), cumulative[rising], value[rising])
+        )

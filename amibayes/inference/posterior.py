@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import emcee
-import h5py
 import numpy as np
 
 from amibayes.errors import DataError, UsageError
-from amibayes.files import atomic_path
+from amibayes.inference.chain_file import digest_of, load_chain, save_chain
 from amibayes.inference.grid_posterior import GridPosterior
 from amibayes.inference.laplace import gaussian_of, log_masses, physical
 from amibayes.inference.likelihood import Likelihood
@@ -41,9 +39,6 @@ START_WIDTH = 0.05
 
 STRONG = 30.0
 """Δχ² above which a mode is an island: no chain leaves it."""
-
-GROUP = "mcmc"
-"""Name of the HDF5 group, as emcee's own backend has it."""
 
 Progress = Callable[[int, int], None]
 
@@ -210,8 +205,8 @@ def sample(
     likelihood = result.likelihood
     start = _start(result, prior, rng)
     seed = int(rng.integers(2**32))
-    digest = _digest(likelihood, prior, start, seed)
-    backend = _load(path, digest) if path and resume else None
+    digest = digest_of(likelihood, prior, start, seed)
+    backend = load_chain(path, digest) if path and resume else None
     sampler = emcee.EnsembleSampler(
         len(start),
         start.shape[1],
@@ -224,7 +219,7 @@ def sample(
     while not (done := _long_enough(sampler)) and sampler.iteration < max_steps:
         sampler.run_mcmc(state if sampler.iteration == 0 else None, SEGMENT)
         if path:
-            _save(sampler, path, digest)
+            save_chain(sampler, path, digest)
         if progress:
             progress(sampler.iteration, int(ENOUGH * _time(sampler)))
     return _posterior(sampler, result, prior, grid, done)
@@ -310,7 +305,7 @@ def _long_enough(sampler: emcee.EnsembleSampler) -> bool:
     if sampler.iteration < 2 * SEGMENT:
         return False
     kept = sampler.iteration - sampler.iteration // 3
-    return kept > ENOUGH * _time(sampler) and _split_rhat(sampler).max() < GOOD_RHAT
+    return bool(kept > ENOUGH * _time(sampler) and _split_rhat(sampler).max() < GOOD_RHAT)
 
 
 def _split_rhat(sampler: emcee.EnsembleSampler) -> FloatArray:
@@ -354,50 +349,3 @@ def _posterior(
         times=times,
         rhats=_split_rhat(sampler),
     )
-
-
-def _digest(likelihood: Likelihood, prior: Prior, start: FloatArray, seed: int) -> str:
-    text = repr((likelihood.model, prior, seed, emcee.__version__)).encode()
-    return sha256(text + likelihood.observables.data.tobytes() + start.tobytes()).hexdigest()
-
-
-def _save(sampler: emcee.EnsembleSampler, path: str | Path, digest: str) -> None:
-    """Write the chain in the layout of `emcee.backends.HDFBackend`, whole or not at all."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        group = file.create_group(GROUP)
-        backend = sampler.backend
-        group.attrs.update(
-            version=emcee.__version__,
-            nwalkers=sampler.nwalkers,
-            ndim=sampler.ndim,
-            has_blobs=False,
-            iteration=sampler.iteration,
-            amibayes_digest=digest,
-        )
-        for k, part in enumerate(backend.random_state):
-            group.attrs[f"random_state_{k}"] = part
-        group["accepted"] = backend.accepted
-        group["chain"] = backend.get_chain()
-        group["log_prob"] = backend.get_log_prob()
-
-
-def _load(path: str | Path, digest: str) -> emcee.backends.Backend | None:
-    """Read a chain back, if it is the chain of this very problem."""
-    if not Path(path).is_file():
-        return None
-    try:
-        with h5py.File(path, "r") as file:
-            group = file[GROUP]
-            if group.attrs.get("amibayes_digest") != digest:
-                return None
-            backend = emcee.backends.Backend()
-            backend.reset(int(group.attrs["nwalkers"]), int(group.attrs["ndim"]))
-            backend.chain = group["chain"][()]
-            backend.log_prob = group["log_prob"][()]
-            backend.accepted = group["accepted"][()]
-            backend.iteration = int(group.attrs["iteration"])
-            backend.random_state = tuple(group.attrs[f"random_state_{k}"] for k in range(5))
-            backend.initialized = True
-            return backend
-    except (OSError, KeyError) as error:
-        raise DataError(f"is not a chain that can be continued: {error}", source=path) from error

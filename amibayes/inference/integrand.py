@@ -1,0 +1,243 @@
+"""What a grid posterior adds up: the likelihood at cells, over contrast and nuisance.
+
+The contrast is integrated over boxes that follow the likelihood in every cell, each with
+its exact prior probability; nuisance parameters over Gauss–Legendre nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.special import logsumexp
+
+from amibayes.inference.bank import TemplateBank, make_grid
+from amibayes.inference.cells import Cells, polar_cells
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.priors import Prior
+from amibayes.inference.refine import Box, fit_single, refine, single_likelihood
+from amibayes.units import MAS, FloatArray
+
+CELLS_PER_FRINGE = 8
+"""Cells per λ/B_max to begin with."""
+
+CONTRAST_REACH = 7.0
+"""Errors of the contrast, to both sides of its best value, that are integrated finely."""
+
+FAINT_BOXES, FINE_BOXES, MORE_BOXES = 8, 40, 24
+"""Boxes in contrast: below the fine range, in it, and more of them with nuisance parameters."""
+
+NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.5
+FEWEST_NODES, MOST_NODES = 6, 32
+
+BRIGHT = (0.1, 0.2, 0.4, 0.8)
+"""Contrasts tried beside the best one of the linear theory."""
+
+BATCH = 1_500_000
+"""Model values (samples × parameter sets) held at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """Quadrature of the nuisance parameters.
+
+    Parameters
+    ----------
+    value : (n_nodes, n_nuisance) float array
+    log_weight : (n_nodes,) float array
+        Logarithm of the prior probability that a node stands for.
+    low, high : (n_nodes, n_nuisance) float array
+        Range that it stands for.
+    """
+
+    value: FloatArray
+    log_weight: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+class Integrand:
+    """Likelihood times prior, integrated over contrast and nuisance, in batches of cells.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With a model of one companion.
+    prior : Prior
+    """
+
+    def __init__(self, likelihood: Likelihood, prior: Prior) -> None:
+        self.likelihood, self.prior = likelihood, prior
+        self.fringe_mas = float(1.0 / likelihood.samples.frequency.max() / MAS)
+        self.single, self.chi2_single = fit_single(likelihood)
+        lattice = self.fringe_mas / CELLS_PER_FRINGE
+        self.grid = make_grid(prior.inner_mas, prior.outer_mas, lattice)
+        self._scan()
+        self.nuisance = self._nuisance()
+        self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
+        none = single_likelihood(likelihood).log_prob(self.nuisance.value)
+        self.best_none = float(none.max())
+        self.log_z_none = float(logsumexp(none + self.nuisance.log_weight))
+        self.n_evaluations = 0
+
+    def _scan(self) -> None:
+        """Best contrast and gain in χ² of the linear theory over a lattice of the field."""
+        if not len(self.grid):
+            self.gain, self.contrast = np.zeros(0), np.zeros(0)
+            return
+        bank = TemplateBank(self.likelihood, self.grid, self.single)
+        residuals = single_likelihood(self.likelihood).residuals(self.single)[:, 0]
+        self.contrast, sigma = bank.scan(residuals)
+        self.gain = np.where(self.contrast > 0, (self.contrast / sigma) ** 2, 0.0)
+
+    def start(self) -> Cells:
+        """Cells of the field, without those that the linear theory rules out by far."""
+        p = self.prior
+        cells = polar_cells(p.inner_mas, p.outer_mas, self.fringe_mas / CELLS_PER_FRINGE)
+        if not len(self.grid) or self.contrast[self.gain.argmax()] > BRIGHT[0]:
+            return cells
+        image = np.nan_to_num(self.grid.image(self.gain), nan=0.0)
+        around = maximum_filter(image, 3)
+        half = self.grid.half_width
+        east, north = (
+            np.clip(np.rint(x / self.grid.step_mas).astype(int) + half, 0, 2 * half)
+            for x in cells.position
+        )
+        best = self.gain.max()
+        return cells[around[north, east] > 0.4 * best - 60.0]
+
+    def _nuisance(self) -> Nuisance:
+        """Nodes over the ranges that the fits with and without a companion allow."""
+        if not len(self.single):
+            none = np.zeros((1, 0))
+            return Nuisance(none, np.zeros(1), none, none)
+        axes = [self._axis(k) for k in range(len(self.single))]
+        value, weight, low, high = (
+            np.stack(np.meshgrid(*[a[j] for a in axes], indexing="ij"), axis=-1) for j in range(4)
+        )
+        n = len(axes)
+        log_weight = np.log(weight).sum(axis=-1).ravel()
+        return Nuisance(value.reshape(-1, n), log_weight, low.reshape(-1, n), high.reshape(-1, n))
+
+    def _axis(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        low, high = self.prior.nuisance[k]
+        centres = np.clip([self.single[k], self._best[3 + k]], low, high)
+        alone = single_likelihood(self.likelihood).errors(self.single)
+        joint = self.likelihood.errors(self._best)
+        sigma = float(np.sqrt(max(alone[k, k], joint[3 + k, 3 + k])))
+        if not 0.0 < sigma < high - low:
+            sigma = high - low
+        begin = max(low, centres.min() - NUISANCE_REACH * sigma)
+        end = min(high, centres.max() + NUISANCE_REACH * sigma)
+        wanted = int(np.ceil(NODES_PER_SIGMA * (end - begin) / sigma))
+        x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, FEWEST_NODES, MOST_NODES)))
+        edges = begin + 0.5 * (end - begin) * np.concatenate([[0.0], np.cumsum(w)])
+        value = begin + 0.5 * (end - begin) * (1.0 + x)
+        return value, 0.5 * w * (end - begin) / (high - low), edges[:-1], edges[1:]
+
+    @property
+    def _best(self) -> FloatArray:
+        """A fit with a companion, from the best position of the linear scan."""
+        if not len(self.grid):
+            return np.concatenate([[self.prior.outer_mas, 0.0, 0.0], self.single])
+        k = int(self.gain.argmax())
+        place = [self.grid.east_mas[k], self.grid.north_mas[k], np.clip(self.contrast[k], 0, 1)]
+        box = Box(self.prior.inner_mas, self.prior.outer_mas, self.fringe_mas)
+        seed = np.concatenate([place, self.single])
+        return np.array(refine(self.likelihood, seed, box, self.chi2_single).theta)
+
+    def log_prob(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
+        """Log-likelihood (n, k) at sites (n, 2 + n_nuisance), each with k contrasts (n, k)."""
+        n, k = contrast.shape
+        theta = np.empty((n, k, sites.shape[1] + 1))
+        theta[:, :, :2] = sites[:, None, :2]
+        theta[:, :, 2] = contrast
+        theta[:, :, 3:] = sites[:, None, 2:]
+        self.n_evaluations += n * k
+        return self.likelihood.log_prob(theta.reshape(n * k, -1)).reshape(n, k)
+
+    def _best_contrast(self, sites: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Most likely contrast (below zero where it is) and its error at sites, (n,) each."""
+        n, most = len(sites), self.prior.contrast_max
+        bright = [c for c in BRIGHT if c < most]
+        trial = np.broadcast_to([0.0, 1e-3, 2e-3, *bright], (n, 3 + len(bright)))
+        value = self.log_prob(sites, trial)
+        best, sigma = _parabola(np.full(n, 1e-3), np.full(n, 1e-3), value[:, :3], np.full(n, 0.1))
+        if bright:
+            top = value[:, 3:].argmax(axis=1)
+            brighter = np.clip(best, 0.0, most)[:, None]
+            exceeds = value[np.arange(n), 3 + top] > self.log_prob(sites, brighter)[:, 0]
+            best = np.where(exceeds, np.array(bright)[top], best)
+        for _ in range(2):
+            middle = np.clip(best, sigma, np.maximum(most, sigma))
+            points = middle[:, None] + sigma[:, None] * np.array([-1.0, 0.0, 1.0])
+            best, sigma = _parabola(middle, sigma, self.log_prob(sites, points), sigma)
+        return best, sigma
+
+    def boxes(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
+        """Boxes of the contrast (n, n_boxes + 1), and log-likelihood (n, n_nodes, n_boxes)."""
+        n, nodes = len(cells), self.nuisance.value
+        place = np.repeat(np.column_stack(cells.position), len(nodes), axis=0)
+        sites = np.hstack([place, np.tile(nodes, (n, 1))])
+        best, sigma = self._best_contrast(sites)
+        edges = self._edges(*(x.reshape(n, -1) for x in (best, sigma)))
+        contrast = np.repeat(self._inside(edges), len(nodes), axis=0)
+        return edges, self.log_prob(sites, contrast).reshape(n, len(nodes), -1)
+
+    def _edges(self, best: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Boxes: logarithmic below the fine range, even in it; (n, n_nodes) → (n, n_boxes + 1)."""
+        p, small = self.prior, sigma.min(axis=1)
+        low = np.maximum((best - CONTRAST_REACH * sigma).min(axis=1), 0.3 * small)
+        high = (np.maximum(best, 0.0) + CONTRAST_REACH * sigma).max(axis=1)
+        low = np.clip(low, p.contrast_min, 0.9 * p.contrast_max)
+        # Where the data want less than the prior allows, what lies above its lower end counts.
+        high = np.minimum(np.maximum(high, low + CONTRAST_REACH * small), p.contrast_max)
+        faint = np.geomspace(np.full(len(low), p.contrast_min), low, FAINT_BOXES + 1, axis=1)
+        fine = np.linspace(low, high, self.n_boxes - FAINT_BOXES + 1, axis=1)
+        return np.hstack([faint, fine[:, 1:]])
+
+    def _inside(self, edges: FloatArray) -> FloatArray:
+        """Mean contrast of every box under the prior."""
+        low, high = edges[:, :-1], edges[:, 1:]
+        if self.prior.contrast_form == "uniform":
+            return 0.5 * (low + high)
+        ratio = np.log(high / low)
+        return np.where(ratio > 1e-6, (high - low) / np.where(ratio > 0, ratio, 1.0), low)
+
+    def batches(self, cells: Cells) -> list[Cells]:
+        """Cut cells into groups whose model values fit in memory."""
+        each = len(self.likelihood.samples) * len(self.nuisance.value) * self.n_boxes
+        at_once = max(1, BATCH // each)
+        return [cells[k : k + at_once] for k in range(0, len(cells), at_once)]
+
+    def shares(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Boxes, logarithm of their mass (n, n_nodes, n_boxes), and best log-likelihood (n,)."""
+        p = self.prior
+        edges, log_prob = self.boxes(cells)
+        ring = p.ring_cdf(cells.outer) - p.ring_cdf(cells.inner)
+        place = np.log(ring * (cells.last - cells.first) / (2.0 * np.pi))
+        bright = np.log(np.maximum(np.diff(p.contrast_cdf(edges), axis=1), 1e-300))
+        log_mass = log_prob + (place[:, None] + bright)[:, None, :]
+        return edges, log_mass + self.nuisance.log_weight[:, None], log_prob.max(axis=(1, 2))
+
+    def masses(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
+        """Logarithm of each cell's share of the evidence, and its best log-likelihood."""
+        masses, peaks = [], []
+        for batch in self.batches(cells):
+            _, log_mass, peak = self.shares(batch)
+            masses.append(logsumexp(log_mass, axis=(1, 2)))
+            peaks.append(peak)
+        return np.concatenate(masses), np.concatenate(peaks)
+
+
+def _parabola(
+    middle: FloatArray, step: FloatArray, value: FloatArray, otherwise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Top and width of the parabolas through values (n, 3) at middle − step, middle, + step."""
+    slope = 0.5 * (value[:, 2] - value[:, 0]) / step
+    curvature = (2.0 * value[:, 1] - value[:, 0] - value[:, 2]) / step**2
+    arched = curvature > 1e-2 / otherwise**2 * 1e-2
+    safe = np.where(arched, curvature, 1.0)
+    best = np.where(arched, middle + slope / safe, middle + np.sign(slope) * step)
+    return best, np.where(arched, 1.0 / np.sqrt(safe), otherwise)
