@@ -365,9 +365,10 @@ def _upper_limit_lines(report: SearchReport) -> list[str]:
     limit = upper_limit(report) if report.significance is not None else None
     if limit is None:
         return []
+    stated = "" if report.posterior is None else f", {report.posterior.prior.description}"
     return [
         f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
-        f"({limit['level']:.0%}, anywhere in the field, {report.posterior.prior.description if report.posterior else ''})"
+        f"({limit['level']:.0%}, anywhere in the field{stated})"
     ]
 
 

@@ -12,6 +12,7 @@ from scipy import stats
 from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.noise import ExtraNoise, add_noise, fit_noise, search_with_noise
+from amibayes.inference.refine import single_likelihood
 from amibayes.inference.significance import bank_statistic, null_maxima, profiled
 from amibayes.observables import join
 
@@ -86,22 +87,27 @@ def test_search_of_noisy_data_has_a_reduced_chi2_of_one_and_fair_errors() -> Non
 
 
 @pytest.mark.slow
-def test_false_alarms_of_understated_noise_stay_at_their_rate() -> None:
-    """Null data with a reduced χ² near 12: p from the fitted noise, uniform within binomial.
+@pytest.mark.parametrize("factor", [1.0, 1.5, 4.0])
+def test_false_alarms_stay_at_their_rate_whatever_the_errors_say(factor: float) -> None:
+    """Null data whose noise is ``factor`` times the stated errors: the reported p is uniform.
 
-    P(p < 0.1) of 400 searches. With the stated errors all would be detections.
+    P(p < 0.1) and P(p < 0.02) of 300 searches against binomial chance, 1e-4 each. Trusting
+    the errors would call half of the data with a factor of 1.5 and nearly all with 4 unlikely.
     """
     rng = np.random.default_rng(6)
-    n, hits = 400, 0
+    extra = ExtraNoise(*(np.sqrt(factor**2 - 1.0) * np.array([0.005, np.radians(0.3)])))
+    n, p = 300, []
     for _ in range(n):
-        result, noise = search_with_noise(Likelihood(understated([0.0, 0.0, 0.0], rng)), FIELD)
+        data = understated([0.0, 0.0, 0.0], rng, extra)
+        result, _ = search_with_noise(Likelihood(data), FIELD)
         bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-        white = result.likelihood.residuals([100.0, 0.0, 0.0])
-        assert noise.any
+        white = single_likelihood(result.likelihood).residuals(result.single_theta)
         statistic = bank_statistic(bank, white, free_scale=True)[0]
         null = null_maxima(bank, 1000, rng, free_scale=True)
-        hits += (1 + (null >= statistic).sum()) / 1001 < 0.1
-    assert stats.binomtest(int(hits), n, 0.1, alternative="greater").pvalue > 1e-4
+        p.append((1 + (null >= statistic).sum()) / 1001)
+    for level in (0.1, 0.02):
+        hits = int((np.array(p) < level).sum())
+        assert stats.binomtest(hits, n, level, alternative="greater").pvalue > 1e-4
 
 
 def test_profiled_statistic_does_not_depend_on_the_scale(rng) -> None:

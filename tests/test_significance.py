@@ -20,7 +20,7 @@ def kernel_bank(step_mas: float) -> TemplateBank:
 
 
 def test_null_quantiles_for_15_kernel_phases() -> None:
-    """50/90/99/99.9 % of the largest Δχ², F480M, 50–400 mas: 6.4/10.9/16.0/20.5, found independently.
+    """50/90/99/99.9 % of the largest Δχ² (F480M, 50–400 mas): 6.4/10.9/16.0/20.5 elsewhere.
 
     40 000 draws: the quantiles scatter by sqrt(p(1-p)/n)/density, 0.02/0.04/0.12/0.4; the
     lattice of λ/16B is 0.05-0.1 below the continuum.
