@@ -223,6 +223,7 @@ def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
         "contrast": contrast,
         "delta_mag": float(contrast_to_delta_mag(contrast)),
         "contrast_uniform_prior": number(uniform),
+        "prior": posterior.prior.description,
         "method": "chain" if grid is None else "grid",
     }
 
@@ -363,7 +364,7 @@ def _upper_limit_lines(report: SearchReport) -> list[str]:
         return []
     return [
         f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
-        f"({limit['level']:.0%}, anywhere in the field, {report.posterior.prior.description if report.posterior else ''})"
+        f"({limit['level']:.0%}, anywhere in the field; prior: {limit['prior']})"
     ]
 
 
