@@ -123,6 +123,10 @@ FAST = ("--null-draws", "0", "--no-posterior", "--no-limits")
         (("--calibration", "weighted"), "needs calibrators"),
         (("--seperation", "50:400"), "did you mean --separation"),
         (("--separation", "100:100.0001"), "no position"),
+        (("--prior", "contrast"), "is no prior"),
+        (("--prior", "contrast=1:1e-5"), "is empty or impossible"),
+        (("--prior", "diameter=0:1"), "not a free parameter"),
+        (("--companions", "3"), "not a list out of 0,1,2"),
     ],
 )
 def test_wrong_usage_is_one_line_and_status_2(words, message, target, tmp_path, capsys) -> None:
@@ -194,3 +198,27 @@ def test_companion_outside_the_default_field_is_pointed_out(data: Path, tmp_path
     result = json.loads(capsys.readouterr().out)
     assert any("28.9 mas, outside the field" in w for w in result["warnings"])
     assert result["fit"]["diameter_mas"] > 0.5
+
+
+def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> None:
+    path = tmp_path / "none.oifits"
+    write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))
+    words = (path, "--separation", "50:400", "--null-draws", 500, "--no-limits", "--json")
+    prior = ("--prior", "contrast=uniform:1e-5:0.1", "--prior", "position=separation")
+    assert run(*words, *prior, "--companions", "0,1,2", "--out", tmp_path / "out") == 0
+    result = json.loads(capsys.readouterr().out)
+    posterior, evidence = result["posterior"], result["evidence"]
+    assert posterior["prior"]["contrast"] == [1e-5, 0.1]
+    assert "uniform in contrast" in posterior["prior"]["form"]
+    limit = posterior["upper_limit"]
+    assert limit["method"] == "grid"
+    assert 1e-5 < limit["contrast"] < 0.01
+    assert limit["contrast"] == pytest.approx(posterior["contrast"]["upper_95"], rel=0.5)
+    assert limit["contrast"] == limit["contrast_uniform_prior"]
+    assert evidence["companions"] == [0, 1, 2]
+    assert evidence["method"] == ["quadrature", "grid", "importance"]
+    assert sum(evidence["probability"]) == pytest.approx(1.0)
+    assert evidence["probability"][0] > 0.9
+    assert len(evidence["two_companions"]["companions"]) == 2
+    assert evidence["halo"]["log_z"] < evidence["log_z"][0]
+    assert sum(m["probability"] for m in result["modes"]) == pytest.approx(1.0)

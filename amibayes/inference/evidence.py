@@ -350,6 +350,7 @@ def log_evidence_nested(
         theta_of,
         len(likelihood.parameters),
         nlive=live_points,
+        sample="rwalk",
         rstate=rng,
     )
     sampler.run_nested(print_progress=False)
