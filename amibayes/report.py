@@ -223,6 +223,7 @@ def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
         "contrast": contrast,
         "delta_mag": float(contrast_to_delta_mag(contrast)),
         "contrast_uniform_prior": number(uniform),
+        "prior": posterior.prior.description,
         "method": "chain" if grid is None else "grid",
     }
 
@@ -365,10 +366,9 @@ def _upper_limit_lines(report: SearchReport) -> list[str]:
     limit = upper_limit(report) if report.significance is not None else None
     if limit is None:
         return []
-    stated = "" if report.posterior is None else f", {report.posterior.prior.description}"
     return [
         f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
-        f"({limit['level']:.0%}, anywhere in the field{stated})"
+        f"({limit['level']:.0%}, anywhere in the field; prior: {limit['prior']})"
     ]
 
 

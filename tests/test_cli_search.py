@@ -124,6 +124,10 @@ FAST = ("--null-draws", "0", "--no-posterior", "--no-limits")
         (("--calibration", "weighted"), "needs calibrators"),
         (("--seperation", "50:400"), "did you mean --separation"),
         (("--separation", "100:100.0001"), "no position"),
+        (("--prior", "contrast"), "is no prior"),
+        (("--prior", "contrast=1:1e-5"), "is empty or impossible"),
+        (("--prior", "diameter=0:1"), "not a free parameter"),
+        (("--companions", "3"), "not a list out of 0,1,2"),
     ],
 )
 def test_wrong_usage_is_one_line_and_status_2(words, message, target, tmp_path, capsys) -> None:
@@ -222,3 +226,27 @@ def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys)
 def test_absurd_field_is_refused(target, tmp_path, capsys) -> None:
     assert run(target, *FAST, "--separation", "1:100000000", "--out", tmp_path / "out") == 2
     assert "positions between" in error_of(capsys)
+
+
+def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> None:
+    path = tmp_path / "none.oifits"
+    write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))
+    words = (path, "--separation", "50:400", "--null-draws", 500, "--no-limits", "--json")
+    prior = ("--prior", "contrast=uniform:1e-5:0.1", "--prior", "position=separation")
+    assert run(*words, *prior, "--companions", "0,1,2", "--out", tmp_path / "out") == 0
+    result = json.loads(capsys.readouterr().out)
+    posterior, evidence = result["posterior"], result["evidence"]
+    assert posterior["prior"]["contrast"] == [1e-5, 0.1]
+    assert "uniform in contrast" in posterior["prior"]["form"]
+    limit = posterior["upper_limit"]
+    assert limit["method"] == "grid"
+    assert 1e-5 < limit["contrast"] < 0.01
+    assert limit["contrast"] == pytest.approx(posterior["contrast"]["upper_95"], rel=0.5)
+    assert limit["contrast"] == limit["contrast_uniform_prior"]
+    assert evidence["companions"] == [0, 1, 2]
+    assert evidence["method"] == ["quadrature", "grid", "importance"]
+    assert sum(evidence["probability"]) == pytest.approx(1.0)
+    assert evidence["probability"][0] > 0.9
+    assert len(evidence["two_companions"]["companions"]) == 2
+    assert evidence["halo"]["log_z"] < evidence["log_z"][0]
+    assert sum(m["probability"] for m in result["modes"]) == pytest.approx(1.0)

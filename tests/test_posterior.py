@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import emcee
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 
-from amibayes.errors import DataError
+from amibayes.errors import DataError, UsageError
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import Prior, default_prior
@@ -118,3 +119,32 @@ def test_prior_is_normalised(rng) -> None:
     box = 800.0**2 * 12.0 * 4.0
     density = np.exp(prior.log_density(x)) * box
     assert abs(density.mean() - 1.0) < 5.0 * density.std() / np.sqrt(n)
+
+
+def test_convergence_is_reported_by_parameter(found) -> None:
+    posterior = run(found)
+    lines = posterior.convergence()
+    assert set(lines) == set(posterior.names)
+    assert max(x["split_rhat"] for x in lines.values()) == posterior.split_rhat
+    longest = max(x["autocorrelation_time"] for x in lines.values())
+    assert longest == posterior.autocorrelation_time
+    fewest = min(x["n_effective"] for x in lines.values())
+    assert int(fewest) == posterior.n_effective
+
+
+def test_inference_data_is_the_chain_after_burn_in(found) -> None:
+    arviz = pytest.importorskip("arviz", exc_type=ImportError)
+    posterior = run(found)
+    data = posterior.to_inference_data()
+    east = np.asarray(data["posterior"]["east_mas"])
+    np.testing.assert_array_equal(east.T, posterior.chain[posterior.n_burn :, :, 0])
+    assert data["sample_stats"]["lp"].shape == east.shape
+    rhat = float(np.asarray(arviz.rhat(data)["east_mas"]))
+    assert 0.99 < rhat < 1.05
+
+
+def test_inference_data_without_arviz_says_what_to_install(found, monkeypatch) -> None:
+    posterior = run(found)
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(UsageError, match=r"pip install 'amibayes\[arviz\]'"):
+        posterior.to_inference_data()

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.special import gammaln, logsumexp
 
 from amibayes.errors import UsageError
-from amibayes.inference.grid_posterior import GridPosterior, log_evidence_none
+from amibayes.inference.grid_posterior import GridPosterior
+from amibayes.inference.integrand import log_evidence_none
 from amibayes.inference.laplace import (
     gaussian_of,
     log_evidence_laplace,
@@ -349,6 +350,7 @@ def log_evidence_nested(
         theta_of,
         len(likelihood.parameters),
         nlive=live_points,
+        sample="rwalk",
         rstate=rng,
     )
     sampler.run_nested(print_progress=False)

@@ -190,16 +190,11 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
     return _finished(work, cells, log_mass)
 
 
-def affordable(likelihood: Likelihood, prior: Prior, most: float = 1e8) -> bool:
-    """Whether the grid posterior takes fewer model values than ``most`` (about 15 s)."""
+def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:
+    """Whether the grid posterior takes fewer model values than ``most`` (a few seconds)."""
     work = Integrand(likelihood, prior)
     n_sets = len(work.start()) * len(work.nuisance.value) * (work.n_boxes + 16)
     return n_sets * len(likelihood.samples) < most
-
-
-def log_evidence_none(likelihood: Likelihood, prior: Prior) -> float:
-    """Logarithm of the evidence without a companion, nuisance parameters integrated."""
-    return Integrand(likelihood, prior).log_z_none
 
 
 def _to_cut(

@@ -28,7 +28,7 @@ CONTRAST_REACH = 7.0
 FAINT_BOXES, FINE_BOXES, MORE_BOXES = 8, 40, 24
 """Boxes in contrast: below the fine range, in it, and more of them with nuisance parameters."""
 
-NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.5
+NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.3
 FEWEST_NODES, MOST_NODES = 6, 32
 
 BRIGHT = (0.1, 0.2, 0.4, 0.8)
@@ -57,6 +57,69 @@ class Nuisance:
     high: FloatArray
 
 
+def nuisance_nodes(prior: Prior, centres: FloatArray, errors: FloatArray) -> Nuisance:
+    """Gauss–Legendre nodes around fits, each parameter given the ones before it.
+
+    Parameters
+    ----------
+    prior : Prior
+    centres : (n_fits, n_nuisance) float array
+        Best values; nodes reach 5σ beyond all of them, as far as the prior goes.
+    errors : (n_nuisance, n_nuisance) float array
+        Their covariance: correlated parameters are followed along their ridge.
+    """
+    value, low, high = (np.empty((1, 0)) for _ in range(3))
+    log_weight = np.zeros(1)
+    for k, bounds in enumerate(prior.nuisance):
+        turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
+        sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
+        if not 0.0 < sigma < bounds[1] - bounds[0]:
+            sigma, turn = bounds[1] - bounds[0], 0.0 * turn
+        middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
+        x, w, a, b = _axis(middle, sigma, bounds)
+        n = x.shape[1]
+        value, low, high = (
+            np.hstack([np.repeat(old, n, axis=0), new.reshape(-1, 1)])
+            for old, new in ((value, x), (low, a), (high, b))
+        )
+        log_weight = np.repeat(log_weight, n) + np.log(w).ravel()
+    return Nuisance(value, log_weight, low, high)
+
+
+def _axis(
+    middle: FloatArray, sigma: float, bounds: tuple[float, float]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Nodes, weights and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
+    centres = np.clip(middle, *bounds)
+    begin = np.maximum(centres.min(axis=1) - NUISANCE_REACH * sigma, bounds[0])[:, None]
+    length = np.minimum(centres.max(axis=1) + NUISANCE_REACH * sigma, bounds[1])[:, None] - begin
+    wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
+    x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, FEWEST_NODES, MOST_NODES)))
+    edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
+    weight = 0.5 * w * length / (bounds[1] - bounds[0])
+    return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
+
+
+def log_evidence_none(
+    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
+) -> float:
+    """Logarithm of the evidence without a companion, nuisance parameters integrated.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With any number of companions in its model.
+    prior : Prior
+    single : (n_nuisance,) float array, optional
+        The best fit without a companion, if it is known.
+    """
+    alone = single_likelihood(likelihood)
+    best = fit_single(likelihood)[0] if single is None else single
+    errors = alone.errors(best) if len(best) else np.empty((0, 0))
+    nodes = nuisance_nodes(prior, best[None], errors)
+    return float(logsumexp(alone.log_prob(nodes.value) + nodes.log_weight))
+
+
 class Integrand:
     """Likelihood times prior, integrated over contrast and nuisance, in batches of cells.
 
@@ -76,9 +139,8 @@ class Integrand:
         self._scan()
         self.nuisance = self._nuisance()
         self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
-        none = single_likelihood(likelihood).log_prob(self.nuisance.value)
-        self.best_none = float(none.max())
-        self.log_z_none = float(logsumexp(none + self.nuisance.log_weight))
+        self.log_z_none = log_evidence_none(likelihood, prior, self.single)
+        self.best_none = likelihood.log_norm - 0.5 * self.chi2_single
         self.n_evaluations = 0
 
     def _scan(self) -> None:
@@ -108,33 +170,12 @@ class Integrand:
         return cells[around[north, east] > 0.4 * best - 60.0]
 
     def _nuisance(self) -> Nuisance:
-        """Nodes over the ranges that the fits with and without a companion allow."""
+        """Nodes over what the fits with and without a companion allow."""
         if not len(self.single):
-            none = np.zeros((1, 0))
-            return Nuisance(none, np.zeros(1), none, none)
-        axes = [self._axis(k) for k in range(len(self.single))]
-        value, weight, low, high = (
-            np.stack(np.meshgrid(*[a[j] for a in axes], indexing="ij"), axis=-1) for j in range(4)
-        )
-        n = len(axes)
-        log_weight = np.log(weight).sum(axis=-1).ravel()
-        return Nuisance(value.reshape(-1, n), log_weight, low.reshape(-1, n), high.reshape(-1, n))
-
-    def _axis(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        low, high = self.prior.nuisance[k]
-        centres = np.clip([self.single[k], self._best[3 + k]], low, high)
-        alone = single_likelihood(self.likelihood).errors(self.single)
-        joint = self.likelihood.errors(self._best)
-        sigma = float(np.sqrt(max(alone[k, k], joint[3 + k, 3 + k])))
-        if not 0.0 < sigma < high - low:
-            sigma = high - low
-        begin = max(low, centres.min() - NUISANCE_REACH * sigma)
-        end = min(high, centres.max() + NUISANCE_REACH * sigma)
-        wanted = int(np.ceil(NODES_PER_SIGMA * (end - begin) / sigma))
-        x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, FEWEST_NODES, MOST_NODES)))
-        edges = begin + 0.5 * (end - begin) * np.concatenate([[0.0], np.cumsum(w)])
-        value = begin + 0.5 * (end - begin) * (1.0 + x)
-        return value, 0.5 * w * (end - begin) / (high - low), edges[:-1], edges[1:]
+            return nuisance_nodes(self.prior, np.empty((1, 0)), np.empty((0, 0)))
+        best = self._best
+        errors = self.likelihood.errors(best)[3:, 3:]
+        return nuisance_nodes(self.prior, np.array([self.single, best[3:]]), errors)
 
     @property
     def _best(self) -> FloatArray:
@@ -163,7 +204,7 @@ class Integrand:
         bright = [c for c in BRIGHT if c < most]
         trial = np.broadcast_to([0.0, 1e-3, 2e-3, *bright], (n, 3 + len(bright)))
         value = self.log_prob(sites, trial)
-        best, sigma = _parabola(np.full(n, 1e-3), np.full(n, 1e-3), value[:, :3], np.full(n, 0.1))
+        best, sigma = _parabola(np.full(n, 1e-3), np.full(n, 1e-3), value[:, :3], np.full(n, 1.0))
         if bright:
             top = value[:, 3:].argmax(axis=1)
             brighter = np.clip(best, 0.0, most)[:, None]
@@ -237,7 +278,7 @@ def _parabola(
     """Top and width of the parabolas through values (n, 3) at middle − step, middle, + step."""
     slope = 0.5 * (value[:, 2] - value[:, 0]) / step
     curvature = (2.0 * value[:, 1] - value[:, 0] - value[:, 2]) / step**2
-    arched = curvature > 1e-2 / otherwise**2 * 1e-2
+    arched = curvature > 1e-4 / otherwise**2
     safe = np.where(arched, curvature, 1.0)
     best = np.where(arched, middle + slope / safe, middle + np.sign(slope) * step)
     return best, np.where(arched, 1.0 / np.sqrt(safe), otherwise)
