@@ -13,8 +13,8 @@ import numpy as np
 from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import View
 from amibayes.optics import psf
-from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
 from amibayes.optics.psf import ComplexArray
+from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
 from amibayes.orientation import Orientation
 from amibayes.response import EXPONENTS, even_powers
 from amibayes.units import FloatArray
