@@ -70,7 +70,9 @@ class Reference:
     def outliers(self, images: FloatArray, bad: BoolArray, limit: float) -> BoolArray:
         """Pixels (n, n_y, n_x) that stand off the reference, scaled to each image's flux."""
         usable = self.good & ~bad
-        flux = np.einsum("nyx,yx->n", np.where(usable, images, 0.0), self.image)
+        # A single hot pixel must not decide what the flux is.
+        most = 2.0 * np.abs(self.image) + limit * self.scatter
+        flux = np.einsum("nyx,yx->n", usable * np.clip(images, -most, most), self.image)
         own = np.einsum("nyx,yx->n", usable, self.image**2)
         scale = flux / np.maximum(own, 1e-300)
         off = np.abs(images - scale[:, None, None] * self.image) > limit * self.scatter

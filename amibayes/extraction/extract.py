@@ -38,6 +38,9 @@ from amibayes.units import FloatArray
 MOST_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
+JITTER_SLACK = 0.01
+"""Share of the light about a pixel by which the pointing may change its residual, 1σ."""
+
 LARGEST_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
 
@@ -225,7 +228,7 @@ def _expected(residual: FloatArray, image: FloatArray, noise: NoiseModel) -> Res
     spread = TO_SIGMA * np.median(np.abs(residual - middle), axis=0)
     # A scatter of few integrations may be small by chance: its surroundings have a say.
     around = np.sqrt(uniform_filter(spread.reshape(image.shape) ** 2, 5)).ravel()
-    slack = 3e-3 * maximum_filter(np.abs(image), 3).ravel()
+    slack = JITTER_SLACK * maximum_filter(np.abs(image), 3).ravel()
     return Residual(middle, np.maximum(spread, around) + np.sqrt(noise.variance).ravel() + slack)
 
 
@@ -264,45 +267,49 @@ def _attenuation(
 
 
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
-    first = parts[0]
-    frames = concatenated([p.frames for p in parts])
-    attenuation = np.concatenate([p.attenuation for p in parts])
-    if not options.keep_all:
-        found = average(frames.select(frames.used), attenuation[frames.used])
-        off = np.zeros(len(frames), dtype=bool)
-        off[frames.used] = standing_off(found.deviation, options.clip)
-        reason = np.where(off, "observables stand off the others'", frames.reason)
-        frames = replace(frames, reason=reason)
+    """One exposure out of its files: average, covariance, table."""
+    view = parts[0].bench.view
+    frames, attenuation, physical = _together(parts, options)
     used = frames.used
     mean = average(frames.select(used), attenuation[used])
+    n_vis2 = view.instrument.mask.n_baselines
+    basis = independent_basis(view)
+    shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
+    observables = _tabled(parts[0], frames, mean, shrunk)
+    benches = tuple(p.bench for p in parts)
+    sources = tuple(p.template.source for p in parts)
+    return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
+
+
+def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, FloatArray, FloatArray]:
+    """Integrations of all files, those that stand off marked, and what they share."""
+    frames = concatenated([p.frames for p in parts])
+    attenuation = np.concatenate([p.attenuation for p in parts])
     count = np.array([p.frames.used.sum() for p in parts], dtype=float)
     physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
-    basis = independent_basis(first.bench.view)
-    n_vis2 = first.bench.view.instrument.mask.n_baselines
-    shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
-    n = int(used.sum())
-    time = first.template.integration_time_s or 0.0
-    observables = observables_of(
-        first.bench.view,
-        first.template,
+    if not options.keep_all:
+        found = average(frames.select(frames.used), attenuation[frames.used])
+        sigma = np.sqrt(np.diag(physical))
+        off = np.zeros(len(frames), dtype=bool)
+        off[frames.used] = standing_off(found.deviation, sigma, options.clip)
+        reason = np.where(off, "observables stand off the others'", frames.reason)
+        frames = replace(frames, reason=reason)
+    return frames, attenuation, np.asarray(physical)
+
+
+def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:
+    n = int(frames.used.sum())
+    return observables_of(
+        part.bench.view,
+        part.template,
         mean,
         shrunk.matrix / n,
         n_integrations=n if n > 1 else None,
         kind="estimated" if n > 1 else "given",
-        response=first.response,
-        mjd=_mjd(frames, first.template),
-        integration_s=n * time,
+        response=part.response,
+        mjd=_mjd(frames, part.template),
+        integration_s=n * (part.template.integration_time_s or 0.0),
         notes=_notes(frames, shrunk),
-    )
-    return Extraction(
-        observables,
-        frames,
-        mean,
-        shrunk,
-        physical,
-        tuple(p.bench for p in parts),
-        options,
-        tuple(p.template.source for p in parts),
     )
 
 

@@ -38,7 +38,7 @@ class Frames:
         Flux², noise bias taken off.
     bispectrum : (n, n_triangles) complex array
     misfit : (n,) array
-        Weighted squared residual of the fringe fit.
+        Residual of the fringe fit as a share of the image, rms.
     n_bad : (n,) array
         Pixels left out.
     mjd : (n,) array
@@ -177,7 +177,7 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
             bench.sampling.power(samples) - extra,
             flux**2 - own,
             bench.sampling.bispectrum(samples),
-            (residual**2) @ bench.fit.weight,
+            _share(residual, filled),
             count + extra_bad,
             mjd,
             np.zeros(n, dtype=int),
@@ -186,6 +186,12 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
         ),
         samples,
     )
+
+
+def _share(residual: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Root of the ratio of the sums of squares, (n,)."""
+    left, whole = (np.einsum("np,np->n", a, a) for a in (residual, pixels))
+    return np.asarray(np.sqrt(left / np.maximum(whole, 1e-300)))
 
 
 def _filled(
@@ -229,9 +235,7 @@ def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.
         if used.sum() < 3:
             break
         middle = np.median(values[used])
-        spread = max(
-            TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor * abs(middle), 1e-300
-        )
+        spread = max(TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor, 1e-300)
         off = (values - middle) / spread
         hit = used & (np.abs(off) > look_elsewhere(limit, int(used.sum())))
         reason[hit] = [f"{name} stands off by {o:.1f} sigma" for o in off[hit]]
@@ -244,11 +248,10 @@ def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.
 
 
 def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
-    """Names, values, and the relative scatter below which nothing stands off."""
-    light = np.where(frames.flux > 0.0, frames.flux, np.nan)
-    with np.errstate(invalid="ignore"):
-        shape = np.sqrt(frames.misfit) / light
-    return [("flux", np.nan_to_num(light), 1e-3), ("shape", np.nan_to_num(shape), 0.1)]
+    """Names, values, and the least scatter that counts."""
+    lit = np.maximum(frames.flux, 0.0)
+    middle = float(np.median(lit[frames.used])) if frames.used.any() else 0.0
+    return [("flux", lit, 1e-3 * middle), ("shape", frames.misfit, 0.02)]
 
 
 def look_elsewhere(limit: float, n: int) -> float:
