@@ -32,7 +32,7 @@ from amibayes.extraction.table import independent_basis, observables_of
 from amibayes.extraction.view import View, look_at
 from amibayes.observables import Observables, join
 from amibayes.optics import FringeBasis
-from amibayes.response import even_powers
+from amibayes.response import powers_at
 from amibayes.units import FloatArray
 
 MOST_LEFT = 0.25
@@ -262,7 +262,7 @@ def _attenuation(
 ) -> FloatArray:
     """Loss of V² (n, n_baselines) of the star itself where it is off the centre."""
     place = shift_px * view.instrument.pixel_scale_rad
-    log = response @ even_powers(*template.orientation.to_sky(place).T)
+    log = (response @ powers_at(*template.orientation.to_sky(place).T)).real
     return np.asarray(np.exp(2.0 * (log[1:] - log[0])).T)
 
 
