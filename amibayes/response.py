@@ -1,32 +1,44 @@
 """How an extraction responds to light off the axis: its value at a place.
 
 The response of a baseline to a point source is the ratio of the visibility that is
-measured to the one that the source has. It is real and even to the accuracy that matters,
-and its logarithm a polynomial of the even powers of the place.
+measured to the one that the source has. The image of a point is symmetric, so that the
+logarithm of the ratio's modulus is even in the place and its phase odd: both are
+polynomials. A baseline taken the other way round has the conjugate.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.units import FloatArray
 
-EXPONENTS = np.array([(d - k, k) for d in (2, 4, 6) for k in range(d + 1)])
-"""(n_coefficients, 2): powers of the two coordinates, of degree 2, 4 and 6."""
+ComplexArray = NDArray[np.complex128]
+
+EXPONENTS = np.array([(d - k, k) for d in (2, 4, 6, 1, 3, 5) for k in range(d + 1)])
+"""(n_coefficients, 2): powers of the two coordinates; even degrees, then odd ones."""
+
+IS_PHASE = np.asarray(EXPONENTS.sum(axis=1) % 2 == 1)
+"""Which coefficients are of the phase."""
+
+REVERSED = np.where(IS_PHASE, -1.0, 1.0)
+"""Times the coefficients: those of the baseline taken the other way round."""
+
+_UNIT = np.where(IS_PHASE, 1j, 1.0)[:, None]
 
 
-def even_powers(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Monomials (n_coefficients, n) of two coordinates (n,)."""
+def powers_at(first: FloatArray, second: FloatArray) -> ComplexArray:
+    """Monomials (n_coefficients, n) of two coordinates (n,), times i where of the phase."""
     a, b = (_powers(c) for c in (first, second))
-    return np.asarray(a[EXPONENTS[:, 0]] * b[EXPONENTS[:, 1]])
+    return np.asarray(_UNIT * a[EXPONENTS[:, 0]] * b[EXPONENTS[:, 1]])
 
 
-def even_slopes(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the monomials by either coordinate, (n_coefficients, n) each."""
+def slopes_at(first: FloatArray, second: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Derivatives of `powers_at` by either coordinate, (n_coefficients, n) each."""
     (a, b), (i, j) = (_powers(c) for c in (first, second)), EXPONENTS.T
     return (
-        np.asarray(i[:, None] * a[np.maximum(i - 1, 0)] * b[j]),
-        np.asarray(j[:, None] * a[i] * b[np.maximum(j - 1, 0)]),
+        np.asarray(_UNIT * i[:, None] * a[np.maximum(i - 1, 0)] * b[j]),
+        np.asarray(_UNIT * j[:, None] * a[i] * b[np.maximum(j - 1, 0)]),
     )
 
 

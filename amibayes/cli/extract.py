@@ -133,8 +133,9 @@ def _summary(content: list[dict[str, Any]]) -> list[str]:
         lines += [
             f"{entry['path']}: {entry['instrument']} {entry['filter']}, method {entry['method']}",
             f"  integrations   {entry['n_used']} of {entry['n_integrations']} used",
-            f"  star           x {entry['centre_px'][0][0]:+.3f}, y {entry['centre_px'][0][1]:+.3f} "
-            f"pixels from the middle, pointing {entry['jitter_px']:.3f} pixels rms",
+            f"  star           x {entry['centre_px'][0][0]:+.3f}, "
+            f"y {entry['centre_px'][0][1]:+.3f} pixels from the middle, "
+            f"pointing {entry['jitter_px']:.3f} pixels rms",
             f"  bad pixels     {entry['bad_pixels'][0]} always, {entry['outliers']:.1f} more in "
             "an integration",
             f"  V²             σ {entry['sigma_vis2']:.2g}, photon and read noise "

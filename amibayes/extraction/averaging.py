@@ -49,11 +49,13 @@ def average(frames: Frames, attenuation: FloatArray) -> Average:
     return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))
 
 
-def standing_off(deviation: FloatArray, limit: float) -> BoolArray:
+def standing_off(deviation: FloatArray, expected: FloatArray, limit: float) -> BoolArray:
     """Integrations whose observables stand off the others', on a robust scale, (n,).
 
     The statistic is the largest deviation over all observables in units of its scatter,
-    and the limit allows for how many there are.
+    and the limit allows for how many there are. The scatter of a few integrations may be
+    small by chance: it is not taken below what the observables have on average, in units
+    of the ``expected`` standard deviations (m,).
     """
     if len(deviation) < 5:
         return np.zeros(len(deviation), dtype=bool)
@@ -61,5 +63,6 @@ def standing_off(deviation: FloatArray, limit: float) -> BoolArray:
     scatter = TO_SIGMA * np.median(np.abs(deviation - middle), axis=0)
     # A robust scatter of few integrations is uncertain itself.
     slack = 1.0 + 3.0 / np.sqrt(len(deviation))
+    scatter = np.maximum(scatter, expected * np.median(scatter / expected))
     off = np.abs(deviation - middle) / np.maximum(scatter, 1e-300)
     return np.asarray(off.max(axis=1) > slack * look_elsewhere(limit, deviation.size))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ MOST_BAD = 0.2
 
 ALWAYS_BAD = 0.5
 """A pixel bad in a larger fraction of the integrations is never used."""
+
+OUTLIER = 7.0
+"""Pixels of the sample that stand off by more standard deviations are left out of it."""
 
 TO_SIGMA = 1.4826
 """From the median absolute deviation to a standard deviation."""
@@ -48,6 +52,7 @@ class Reference:
         The integrations it was made of, NaN at bad pixels.
     has_errors : bool
         Whether the noise is that of the cube's own errors.
+    source : str
     """
 
     image: FloatArray
@@ -57,6 +62,7 @@ class Reference:
     n_bad: int
     sample: FloatArray
     has_errors: bool
+    source: str
 
     def __post_init__(self) -> None:
         read_only(self, "image", "scatter")
@@ -64,7 +70,9 @@ class Reference:
     def outliers(self, images: FloatArray, bad: BoolArray, limit: float) -> BoolArray:
         """Pixels (n, n_y, n_x) that stand off the reference, scaled to each image's flux."""
         usable = self.good & ~bad
-        flux = np.einsum("nyx,yx->n", np.where(usable, images, 0.0), self.image)
+        # A single hot pixel must not decide what the flux is.
+        most = 2.0 * np.abs(self.image) + limit * self.scatter
+        flux = np.einsum("nyx,yx->n", usable * np.clip(images, -most, most), self.image)
         own = np.einsum("nyx,yx->n", usable, self.image**2)
         scale = flux / np.maximum(own, 1e-300)
         off = np.abs(images - scale[:, None, None] * self.image) > limit * self.scatter
@@ -97,13 +105,18 @@ def reference_of(file: Source) -> Reference:
     good &= ~_hot(image, good)
     image = _filled(image, good)
     measured = _measured_variance(cube, keep, lit, spread, len(images))
-    noise = noise_model(image, measured, good & np.isfinite(measured) & (measured > 0.0))
+    known = good & np.isfinite(measured) & (measured > 0.0)
+    if not known.any():  # a single image without errors: the fit will tell its noise
+        known, measured = good, np.full(image.shape, float(np.var(image[good])))
+    noise = noise_model(image, measured, known)
     scatter = np.sqrt(
         np.maximum(spread**2, noise.variance) + (0.03 * maximum_filter(np.abs(image), 3)) ** 2
     )
-    return Reference(
-        image, scatter, good, noise, int((~good).sum()), images, cube.error is not None
-    )
+    count = int((~good).sum())
+    has_errors = cube.error is not None
+    found = Reference(image, scatter, good, noise, count, images, has_errors, cube.source)
+    off = found.outliers(np.nan_to_num(images), np.isnan(images), OUTLIER)
+    return replace(found, sample=np.where(off, np.nan, images))
 
 
 def _sample(file: Source) -> Cube:
@@ -113,7 +126,7 @@ def _sample(file: Source) -> Cube:
         return file.read()
     picks = np.unique(np.linspace(0, n - 1, SAMPLE).astype(int))
     parts = [file.read(int(i), int(i) + 1) for i in picks]
-    stacked = {
+    stacked: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("images", "error", "dq")
         if getattr(parts[0], name) is not None
@@ -141,7 +154,6 @@ def _hot(image: FloatArray, good: BoolArray) -> BoolArray:
     is called hot or dead where it differs from what its neighbours predict by more than
     the neighbours differ among themselves, several times over.
     """
-    found = np.zeros_like(good)
     padded = np.pad(np.where(good, image, np.nan), 2, constant_values=np.nan)
     ny, nx = image.shape
     around = np.stack(
@@ -156,7 +168,7 @@ def _hot(image: FloatArray, good: BoolArray) -> BoolArray:
         high, low = np.nanmax(around, axis=0), np.nanmin(around, axis=0)
         size = high - low
     found = good & ((image > high + 2.0 * size) | (image < low - 2.0 * size)) & (size > 0.0)
-    return found
+    return np.asarray(found)
 
 
 def _filled(image: FloatArray, good: BoolArray) -> FloatArray:

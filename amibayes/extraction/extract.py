@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
 
 from amibayes.cube import Cube
 from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average, average, standing_off
-from amibayes.extraction.cleaning import Reference, reference_of
+from amibayes.extraction.cleaning import TO_SIGMA, BoolArray, Reference, reference_of
 from amibayes.extraction.fourier import fourier_sampling
-from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
+from amibayes.extraction.frames import Bench, Frames, Residual, concatenated, measure, select
 from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
 from amibayes.extraction.noise import (
     NoiseModel,
@@ -31,8 +32,14 @@ from amibayes.extraction.table import independent_basis, observables_of
 from amibayes.extraction.view import View, look_at
 from amibayes.observables import Observables, join
 from amibayes.optics import FringeBasis
-from amibayes.response import even_powers
+from amibayes.response import powers_at
 from amibayes.units import FloatArray
+
+MOST_LEFT = 0.25
+"""An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
+
+JITTER_SLACK = 0.01
+"""Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
 LARGEST_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
@@ -175,19 +182,19 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     part = (view.rows, view.columns)
     image, good = reference.image[part], reference.good[part]
     view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
-    noise, level = _noise_and_misfit(view, basis, reference)
+    noise, level, expected = _noise_and_misfit(view, basis, reference)
     fit = fringe_fit(basis, noise.variance + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
     covariance = sampling.noise(np.where(good, noise.variance, 0.0))
-    return Bench(view, reference, fit, sampling, covariance, options)
+    return Bench(view, reference, fit, expected, sampling, covariance, options)
 
 
 def _noise_and_misfit(
     view: View, basis: FringeBasis, reference: Reference
-) -> tuple[NoiseModel, float]:
+) -> tuple[NoiseModel, float, Residual]:
     """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
 
     Where the cube has no errors of its own, the noise is what differs between the
@@ -204,11 +211,50 @@ def _noise_and_misfit(
     coefficients = fit.solve(pixels)
     residual = pixels - coefficients @ fit.design.T
     noise = cropped(reference.noise, part)
-    if not reference.has_errors and len(sample) > 2:
+    _refuse_another(image, residual.mean(axis=0).reshape(image.shape), noise, good, reference)
+    if not reference.has_errors and len(sample) < 3:
+        noise = noise_model(image, (residual[0] ** 2).reshape(image.shape), good)
+    elif not reference.has_errors:
         _, samples = fringe_sampling(fit, view).split(coefficients)
         spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
         noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
-    return noise, misfit_level(residual.reshape(sample.shape), good, noise)
+    level = misfit_level(residual.reshape(sample.shape), good, noise)
+    return noise, level, _expected(residual, image, noise)
+
+
+def _expected(residual: FloatArray, image: FloatArray, noise: NoiseModel) -> Residual:
+    """Robust mean and scatter of the residuals (n, n_pixels) of some integrations."""
+    middle = np.median(residual, axis=0)
+    spread = TO_SIGMA * np.median(np.abs(residual - middle), axis=0)
+    # A scatter of few integrations may be small by chance: its surroundings have a say.
+    around = np.sqrt(uniform_filter(spread.reshape(image.shape) ** 2, 5)).ravel()
+    slack = JITTER_SLACK * maximum_filter(np.abs(image), 3).ravel()
+    return Residual(middle, np.maximum(spread, around) + np.sqrt(noise.variance).ravel() + slack)
+
+
+def _refuse_another(
+    image: FloatArray,
+    residual: FloatArray,
+    noise: NoiseModel,
+    good: BoolArray,
+    reference: Reference,
+) -> None:
+    """Refuse images that this mask and filter did not make.
+
+    Raises
+    ------
+    DataError
+        Where the fit leaves too much of the light.
+    """
+    expected = float(noise.variance[good].sum()) / len(reference.sample)
+    left = float((residual[good] ** 2).sum()) - expected
+    share = np.sqrt(max(left, 0.0) / max(float((image[good] ** 2).sum()), 1e-300))
+    if share > MOST_LEFT:
+        raise DataError(
+            f"the fringes of this mask and filter leave {100.0 * share:.0f} % of the image",
+            source=reference.source,
+            remedy="check instrument, filter and pixel scale",
+        )
 
 
 def _attenuation(
@@ -216,50 +262,54 @@ def _attenuation(
 ) -> FloatArray:
     """Loss of V² (n, n_baselines) of the star itself where it is off the centre."""
     place = shift_px * view.instrument.pixel_scale_rad
-    log = response @ even_powers(*template.orientation.to_sky(place).T)
+    log = (response @ powers_at(*template.orientation.to_sky(place).T)).real
     return np.asarray(np.exp(2.0 * (log[1:] - log[0])).T)
 
 
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
-    first = parts[0]
-    frames = concatenated([p.frames for p in parts])
-    attenuation = np.concatenate([p.attenuation for p in parts])
-    if not options.keep_all:
-        found = average(frames.select(frames.used), attenuation[frames.used])
-        off = np.zeros(len(frames), dtype=bool)
-        off[frames.used] = standing_off(found.deviation, options.clip)
-        reason = np.where(off, "observables stand off the others'", frames.reason)
-        frames = replace(frames, reason=reason)
+    """One exposure out of its files: average, covariance, table."""
+    view = parts[0].bench.view
+    frames, attenuation, physical = _together(parts, options)
     used = frames.used
     mean = average(frames.select(used), attenuation[used])
+    n_vis2 = view.instrument.mask.n_baselines
+    basis = independent_basis(view)
+    shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
+    observables = _tabled(parts[0], frames, mean, shrunk)
+    benches = tuple(p.bench for p in parts)
+    sources = tuple(p.template.source for p in parts)
+    return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
+
+
+def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, FloatArray, FloatArray]:
+    """Integrations of all files, those that stand off marked, and what they share."""
+    frames = concatenated([p.frames for p in parts])
+    attenuation = np.concatenate([p.attenuation for p in parts])
     count = np.array([p.frames.used.sum() for p in parts], dtype=float)
     physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
-    basis = independent_basis(first.bench.view)
-    n_vis2 = first.bench.view.instrument.mask.n_baselines
-    shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
-    n = int(used.sum())
-    time = first.template.integration_time_s or 0.0
-    observables = observables_of(
-        first.bench.view,
-        first.template,
+    if not options.keep_all:
+        found = average(frames.select(frames.used), attenuation[frames.used])
+        sigma = np.sqrt(np.diag(physical))
+        off = np.zeros(len(frames), dtype=bool)
+        off[frames.used] = standing_off(found.deviation, sigma, options.clip)
+        reason = np.where(off, "observables stand off the others'", frames.reason)
+        frames = replace(frames, reason=reason)
+    return frames, attenuation, np.asarray(physical)
+
+
+def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:
+    n = int(frames.used.sum())
+    return observables_of(
+        part.bench.view,
+        part.template,
         mean,
         shrunk.matrix / n,
         n_integrations=n if n > 1 else None,
         kind="estimated" if n > 1 else "given",
-        response=first.response,
-        mjd=_mjd(frames, first.template),
-        integration_s=n * time,
+        response=part.response,
+        mjd=_mjd(frames, part.template),
+        integration_s=n * (part.template.integration_time_s or 0.0),
         notes=_notes(frames, shrunk),
-    )
-    return Extraction(
-        observables,
-        frames,
-        mean,
-        shrunk,
-        physical,
-        tuple(p.bench for p in parts),
-        options,
-        tuple(p.template.source for p in parts),
     )
 
 

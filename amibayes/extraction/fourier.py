@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import IntArray, Sampling, closing_products
+from amibayes.extraction.sampling import BoolArray, IntArray, Sampling, closing_products
 from amibayes.extraction.view import View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
@@ -42,7 +42,7 @@ class _Cells:
     offset: IntArray
     frequency_px: FloatArray
 
-    def select(self, keep: FloatArray) -> _Cells:
+    def select(self, keep: BoolArray) -> _Cells:
         return _Cells(self.baseline[keep], self.offset[keep], self.frequency_px[keep])
 
 
@@ -94,7 +94,7 @@ def _lattice(view: View, half_width: int) -> _Cells:
     return _Cells(baseline, offset.reshape(-1, 2).astype(np.intp), frequency.reshape(-1, 2))
 
 
-def _bright(baseline: IntArray, model: ComplexArray, faintest: float) -> FloatArray:
+def _bright(baseline: IntArray, model: ComplexArray, faintest: float) -> BoolArray:
     """Cells of the splodges themselves."""
     peak = np.zeros(int(baseline.max()) + 1)
     np.maximum.at(peak, baseline, np.abs(model))

@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import norm
 
 from amibayes.cube import Cube
 from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
 from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import Sampling
+from amibayes.extraction.sampling import IntArray, Sampling
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
@@ -37,7 +38,7 @@ class Frames:
         Flux², noise bias taken off.
     bispectrum : (n, n_triangles) complex array
     misfit : (n,) array
-        Weighted squared residual of the fringe fit.
+        Residual of the fringe fit as a share of the image, rms.
     n_bad : (n,) array
         Pixels left out.
     mjd : (n,) array
@@ -55,11 +56,11 @@ class Frames:
     square: FloatArray
     bispectrum: ComplexArray
     misfit: FloatArray
-    n_bad: FloatArray
+    n_bad: IntArray
     mjd: FloatArray
-    file: FloatArray
-    number: FloatArray
-    reason: np.ndarray
+    file: IntArray
+    number: IntArray
+    reason: NDArray[np.str_]
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -75,12 +76,36 @@ class Frames:
 
 
 @dataclass(frozen=True, eq=False)
+class Residual:
+    """What the fit of a good integration leaves in each pixel, and how that varies."""
+
+    mean: FloatArray
+    scatter: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Bench:
-    """Everything that an integration goes through."""
+    """Everything that an integration goes through.
+
+    Parameters
+    ----------
+    view : View
+    reference : Reference
+    fit : FringeFit
+        Also of the Fourier methods, for which it fills bad pixels.
+    expected : Residual
+        Of that fit.
+    sampling : Sampling
+        What is measured.
+    noise : array
+        Covariance of the sampling's numbers in one integration.
+    options : ExtractOptions
+    """
 
     view: View
     reference: Reference
     fit: FringeFit
+    expected: Residual
     sampling: Sampling
     noise: FloatArray
     options: ExtractOptions
@@ -110,7 +135,7 @@ def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArra
     number = np.arange(len(joined))
     return (
         replace(joined, number=number, file=np.full(len(number), index)),
-        total / max(count, 1),
+        np.asarray(total / max(count, 1), dtype=complex),
         flux / max(count, 1),
     )
 
@@ -138,8 +163,8 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     never = bench.fit.weight == 0.0
     count = missing[:, ~never].sum(axis=1)
     hopeless = count > MOST_BAD * missing.shape[1]
-    filled = bench.fit.fill(pixels, (missing | never) & ~hopeless[:, None])
-    coefficients = bench.fit.solve(filled)
+    missing = (missing | never) & ~hopeless[:, None]
+    filled, residual, extra_bad = _filled(bench, pixels, missing)
     flux, samples = bench.sampling.apply(filled)
     shift = _shift(bench, samples)
     own, extra = bench.sampling.bias(bench.noise)
@@ -152,8 +177,8 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
             bench.sampling.power(samples) - extra,
             flux**2 - own,
             bench.sampling.bispectrum(samples),
-            bench.fit.misfit(filled, coefficients),
-            count,
+            _share(residual, filled),
+            count + extra_bad,
             mjd,
             np.zeros(n, dtype=int),
             np.zeros(n, dtype=int),
@@ -163,11 +188,40 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
+def _share(residual: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Root of the ratio of the sums of squares, (n,)."""
+    left, whole = (np.einsum("np,np->n", a, a) for a in (residual, pixels))
+    return np.asarray(np.sqrt(left / np.maximum(whole, 1e-300)))
+
+
+def _filled(
+    bench: Bench, pixels: FloatArray, missing: BoolArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Fill missing pixels, and those that the fit then shows to be wrong.
+
+    Returns
+    -------
+    filled, residual : (n, n_pixels) array
+    count : (n,) int array
+        Pixels found wrong.
+    """
+    fit, expected = bench.fit, bench.expected
+    filled = fit.fill(pixels, missing)
+    residual = filled - fit.solve(filled) @ fit.design.T
+    wrong = np.abs(residual - expected.mean) > bench.options.outlier * expected.scatter
+    wrong &= ~missing
+    hit = np.flatnonzero(wrong.any(axis=1))
+    if len(hit):
+        filled[hit] = fit.fill(pixels[hit], missing[hit] | wrong[hit])
+        residual[hit] = filled[hit] - fit.solve(filled[hit]) @ fit.design.T
+    return filled, residual, wrong.sum(axis=1)
+
+
 def _shift(bench: Bench, samples: ComplexArray) -> FloatArray:
     return shift_of(bench.view, bench.sampling.fringes(samples))
 
 
-def select(frames: Frames, limit: float, largest_shift_px: float) -> FloatArray:
+def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.str_]:
     """Say why integrations are not to be used: flux, pointing, shape.
 
     Returns
@@ -181,9 +235,7 @@ def select(frames: Frames, limit: float, largest_shift_px: float) -> FloatArray:
         if used.sum() < 3:
             break
         middle = np.median(values[used])
-        spread = max(
-            TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor * abs(middle), 1e-300
-        )
+        spread = max(TO_SIGMA * float(np.median(np.abs(values[used] - middle))), floor, 1e-300)
         off = (values - middle) / spread
         hit = used & (np.abs(off) > look_elsewhere(limit, int(used.sum())))
         reason[hit] = [f"{name} stands off by {o:.1f} sigma" for o in off[hit]]
@@ -196,11 +248,10 @@ def select(frames: Frames, limit: float, largest_shift_px: float) -> FloatArray:
 
 
 def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
-    """Names, values, and the relative scatter below which nothing stands off."""
-    light = np.where(frames.flux > 0.0, frames.flux, np.nan)
-    with np.errstate(invalid="ignore"):
-        shape = np.sqrt(frames.misfit) / light
-    return [("flux", np.nan_to_num(light), 1e-3), ("shape", np.nan_to_num(shape), 0.1)]
+    """Names, values, and the least scatter that counts."""
+    lit = np.maximum(frames.flux, 0.0)
+    middle = float(np.median(lit[frames.used])) if frames.used.any() else 0.0
+    return [("flux", lit, 1e-3 * middle), ("shape", frames.misfit, 0.02)]
 
 
 def look_elsewhere(limit: float, n: int) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.errors import DataError
-from amibayes.extraction.sampling import Sampling
+from amibayes.extraction.sampling import BoolArray, IntArray, Sampling
 from amibayes.extraction.view import CONVERGED_PX, View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
@@ -45,13 +45,13 @@ class FringeFit:
     @property
     def n_baselines(self) -> int:
         """How many baselines."""
-        return self.design.shape[1] // 2 - 1
+        return int(self.design.shape[1]) // 2 - 1
 
     def solve(self, pixels: FloatArray) -> FloatArray:
         """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
         return np.asarray(pixels @ self.inverse)
 
-    def fill(self, pixels: FloatArray, missing: FloatArray) -> FloatArray:
+    def fill(self, pixels: FloatArray, missing: BoolArray) -> FloatArray:
         """Give missing pixels the values that a fit without them predicts.
 
         Parameters
@@ -65,7 +65,7 @@ class FringeFit:
         """
         frame, pixel = np.nonzero(missing)
         if not len(frame):
-            return pixels
+            return pixels.copy()
         filled = pixels.copy()
         filled[frame, pixel] = 0.0
         count = np.bincount(frame, minlength=len(pixels))
@@ -76,19 +76,15 @@ class FringeFit:
             filled[frames[:, None], index] = self._predicted(filled[frames], index)
         return filled
 
-    def _predicted(self, pixels: FloatArray, index: FloatArray) -> FloatArray:
+    def _predicted(self, pixels: FloatArray, index: IntArray) -> FloatArray:
         """Predictions (n, k) of the pixels ``index`` (n, k), which are 0 in ``pixels``."""
         design, inverse = self.design[index], self.inverse[index]
         system = np.eye(index.shape[1]) - design @ inverse.swapaxes(1, 2)
         start = np.einsum("nkp,np->nk", design, self.solve(pixels))
         return np.asarray(np.linalg.solve(system, start[..., None])[..., 0])
 
-    def misfit(self, pixels: FloatArray, coefficients: FloatArray) -> FloatArray:
-        """Weighted sum of squared residuals of every image, (n,)."""
-        return np.asarray(((pixels - coefficients @ self.design.T) ** 2) @ self.weight)
 
-
-def fringe_fit(basis: FringeBasis, variance: FloatArray, good: FloatArray) -> FringeFit:
+def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> FringeFit:
     """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only."""
     design = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
     weight = np.where(good, 1.0 / variance, 0.0).ravel()
@@ -123,7 +119,7 @@ def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None
 
 
 def centre_on(
-    view: View, image: FloatArray, variance: FloatArray, good: FloatArray, source: str
+    view: View, image: FloatArray, variance: FloatArray, good: BoolArray, source: str
 ) -> tuple[View, FringeBasis]:
     """Move the view's centre to the star, by Gauss–Newton on the phases of its fringes.
 

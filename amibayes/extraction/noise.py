@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
 
+from amibayes.extraction.sampling import BoolArray
 from amibayes.units import FloatArray, read_only
 
 _ROUNDS = 4
@@ -38,7 +39,7 @@ class NoiseModel:
         read_only(self, "variance")
 
 
-def noise_model(mean: FloatArray, measured: FloatArray, good: FloatArray) -> NoiseModel:
+def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> NoiseModel:
     """Fit the variance that was measured at each pixel.
 
     Parameters
@@ -98,7 +99,7 @@ def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:
     return NoiseModel(noise.variance[part], noise.constant, noise.per_signal)
 
 
-def misfit_level(residual: FloatArray, good: FloatArray, noise: NoiseModel) -> float:
+def misfit_level(residual: FloatArray, good: BoolArray, noise: NoiseModel) -> float:
     """Mean square of what the fringe model cannot follow, beyond the noise.
 
     Errors of the optics are the same in every integration. As an even variance on top of

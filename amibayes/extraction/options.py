@@ -33,8 +33,6 @@ class ExtractOptions:
     temperature_k : float, optional
         Blackbody that stands for the star's spectrum; as many photons at every wavelength
         unless given.
-    fit_scale : bool
-        Fit pixel scale and rotation of the mask as well as the centre.
     keep_all : bool
         Leave no integration out that can be measured at all.
 
@@ -50,7 +48,6 @@ class ExtractOptions:
     window_px: float | None = None
     covariance: Literal["shrunk", "scatter", "physical"] = "shrunk"
     temperature_k: float | None = None
-    fit_scale: bool = False
     keep_all: bool = False
 
     def __post_init__(self) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from amibayes.covariance import BlockCovariance
 from amibayes.errors import DataError
 from amibayes.extraction.extract import Extraction
 from amibayes.observables import Measurements, Observables, join
@@ -36,11 +37,10 @@ def integrations(extraction: Extraction) -> Observables:
     vis2, closure = series(extraction)
     mean = extraction.observables
     covariance = mean.covariance
+    assert isinstance(covariance, BlockCovariance)
     n = len(used)
-    whole = type(covariance)(
-        covariance.size,
-        [replace(b, matrix=b.matrix * n) for b in covariance.blocks],  # type: ignore[attr-defined]
-    )
+    blocks = [replace(b, matrix=b.matrix * n) for b in covariance.blocks]
+    whole = BlockCovariance(covariance.size, blocks)
     time = extraction.frames.mjd[used]
     parts = []
     for k in range(n):

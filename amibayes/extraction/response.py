@@ -16,7 +16,7 @@ from amibayes.optics import psf
 from amibayes.optics.psf import ComplexArray
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
 from amibayes.orientation import Orientation
-from amibayes.response import EXPONENTS, even_powers
+from amibayes.response import EXPONENTS, IS_PHASE, powers_at
 from amibayes.units import FloatArray
 
 RADII = 7
@@ -39,19 +39,22 @@ def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) 
     Returns
     -------
     (1 + n_baselines, n_coefficients) array
-        Of ln(response) in `amibayes.response.even_powers` of east and north in radians,
+        Of ln(response) in `amibayes.response.powers_at` of east and north in radians,
         beyond the smearing over the filter's width (`relative_band`).
     """
     place = _places(view)
     flux, samples = _measured(view, sampling, place)
     turns = view.uv_m @ place.T / view.wavelength_m
-    expected = np.abs(np.sinc(relative_band(view) * turns))
-    ratio = np.vstack([flux, np.abs(sampling.fringes(samples).T) / expected])
+    expected = np.exp(-2j * np.pi * turns) * np.sinc(relative_band(view) * turns)
+    ratio = np.vstack([flux, sampling.fringes(samples).T / expected])
     east, north = orientation.to_sky(place).T
     scale = float(np.hypot(east, north).max())
-    powers = even_powers(east / scale, north / scale)
-    log = np.log(np.maximum(ratio, SMALLEST))
-    coefficients = np.linalg.lstsq(powers.T, log.T, rcond=None)[0].T
+    powers = powers_at(east / scale, north / scale)
+    coefficients = np.zeros((len(ratio), len(EXPONENTS)))
+    log = np.log(np.maximum(np.abs(ratio), SMALLEST))
+    for part, values in ((~IS_PHASE, log), (IS_PHASE, np.angle(ratio))):
+        basis = (powers.real + powers.imag)[part]
+        coefficients[:, part] = np.linalg.lstsq(basis.T, values.T, rcond=None)[0].T
     return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
 
 

@@ -18,6 +18,7 @@ from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray, read_only
 
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +139,8 @@ class Sampling:
         total = self.bispectrum(samples[None])[0]
         slope = np.zeros((len(total), 2, self.n_samples), dtype=complex)
         for index, value, turn in ((a, sb * sc, 1j), (b, sa * sc, 1j), (c, sa * sb, -1j)):
-            np.add.at(slope, (self.triangle, 0, index), value)
-            np.add.at(slope, (self.triangle, 1, index), turn * value)
+            np.add.at(slope[:, 0], (self.triangle, index), value)
+            np.add.at(slope[:, 1], (self.triangle, index), turn * value)
         out = (slope / total[:, None, None]).imag
         return np.concatenate([np.zeros((len(total), 1)), out.reshape(len(total), -1)], axis=1)
 

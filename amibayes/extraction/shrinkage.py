@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import multigammaln
 
+from amibayes.extraction.sampling import BoolArray
 from amibayes.units import FloatArray, read_only
 
 MOST_FREEDOM = 1e4
@@ -94,12 +95,13 @@ def shrunk_covariance(
     return Shrunk(spread @ inner @ spread.T, prior, freedom, *scales, block, correlation)
 
 
-def _scales(inner: FloatArray, groups: FloatArray) -> tuple[float, float]:
+def _scales(inner: FloatArray, groups: BoolArray) -> tuple[float, float]:
     diagonal = np.diag(inner)
-    return tuple(float(diagonal[g].mean()) if g.any() else 1.0 for g in (groups, ~groups))  # type: ignore[return-value]
+    mean = [float(diagonal[g].mean()) if g.any() else 1.0 for g in (groups, ~groups)]
+    return mean[0], mean[1]
 
 
-def _most_likely(white: FloatArray, groups: FloatArray) -> tuple[float, tuple[float, float]]:
+def _most_likely(white: FloatArray, groups: BoolArray) -> tuple[float, tuple[float, float]]:
     """Prior degrees of freedom and the two scales of greatest marginal likelihood."""
     p, n = white.shape
     m, scatter = n - 1, white @ white.T

@@ -11,6 +11,7 @@ from amibayes.extraction.averaging import Average
 from amibayes.extraction.response import relative_band
 from amibayes.extraction.view import View
 from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
+from amibayes.response import REVERSED
 from amibayes.units import FloatArray
 
 
@@ -64,8 +65,8 @@ def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) 
     right, down = (header.get(key) for key in ("TARG_RA", "TARG_DEC"))
     between = np.zeros((n, n, response.shape[1]))
     between[np.arange(n), np.arange(n)] = response[0]
-    for at in (mask.pairs, mask.pairs[:, ::-1]):
-        between[at[:, 0], at[:, 1]] = response[1:]
+    a, b = mask.pairs.T
+    between[a, b], between[b, a] = response[1:], response[1:] * REVERSED
     return Setup(
         f"{template.instrument.upper()}_{view.instrument.bandpass.name}",
         mask.name[:40],

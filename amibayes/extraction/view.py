@@ -81,7 +81,7 @@ class View:
         ny, nx = self.shape
         x = np.arange(nx) - 0.5 * (nx - 1) - self.centre_px[0]
         y = np.arange(ny) - 0.5 * (ny - 1) - self.centre_px[1]
-        return x, y
+        return np.asarray(x), np.asarray(y)
 
 
 def instrument_of(cube: Cube) -> Instrument:

@@ -225,9 +225,9 @@ class TemplateBank:
         if self._samples.off_axis is None:
             return
         fringe, flux = self._samples.off_axis.at(east_mas, north_mas)
-        cosine *= fringe
-        cosine -= (flux - 1.0) * self._primary[:, None]
-        sine *= fringe
+        turned = (cosine - 1j * sine) * fringe
+        cosine[...] = turned.real - (flux - 1.0) * self._primary[:, None]
+        sine[...] = -turned.imag
 
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""

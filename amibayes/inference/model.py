@@ -89,7 +89,7 @@ class BinaryModel:
         if samples.off_axis is None:
             return wave, 1.0
         fringe, flux = samples.off_axis.at(east_mas, north_mas)
-        return wave * fringe, flux
+        return np.asarray(wave * fringe), flux
 
     def companion(
         self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
@@ -111,7 +111,7 @@ class BinaryModel:
             light = light + contrast * seen.wave
             total = total + contrast * seen.flux
             found.append((contrast, seen))
-        value = light / total
+        value = np.asarray(light / total, dtype=complex)
         out = []
         for contrast, seen in found:
             moved = [w - value * f for w, f in zip(seen.wave_slopes, seen.flux_slopes, strict=True)]

@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.observables import IntArray, Observables
-from amibayes.response import EXPONENTS, even_powers, even_slopes
+from amibayes.response import EXPONENTS, REVERSED, ComplexArray, powers_at, slopes_at
 from amibayes.units import MAS, FloatArray
-
-Slopes = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,32 +19,38 @@ class OffAxis:
     ----------
     fringe, flux : (n_samples, n_coefficients) array
         Logarithm of the response of the visibility and of the flux that it is divided by,
-        in even powers of east and north (radians).
+        as `amibayes.response` has it, of east and north in radians.
     """
 
     fringe: FloatArray
     flux: FloatArray
 
-    def at(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def at(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """Response of visibility and flux, (n_samples, n) each."""
-        powers = even_powers(east_mas * MAS, north_mas * MAS)
-        return np.exp(self.fringe @ powers), np.exp(self.flux @ powers)
+        powers = powers_at(east_mas * MAS, north_mas * MAS)
+        return np.exp(self.fringe @ powers), np.exp((self.flux @ powers).real)
 
-    def slopes(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[Slopes, Slopes]:
+    def slopes(
+        self, east_mas: FloatArray, north_mas: FloatArray
+    ) -> tuple[tuple[ComplexArray, ComplexArray], tuple[FloatArray, FloatArray]]:
         """Derivatives of both logarithms by east and north, per mas, (n_samples, n) each."""
-        east, north = even_slopes(east_mas * MAS, north_mas * MAS)
+        east, north = slopes_at(east_mas * MAS, north_mas * MAS)
         return (
             (self.fringe @ east * MAS, self.fringe @ north * MAS),
-            (self.flux @ east * MAS, self.flux @ north * MAS),
+            ((self.flux @ east).real * MAS, (self.flux @ north).real * MAS),
         )
 
 
-def off_axis_of(data: Observables, first: IntArray) -> OffAxis | None:
-    """Response at points ``first`` of a list of all V² and then all legs of the triangles."""
+def off_axis_of(data: Observables, first: IntArray, sign: FloatArray) -> OffAxis | None:
+    """Response at points ``first`` of a list of all V² and then all legs of the triangles.
+
+    ``sign`` (n,) is −1 where the point is the opposite of the baseline's own.
+    """
     if all(s.response is None for s in data.setups):
         return None
     v2, cp = data.vis2, data.closure_phase
-    legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 0, 2]].reshape(-1, 2)])[first]
+    # The third leg closes the triangle: from its last station back to its first.
+    legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)])[first]
     setup = np.concatenate([v2.setup, np.repeat(cp.setup, 3)])[first]
     fringe = np.zeros((len(first), len(EXPONENTS)))
     flux = np.zeros_like(fringe)
@@ -55,4 +59,5 @@ def off_axis_of(data: Observables, first: IntArray) -> OffAxis | None:
             here = setup == number
             a, b = legs[here].T
             fringe[here], flux[here] = described.response[a, b], described.response[a, a]
+    fringe = np.where(sign[:, None] < 0.0, fringe * REVERSED, fringe)
     return OffAxis(fringe, flux)

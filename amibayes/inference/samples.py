@@ -73,7 +73,7 @@ def samples_of(observables: Observables) -> Samples:
         (band / wavelength)[first],
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
-        off_axis_of(data, first),
+        off_axis_of(data, first, orientation),
     )
 
 

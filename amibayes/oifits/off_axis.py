@@ -14,7 +14,7 @@ from astropy.io import fits
 from amibayes.observables import Setup
 from amibayes.oifits.layout import Layout
 from amibayes.oifits.tables import OWN_KEY, OIFits
-from amibayes.response import EXPONENTS
+from amibayes.response import EXPONENTS, REVERSED
 
 RESPONSE = "AMIBAYES_RESPONSE"
 
@@ -50,6 +50,7 @@ def _explain(table: Any) -> None:
     for line in (
         "Response to light off the axis: visibility of a pair of stations, and flux",
         "(a station with itself). ln(response) = sum of COEFF east^i north^j, radians,",
+        "times the imaginary unit where i + j is odd.",
         f"i,j = {powers}.",
     ):
         table.header["COMMENT"] = line
@@ -69,5 +70,6 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
     for (a, b), row in zip(index, coefficients, strict=True):
         if int(a) in place and int(b) in place:
             i, j = place[int(a)], place[int(b)]
-            response[i, j] = response[j, i] = row
+            response[j, i] = row * REVERSED
+            response[i, j] = row
     return replace(setup, response=response)

@@ -132,11 +132,11 @@ def observables_plot(extraction: Extraction) -> Figure:
     figure = new_figure(7.2)
     upper, lower = figure.subplots(2, 1)
     baseline = np.hypot(data.vis2.u_m[:, 0], data.vis2.v_m[:, 0])
-    _errors(upper, baseline, data.vis2.value, sigma[0], photons[:n])
+    _errors(upper, np.asarray(baseline), data.vis2.value, sigma[0], photons[:n])
     upper.set_xlabel("Baseline (m)")
     upper.set_ylabel("V²")
-    number = 1.0 + np.arange(len(data.closure_phase))
-    degrees = np.degrees
+    number = np.linspace(1.0, len(data.closure_phase), len(data.closure_phase))
+    degrees = _degrees
     _errors(
         lower, number, degrees(data.closure_phase.value), degrees(sigma[1]), degrees(photons[n:])
     )
@@ -146,6 +146,10 @@ def observables_plot(extraction: Extraction) -> Figure:
     lower.legend(loc="best")
     upper.set_title(f"{count} integrations, method {extraction.options.method}")
     return figure
+
+
+def _degrees(angle_rad: FloatArray) -> FloatArray:
+    return np.asarray(np.degrees(angle_rad))
 
 
 def _errors(

@@ -1,0 +1,320 @@
+"""Extraction against images and visibilities that it did not make."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from amibayes.calibration import calibrate
+from amibayes.cli import main
+from amibayes.cli.common import METHODS as CLI_METHODS
+from amibayes.cube import Cube, read_cube, write_cube
+from amibayes.errors import DataError, UsageError
+from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
+from amibayes.extraction.per_integration import integrations, series
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.search import search
+from amibayes.instrument import Instrument, load_instrument
+from amibayes.observables import Observables
+from amibayes.oifits import read_oifits, write_oifits
+from amibayes.optics import psf
+from amibayes.orientation import Orientation
+from amibayes.units import DEGREE, MAS, FloatArray
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+@pytest.fixture(scope="module")
+def niriss() -> Instrument:
+    return load_instrument("niriss", "F430M")
+
+
+def cube_of(images: FloatArray, instrument: Instrument, **more: object) -> Cube:
+    return Cube(
+        images=images,
+        pixel_scale_rad=instrument.pixel_scale_rad,
+        instrument="NIRISS",
+        filter=instrument.bandpass.name,
+        error=np.sqrt(np.maximum(images, 0.0) + 10.0),
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def binary_images(
+    instrument: Instrument, places_px: FloatArray, offset_mas: tuple[float, float], contrast: float
+) -> FloatArray:
+    """A star and a companion at an image offset, each a PSF of its own; no fringe model."""
+    channels = instrument.bandpass.channels()
+    step = np.array(offset_mas) * MAS / instrument.pixel_scale_rad
+
+    def star(at: FloatArray) -> FloatArray:
+        return psf(instrument, channels, 80, centre_px=(float(at[0]), float(at[1])))
+
+    return 1e7 * np.stack([star(p) + contrast * star(p + step) for p in places_px])
+
+
+def jittered(n: int, seed: int) -> FloatArray:
+    return np.array([0.3, -0.2]) + 0.1 * np.random.default_rng(seed).standard_normal((n, 2))
+
+
+def with_photons(images: FloatArray, seed: int) -> FloatArray:
+    return np.random.default_rng(seed).poisson(np.maximum(images, 0.0)).astype(float)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_point_source_has_unit_vis2_and_no_closure_phase(niriss: Instrument, method: str) -> None:
+    images = binary_images(niriss, jittered(4, 1), (0.0, 0.0), 0.0)
+    found = extract_all(cube_of(images, niriss), ExtractOptions(method=method))[0]  # type: ignore[arg-type]
+    # No noise: what is left is the jitter, 0.1 pixels under an envelope that stays, and
+    # without a window the light that the image's edges cut off.
+    assert np.abs(found.average.vis2 - 1.0).max() < 5e-4
+    assert np.abs(found.average.closure_phase).max() < np.radians(0.06)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("separation", [50.0, 150.0, 200.0, 300.0, 400.0])
+def test_companions_in_the_images_keep_their_contrast(
+    niriss: Instrument, method: str, separation: float
+) -> None:
+    angle = np.radians(37.0)
+    offset = (-separation * np.sin(angle), separation * np.cos(angle))
+    both = []
+    for at, contrast in (((0.0, 0.0), 0.0), (offset, 0.01)):
+        images = binary_images(niriss, np.array([[0.2, -0.1], [0.25, -0.05]]), at, contrast)
+        options = ExtractOptions(method=method, covariance="physical")  # type: ignore[arg-type]
+        both.append(extract_all(cube_of(images, niriss), options)[0].observables)
+    likelihood = Likelihood(calibrate(both[1], [both[0]]).observables)
+    found = search(likelihood, (0.6 * separation, 1.3 * separation)).companion
+    worst = {"fft": 0.03, "square": 0.03}.get(method, 0.01)
+    assert found.contrast == pytest.approx(0.01, rel=worst)
+    assert np.hypot(found.east_mas + offset[0], found.north_mas - offset[1]) < max(
+        2.0, 0.012 * separation
+    )
+
+
+def truth_differences(calibrated: Observables, theta: list[float]) -> tuple[float, float]:
+    """RMS of V² and of closure phase (degrees) about a binary."""
+    likelihood = Likelihood(calibrated)
+    rest = likelihood._difference(likelihood.predict([theta]))[:, 0]
+    n = calibrated.n_vis2
+    return rms(rest[:n]), float(np.degrees(rms(rest[n:])))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_ami_sim_pair_gives_the_companion_that_was_put_in(data: Path, method: str) -> None:
+    target, calibrator = (
+        extract(data / "cubes" / f"niriss_f480m_{name}.fits", method, filter="F480M")  # type: ignore[arg-type]
+        for name in ("target", "calibrator")
+    )
+    calibrated = calibrate(target, [calibrator]).observables
+    vis2, closure = truth_differences(calibrated, [-160.0, 117.0, 0.01])
+    assert vis2 < 0.0006
+    assert closure < (0.045 if method == "fft" else 0.03)
+    found = search(Likelihood(calibrated), (50.0, 400.0)).companion
+    assert found.separation_mas == pytest.approx(198.3, abs=2.0)
+    assert found.east_mas == pytest.approx(-160.0, abs=2.0)
+    assert found.north_mas == pytest.approx(117.0, abs=2.0)
+    assert found.contrast == pytest.approx(0.01, abs=0.0005)
+
+
+def test_independent_psf(niriss: Instrument) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        poppy = pytest.importorskip("poppy")
+        holes = [
+            poppy.HexagonAperture(flattoflat=niriss.mask.size_m, rotation=0.0, name=f"hole {k}")
+            for k in range(niriss.mask.n_holes)
+        ]
+        for hole, (x, y) in zip(holes, niriss.mask.holes_m, strict=True):
+            hole.shift_x, hole.shift_y = x, y
+        system = poppy.OpticalSystem(pupil_diameter=6.6, npix=1024, oversample=1)
+        system.add_pupil(poppy.CompoundAnalyticOptic(holes, mergemode="or"))
+        pixel = np.degrees(niriss.pixel_scale_rad) * 3600.0
+        system.add_detector(pixelscale=pixel, fov_pixels=80, oversample=5)
+        few = niriss.bandpass.channels(n=3)
+        fine = sum(
+            w * system.calc_psf(wavelength=float(wavelength))[0].data
+            for wavelength, w in zip(few.wavelength_m, few.weight, strict=True)
+        )
+    image = np.asarray(fine).reshape(80, 5, 80, 5).sum(axis=(1, 3))
+    images = np.stack([1e7 * image / image.sum()] * 3)
+    for method in ("fringes", "matched", "unique"):
+        found = extract_all(cube_of(images, niriss), ExtractOptions(method=method))[0]  # type: ignore[arg-type]
+        # 3 wavelengths leave 1e-3 of the image, and a pupil of black and white cells too.
+        assert np.abs(found.average.vis2 - 1.0).max() < 0.02
+        assert np.abs(np.degrees(found.average.closure_phase)).max() < 0.2
+
+
+def test_orientation_turns_the_companion(niriss: Instrument) -> None:
+    images = binary_images(niriss, jittered(3, 2), (120.0, 160.0), 0.02)
+    turned = Orientation(35.0 * DEGREE, -1)
+    found = search(Likelihood(extract(cube_of(images, niriss, orientation=turned))), (100.0, 300.0))
+    expected = 35.0 + np.degrees(np.arctan2(-120.0, 160.0))
+    assert found.companion.position_angle_deg == pytest.approx(expected % 360.0, abs=0.3)
+    assert found.companion.separation_mas == pytest.approx(200.0, abs=1.0)
+
+
+def test_bad_pixels_leave_the_rest_alone(niriss: Instrument) -> None:
+    clean = with_photons(binary_images(niriss, jittered(12, 3), (120.0, 160.0), 0.02), 4)
+    dirty, rng = clean.copy(), np.random.default_rng(5)
+    for image in dirty:
+        image[rng.integers(0, 80, 20), rng.integers(0, 80, 20)] = rng.choice([np.nan, 3e6], 20)
+    dirty[:, 40, 44] = np.nan
+    dirty[:, 30, 30] = 2e6
+    first, second = (
+        extract_all(replace(cube_of(clean, niriss), images=images))[0] for images in (clean, dirty)
+    )
+    assert second.benches[0].reference.n_bad == 2
+    assert second.frames.used.all()
+    change = (second.observables.data - first.observables.data) / np.sqrt(
+        first.observables.covariance.variance
+    )
+    assert rms(change) < 1.0
+
+
+def test_odd_integrations_go_and_the_others_stay(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(15, 6), (0.0, 0.0), 0.0), 7)
+    images[3] = np.nan
+    images[5] *= 0.7
+    images[8] = 0.0
+    images[11] = np.roll(images[11], 3, axis=1)
+    found = extract_all(cube_of(images, niriss))[0]
+    assert [number for _, number, _ in found.rejected] == [3, 5, 8, 11]
+    assert all(reason for *_, reason in found.rejected)
+    kept = extract_all(cube_of(images[[0, 1, 2, 4, 6, 7]], niriss))[0]
+    assert kept.frames.used.all()
+
+
+def test_one_and_two_integrations(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(2, 8), (0.0, 0.0), 0.0), 9)
+    single = extract(cube_of(images[:1], niriss))
+    assert (single.covariance_kind, single.n_integrations) == ("given", None)
+    assert extract(cube_of(images, niriss)).n_integrations == 2
+    bare = extract(replace(cube_of(images[:1], niriss), error=None))
+    ratio = np.sqrt(bare.covariance.variance / single.covariance.variance)
+    assert 0.7 < np.median(ratio) < 1.4
+
+
+def test_files_of_one_exposure_are_one(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(12, 10), (0.0, 0.0), 0.0), 11)
+    halves = [replace(cube_of(part, niriss)) for part in (images[:6], images[6:])]
+    joined = extract_all(halves)
+    assert len(joined) == 1
+    assert joined[0].observables.n_integrations == 12
+    whole = extract(cube_of(images, niriss))
+    change = (joined[0].observables.data - whole.data) / np.sqrt(whole.covariance.variance)
+    assert rms(change) < 0.5
+    turned = replace(halves[1], orientation=Orientation(0.5, -1))
+    assert len(extract_all([halves[0], turned])) == 2
+
+
+def test_oifits_keeps_everything(niriss: Instrument, tmp_path: Path) -> None:
+    images = with_photons(binary_images(niriss, jittered(10, 12), (90.0, 0.0), 0.05), 13)
+    before = extract(cube_of(images, niriss, integration_time_s=2.0, mjd=59000.0 + np.arange(10)))
+    write_oifits(tmp_path / "x.oifits", before)
+    after = read_oifits(tmp_path / "x.oifits")
+    np.testing.assert_array_equal(after.data, before.data)
+    # Cholesky factors of the same matrix: equal to rounding.
+    np.testing.assert_allclose(
+        after.covariance.dense(), before.covariance.dense(), rtol=1e-12, atol=1e-18
+    )
+    assert after.setups[0].response is not None
+    np.testing.assert_array_equal(after.setups[0].response, before.setups[0].response)
+    assert after.n_integrations == 10
+    assert after.vis2.integration_s[0] == 20.0
+    assert after.vis2.mjd[0] == pytest.approx(59004.5)
+    theta = [[80.0, 60.0, 0.02]]
+    assert Likelihood(after).chi2(theta) == pytest.approx(Likelihood(before).chi2(theta), rel=1e-9)
+
+
+def test_gradient_follows_the_response(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(10, 14), (90.0, 0.0), 0.05), 15)
+    likelihood = Likelihood(extract(cube_of(images, niriss)))
+    theta = np.array([[-150.0, 210.0, 0.05]])
+    _, gradient = likelihood.log_prob_and_gradient(theta)
+    for k, step in enumerate((1e-3, 1e-3, 1e-6)):
+        ahead, behind = theta.copy(), theta.copy()
+        ahead[0, k] += step
+        behind[0, k] -= step
+        slope = (likelihood.log_prob(ahead) - likelihood.log_prob(behind)) / (2.0 * step)
+        # Central differences lose eight of sixteen digits of the likelihood.
+        assert gradient[0, k] == pytest.approx(slope[0], rel=1e-4)
+
+
+def test_per_integration_series_average_to_the_mean(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(6, 16), (0.0, 0.0), 0.0), 17)
+    found = extract_all(cube_of(images, niriss))[0]
+    vis2, closure = series(found)
+    np.testing.assert_allclose(vis2.mean(axis=0), found.average.vis2, rtol=1e-12)
+    np.testing.assert_allclose(closure.mean(axis=0), found.average.closure_phase, atol=1e-12)
+    each = integrations(found)
+    assert (each.n_vis2, each.n_closure_phases) == (6 * 21, 6 * 35)
+
+
+def test_faults_are_named(niriss: Instrument, tmp_path: Path) -> None:
+    images = binary_images(niriss, jittered(3, 18), (0.0, 0.0), 0.0)
+    good = cube_of(images, niriss)
+    cases = {
+        "no integration holds light": replace(good, images=np.zeros_like(images)),
+        "edge of the image": replace(good, images=np.roll(images, 39, axis=2)),
+        "leave .* of the image": replace(good, filter="F277W"),
+        "has no filter": replace(good, filter="F999W"),
+        "is not known": replace(good, instrument="NOBODY"),
+        "do not hold one fringe": replace(good, images=images[:, :9, :9], error=None, dq=None),
+    }
+    for message, cube in cases.items():
+        with pytest.raises(DataError, match=message):
+            extract(cube)
+    with pytest.raises(DataError, match="no cube"):
+        extract([])
+    with pytest.raises(UsageError, match="method"):
+        extract(good, "magic")  # type: ignore[arg-type]
+
+
+def test_command_writes_what_it_says(
+    niriss: Instrument, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = with_photons(binary_images(niriss, jittered(8, 19), (0.0, 0.0), 0.0), 20)
+    path = tmp_path / "star_calints.fits"
+    write_cube(path, cube_of(images, niriss, mjd=59000.0 + np.arange(8)))
+    out = tmp_path / "out"
+    line = ["extract", str(path), "--per-integration", "--out", str(out), "--json"]
+    assert main(line) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content == json.loads((out / "extract.json").read_text())
+    assert content["extractions"][0]["n_used"] == 8
+    header = fits.getheader(out / "star_calints.oifits")
+    assert header["AMIBAYES METHOD"] == "fringes"
+    assert header["AMIBAYES SOURCE1"] == path.name
+    names = {p.name.removeprefix("star_calints") for p in out.iterdir()}
+    assert {".oifits", "_integrations.oifits", "_frame.png", "_fit.png", "_time.png"} <= names
+    assert main(line) == 2  # nothing is overwritten
+    assert main(["extract", str(tmp_path / "none.fits"), "--out", str(tmp_path / "o2")]) == 3
+    assert CLI_METHODS == METHODS
+
+
+def test_search_takes_cubes(niriss: Instrument, tmp_path: Path) -> None:
+    for name, contrast, seed in (("target", 0.02, 21), ("cal", 0.0, 22)):
+        images = binary_images(niriss, jittered(8, seed), (120.0, 160.0), contrast)
+        write_cube(tmp_path / f"{name}.fits", cube_of(with_photons(images, seed), niriss))
+    line = f"search {tmp_path}/target.fits --cal {tmp_path}/cal.fits --separation 50:400"
+    line += f" --null-draws 0 --no-posterior --no-limits --method matched --out {tmp_path}/out"
+    assert main(line.split()) == 0
+    fit = json.loads((tmp_path / "out" / "result.json").read_text())["fit"]
+    assert fit["separation_mas"] == pytest.approx(200.0, abs=6.0 * fit["errors"]["separation_mas"])
+    assert fit["contrast"] == pytest.approx(0.02, abs=6.0 * fit["errors"]["contrast"])
+
+
+def test_calints_made_by_mirage(data: Path) -> None:
+    cube = read_cube(data / "cubes" / "niriss_f480m_calints.fits")
+    found = extract_all(cube)[0]
+    assert found.frames.used.sum() >= 66
+    assert found.average.vis2.min() > 0.8
