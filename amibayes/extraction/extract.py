@@ -38,6 +38,9 @@ from amibayes.units import FloatArray
 MOST_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
+SMOOTH_SHARE, SMOOTH_FLOOR = 0.7, 0.01
+"""How far the weights follow the envelope only, and its least value in units of its peak."""
+
 JITTER_SLACK = 0.01
 """Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
@@ -183,13 +186,31 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     image, good = reference.image[part], reference.good[part]
     view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
     noise, level, expected = _noise_and_misfit(view, basis, reference)
-    fit = fringe_fit(basis, noise.variance + level, good)
+    fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
     covariance = sampling.noise(np.where(good, noise.variance, 0.0))
     return Bench(view, reference, fit, expected, sampling, covariance, options)
+
+
+def _fit_variance(
+    basis: FringeBasis, image: FloatArray, noise: NoiseModel, good: BoolArray
+) -> FloatArray:
+    """Variance that the fit's weights are made of.
+
+    Weights that follow every fringe of the star would be the best for the star; a
+    companion's light, whose fringes lie elsewhere, would be let through in a way that no
+    smooth function of its place describes. Most of the variance is therefore that of the
+    star's envelope.
+    """
+    envelope = basis.matrix[:, 0].reshape(image.shape)
+    light = float(image[good].sum() / max(float(envelope[good].sum()), 1e-300))
+    smooth = noise.per_signal * light * (envelope + SMOOTH_FLOOR * envelope.max())
+    return np.asarray(
+        (1.0 - SMOOTH_SHARE) * noise.variance + SMOOTH_SHARE * (noise.constant + smooth)
+    )
 
 
 def _noise_and_misfit(
