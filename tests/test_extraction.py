@@ -28,7 +28,6 @@ from amibayes.optics import psf
 from amibayes.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
-
 SLOWER = [
     pytest.param(m, marks=pytest.mark.slow) if m in ("fft", "gauss", "square") else m
     for m in METHODS
