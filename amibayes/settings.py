@@ -54,6 +54,7 @@ class Section:
         *,
         above: float = -math.inf,
         at_least: float = -math.inf,
+        at_most: float = math.inf,
     ) -> float:
         """Return a finite number, within its bounds.
 
@@ -70,15 +71,21 @@ class Section:
         if value <= above or value < at_least:
             bound = f"above {above:g}" if value <= above else f"at least {at_least:g}"
             raise self.fault(key, f"is {value:g}; it must be {bound}")
+        if value > at_most:
+            raise self.fault(key, f"is {value:g}; it must be at most {at_most:g}")
         return float(value)
 
-    def whole(self, key: str, default: int = _MISSING, *, at_least: int = 0) -> int:
-        """Return a whole number, ``at_least`` or more."""
+    def whole(
+        self, key: str, default: int = _MISSING, *, at_least: int = 0, at_most: int | None = None
+    ) -> int:
+        """Return a whole number between ``at_least`` and ``at_most``."""
         value = self._get(key, default)
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.fault(key, f"is {value!r}, not a whole number")
         if value < at_least:
             raise self.fault(key, f"is {value}; it must be at least {at_least}")
+        if at_most is not None and value > at_most:
+            raise self.fault(key, f"is {value}; it must be at most {at_most}")
         return value
 
     def flag(self, key: str, default: bool = _MISSING) -> bool:

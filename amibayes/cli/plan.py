@@ -12,6 +12,7 @@ from amibayes.cli.common import (
     number_range,
     positive_float,
 )
+from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
     from amibayes.planning import ContrastCurve, Expectation, Plan
@@ -67,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.files import output_folder, write_json
     from amibayes.instrument import load_instrument
     from amibayes.planning import PlanOptions, expect, make_plan
+    from amibayes.units import MAS
 
     instrument = load_instrument(arguments.instrument, arguments.filter)
     plan = make_plan(
@@ -77,6 +79,13 @@ def run(arguments: argparse.Namespace) -> int:
         time_s=arguments.time,
         options=PlanOptions(arguments.preset, arguments.peak_limit),
     )
+    if arguments.separation[1] * MAS > instrument.field_rad:
+        raise UsageError(
+            f"reaches {arguments.separation[1]:g} mas, the field is "
+            f"{instrument.field_rad / MAS:.0f} mas wide",
+            source="--separation",
+            remedy="narrow the range",
+        )
     expected = expect(plan, arguments.separation)
     content = as_json(plan, expected, arguments.mag)
     folder = output_folder(arguments.out, ["plan.json"], overwrite=arguments.overwrite)

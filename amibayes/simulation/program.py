@@ -30,6 +30,12 @@ from amibayes.units import DEGREE, MAS
 PHOTONS = 1e7
 """Photons of an exposure where the file does not say."""
 
+LARGEST_POINTING_MAS = 1000.0
+"""Jitter or dither past this would leave the star out of most images."""
+
+MOST_PIXELS = 2048
+"""Side of the largest image: the detector's own."""
+
 BETWEEN_S = 300.0
 """Time from the end of an exposure to the start of the next."""
 
@@ -243,9 +249,11 @@ class _Reader:
         return Exposure(
             groups,
             integrations,
-            jitter_rad=table.number("jitter_mas", 7.0, at_least=0.0) * MAS,
-            dither_rad=table.number("dither_mas", 15.0, at_least=0.0) * MAS,
-            n_pixels=table.whole("n_pixels", 80, at_least=8),
+            jitter_rad=table.number("jitter_mas", 7.0, at_least=0.0, at_most=LARGEST_POINTING_MAS)
+            * MAS,
+            dither_rad=table.number("dither_mas", 15.0, at_least=0.0, at_most=LARGEST_POINTING_MAS)
+            * MAS,
+            n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MOST_PIXELS),
             keep_ramps=table.flag("ramps", False) or self.overrides.ramps,
         )
 
