@@ -79,10 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         time_s=arguments.time,
         options=PlanOptions(arguments.preset, arguments.peak_limit),
     )
-    if arguments.separation[1] * MAS > instrument.field_rad:
+    if arguments.separation[1] * MAS > 3.0 * instrument.field_rad:
         raise UsageError(
-            f"reaches {arguments.separation[1]:g} mas, the field is "
-            f"{instrument.field_rad / MAS:.0f} mas wide",
+            f"reaches {arguments.separation[1]:g} mas; the baselines tell positions apart over "
+            f"{instrument.field_rad / MAS:.0f} mas",
             source="--separation",
             remedy="narrow the range",
         )

@@ -353,3 +353,8 @@ def _scheduled(shots: list[Shot]) -> tuple[Shot, ...]:
         duration = exposure.n_integrations * (exposure.n_groups + 1) * frame
         start += (duration + BETWEEN_S) / 86400.0
     return tuple(timed)
+
+
+def _pointing(table: Section, key: str, default_mas: float) -> float:
+    """Rms of the pointing along an axis, radians."""
+    return MAS * table.number(key, default_mas, at_least=0.0, at_most=LARGEST_POINTING_MAS)
