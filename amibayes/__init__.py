@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from amibayes.inference.search import search
     from amibayes.inference.significance import Significance, significance
     from amibayes.instrument import Instrument, instrument_names, load_instrument
+    from amibayes.job import SearchOptions, SearchReport
     from amibayes.observables import Observables, join
     from amibayes.oifits import (
         OIFits,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
     from amibayes.orientation import Orientation
     from amibayes.parallel import open_executor
-    from amibayes.pipeline import SearchOptions, SearchReport, search_companion
+    from amibayes.pipeline import search_companion
     from amibayes.planning import expect, make_plan
     from amibayes.scene import Scene
     from amibayes.scene_file import load_scene
@@ -73,8 +74,8 @@ _HOME = {
     "PupilMap": "amibayes.optics",
     "RunError": "amibayes.errors",
     "Scene": "amibayes.scene",
-    "SearchOptions": "amibayes.pipeline",
-    "SearchReport": "amibayes.pipeline",
+    "SearchOptions": "amibayes.job",
+    "SearchReport": "amibayes.job",
     "SearchResult": "amibayes.inference.results",
     "Significance": "amibayes.inference.significance",
     "TemplateBank": "amibayes.inference.bank",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from amibayes.pipeline import SearchOptions, SearchReport, calibrator_verdicts
+from amibayes.job import SearchOptions, SearchReport, calibrator_verdicts
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot

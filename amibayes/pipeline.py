@@ -5,127 +5,35 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from amibayes.calibration import Calibration, Method, calibrate
+from amibayes.calibration import Calibration, calibrate
 from amibayes.errors import DataError, UsageError
-from amibayes.extraction.reading import ImageOptions, read_observations
+from amibayes.extraction.reading import read_observations
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.evidence import Evidence, weigh_models
-from amibayes.inference.evidence import Method as EvidenceMethod
 from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.limits import DetectionLimit, detection_limit
+from amibayes.inference.limits import detection_limit
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.multiplicity import search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
 from amibayes.inference.posterior import Posterior, modes_to_sample, sample
-from amibayes.inference.priors import Prior, PriorSetting, default_prior, edit_prior
+from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
-from amibayes.inference.significance import ALPHA, Significance, bank_statistic, significance
+from amibayes.inference.significance import Significance, bank_statistic, significance
+from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables, join
 from amibayes.parallel import Executor, Progress
 from amibayes.vetting import Vetting, doubts, vet
 
 Stage = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class SearchOptions:
-    """What the main job is asked to do.
-
-    Parameters
-    ----------
-    separation_mas : (inner, outer), optional
-        By default λ/2B_max to λ/B_min of the data.
-    observables : tuple of {"vis2", "cp"}
-    diameter : float, "free" or None
-        Uniform-disc diameter of the primary, mas. None: free where the longest baseline
-        would notice a disc of 0.3 mas and V² is used, else 0.
-    background : float or "free"
-        Over-resolved flux in units of the primary's.
-    smearing : bool
-    closure_covariance : {"assumed", "diagonal"}
-        For files that give errors and no correlations.
-    calibration : {"hierarchical", "weighted"}, optional
-        By default hierarchical with 3 calibrators or more.
-    clip : float
-        Sigma clipping of the calibrators.
-    keep_all : bool
-        Use all calibrators, whatever vetting would say of them.
-    insname, target : str, optional
-        One instrument, one target of a file that holds several.
-    null_draws : int
-        0 leaves the false-alarm probability out.
-    alpha : float
-        False-alarm probability of a detection.
-    extra_noise : bool
-        Add noise per kind of observable where the residuals ask for it.
-    posterior, limits : bool
-        Whether to sample the posterior, and to measure detection limits (which need the
-        null draws).
-    companions : tuple of int, optional
-        Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
-        where the posterior is sampled.
-    evidence_method : {"direct", "laplace", "nested"}
-        See `amibayes.inference.evidence`.
-    prior : tuple of PriorSetting
-        Changes of the default prior.
-    seed : int
-    images : ImageOptions, optional
-        How image cubes are turned into observables.
-    """
-
-    separation_mas: tuple[float, float] | None = None
-    observables: tuple[str, ...] = ("vis2", "cp")
-    diameter: float | Literal["free"] | None = None
-    background: float | Literal["free"] = 0.0
-    smearing: bool = True
-    closure_covariance: Literal["assumed", "diagonal"] = "assumed"
-    calibration: Method | None = None
-    clip: float = 3.0
-    keep_all: bool = False
-    insname: str | None = None
-    target: str | None = None
-    null_draws: int = 10_000
-    alpha: float = ALPHA
-    extra_noise: bool = True
-    posterior: bool = True
-    limits: bool = True
-    companions: tuple[int, ...] | None = None
-    evidence_method: EvidenceMethod = "direct"
-    prior: tuple[PriorSetting, ...] = ()
-    seed: int = 1
-    images: ImageOptions | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class SearchReport:
-    """Everything the main job found, for `amibayes.report` and `amibayes.plots`."""
-
-    options: SearchOptions
-    targets: tuple[str, ...]
-    calibrators: tuple[str, ...]
-    observables: Observables
-    calibration: Calibration | None
-    references: tuple[Observables, ...]
-    vetting: Vetting | None
-    result: SearchResult
-    noise: ExtraNoise
-    significance: Significance | None
-    posterior: Posterior | None
-    limits: DetectionLimit | None
-    warnings: tuple[str, ...]
-    grid: GridPosterior | None = None
-    evidence: Evidence | None = None
-    timing_s: dict[str, float] = field(default_factory=dict)
 
 
 FEWEST_TO_VET = 3
@@ -208,25 +116,17 @@ def search_companion(
         if options.null_draws:
             with clock.stage("significance"):
                 weight = _weigh(result, options, streams[0], executor, progress)
-        prior = _prior(result, options)
-        grid = _integrated(result, prior, options, clock)
-        if options.posterior:
-            with clock.stage("posterior"):
-                posterior = sample(
-                    result,
-                    prior,
-                    streams[1],
-                    path=chain,
-                    resume=resume,
-                    grid=grid,
-                    progress=progress,
-                )
-        evidence = _compared(result, prior, grid, options, streams[4], clock)
         if options.limits and weight is not None:
             with clock.stage("limits"):
                 limits = detection_limit(
                     result, weight, streams[2], executor=executor, progress=progress
                 )
+        prior = _prior(result, options)
+        grid = _integrated(result, prior, options, clock)
+        if options.posterior:
+            onward = _Chain(chain, resume, progress)
+            posterior = _sampled(result, prior, grid, streams[1], onward, clock)
+        evidence = _compared(result, prior, grid, options, streams[4], clock)
     said = [*_vetting_warnings(vetting), *widened, *_different_targets(parts)]
     return SearchReport(
         options,
@@ -246,6 +146,35 @@ def search_companion(
         evidence,
         clock.seconds,
     )
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """Where the chain of a posterior is kept, and who is told how far it is."""
+
+    path: str | Path | None
+    resume: bool
+    progress: Progress | None
+
+
+def _sampled(
+    result: SearchResult,
+    prior: Prior,
+    grid: GridPosterior | None,
+    rng: np.random.Generator,
+    chain: _Chain,
+    clock: _Clock,
+) -> Posterior:
+    with clock.stage("posterior"):
+        return sample(
+            result,
+            prior,
+            rng,
+            path=chain.path,
+            resume=chain.resume,
+            grid=grid,
+            progress=chain.progress,
+        )
 
 
 def _calibrated(
@@ -473,25 +402,3 @@ def _warnings(
             f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
         )
     return tuple(found)
-
-
-def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
-    """Every calibrator in the order given: vetting's verdict, then what calibration used."""
-    if report.calibration is None:
-        return []
-    used = iter(report.calibration.calibrators)
-    verdicts = None if report.vetting is None else report.vetting.calibrators
-    out: list[dict[str, object]] = []
-    for k, path in enumerate(report.calibrators):
-        vetted = None if verdicts is None else verdicts[k]
-        judged = vetted if vetted is not None and not vetted.kept else next(used)
-        agreement = None if vetted is None else vetted.agreement
-        out.append(
-            {
-                "path": path,
-                "kept": judged.kept,
-                "reason": judged.reason,
-                "agreement_probability": agreement,
-            }
-        )
-    return out

@@ -17,7 +17,7 @@ from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.significance import Significance
-from amibayes.pipeline import SearchReport, calibrator_verdicts
+from amibayes.job import SearchReport, calibrator_verdicts
 from amibayes.units import contrast_to_delta_mag
 
 Json = dict[str, Any]

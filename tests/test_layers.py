@@ -38,6 +38,7 @@ LAYERS = [
     "planning",
     "validation",
     "plots",
+    "job",
     "pipeline",
     "pictures",
     "report",

@@ -10,7 +10,7 @@ from amibayes.cli import common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
-    from amibayes.pipeline import SearchOptions, SearchReport
+    from amibayes.job import SearchOptions, SearchReport
 
 RESULT, CHAIN, CALIBRATED = "result.json", "posterior.h5", "calibrated.oifits"
 
@@ -188,7 +188,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
 
 
 def _options(arguments: argparse.Namespace) -> SearchOptions:
-    from amibayes.pipeline import SearchOptions
+    from amibayes.job import SearchOptions
 
     if arguments.calibration and not arguments.cal:
         raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")

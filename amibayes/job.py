@@ -1,0 +1,133 @@
+"""The main job's request and its answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from amibayes.calibration import Calibration, Method
+from amibayes.extraction.reading import ImageOptions
+from amibayes.inference.evidence import Evidence
+from amibayes.inference.evidence import Method as EvidenceMethod
+from amibayes.inference.grid_posterior import GridPosterior
+from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.noise import ExtraNoise
+from amibayes.inference.posterior import Posterior
+from amibayes.inference.priors import PriorSetting
+from amibayes.inference.results import SearchResult
+from amibayes.inference.significance import ALPHA, Significance
+from amibayes.observables import Observables
+from amibayes.vetting import Vetting
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """What the main job is asked to do.
+
+    Parameters
+    ----------
+    separation_mas : (inner, outer), optional
+        By default λ/2B_max to λ/B_min of the data.
+    observables : tuple of {"vis2", "cp"}
+    diameter : float, "free" or None
+        Uniform-disc diameter of the primary, mas. None: free where the longest baseline
+        would notice a disc of 0.3 mas and V² is used, else 0.
+    background : float or "free"
+        Over-resolved flux in units of the primary's.
+    smearing : bool
+    closure_covariance : {"assumed", "diagonal"}
+        For files that give errors and no correlations.
+    calibration : {"hierarchical", "weighted"}, optional
+        By default hierarchical with 3 calibrators or more.
+    clip : float
+        Sigma clipping of the calibrators.
+    keep_all : bool
+        Use all calibrators, whatever vetting would say of them.
+    insname, target : str, optional
+        One instrument, one target of a file that holds several.
+    null_draws : int
+        0 leaves the false-alarm probability out.
+    alpha : float
+        False-alarm probability of a detection.
+    extra_noise : bool
+        Add noise per kind of observable where the residuals ask for it.
+    posterior, limits : bool
+        Whether to sample the posterior, and to measure detection limits (which need the
+        null draws).
+    companions : tuple of int, optional
+        Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
+        where the posterior is sampled.
+    evidence_method : {"direct", "laplace", "nested"}
+        See `amibayes.inference.evidence`.
+    prior : tuple of PriorSetting
+        Changes of the default prior.
+    seed : int
+    images : ImageOptions, optional
+        How image cubes are turned into observables.
+    """
+
+    separation_mas: tuple[float, float] | None = None
+    observables: tuple[str, ...] = ("vis2", "cp")
+    diameter: float | Literal["free"] | None = None
+    background: float | Literal["free"] = 0.0
+    smearing: bool = True
+    closure_covariance: Literal["assumed", "diagonal"] = "assumed"
+    calibration: Method | None = None
+    clip: float = 3.0
+    keep_all: bool = False
+    insname: str | None = None
+    target: str | None = None
+    null_draws: int = 10_000
+    alpha: float = ALPHA
+    extra_noise: bool = True
+    posterior: bool = True
+    limits: bool = True
+    companions: tuple[int, ...] | None = None
+    evidence_method: EvidenceMethod = "direct"
+    prior: tuple[PriorSetting, ...] = ()
+    seed: int = 1
+    images: ImageOptions | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SearchReport:
+    """Everything the main job found, for `amibayes.report` and `amibayes.plots`."""
+
+    options: SearchOptions
+    targets: tuple[str, ...]
+    calibrators: tuple[str, ...]
+    observables: Observables
+    calibration: Calibration | None
+    references: tuple[Observables, ...]
+    vetting: Vetting | None
+    result: SearchResult
+    noise: ExtraNoise
+    significance: Significance | None
+    posterior: Posterior | None
+    limits: DetectionLimit | None
+    warnings: tuple[str, ...]
+    grid: GridPosterior | None = None
+    evidence: Evidence | None = None
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+
+def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
+    """Every calibrator in the order given: vetting's verdict, then what calibration used."""
+    if report.calibration is None:
+        return []
+    used = iter(report.calibration.calibrators)
+    verdicts = None if report.vetting is None else report.vetting.calibrators
+    out: list[dict[str, object]] = []
+    for k, path in enumerate(report.calibrators):
+        vetted = None if verdicts is None else verdicts[k]
+        judged = vetted if vetted is not None and not vetted.kept else next(used)
+        agreement = None if vetted is None else vetted.agreement
+        out.append(
+            {
+                "path": path,
+                "kept": judged.kept,
+                "reason": judged.reason,
+                "agreement_probability": agreement,
+            }
+        )
+    return out
