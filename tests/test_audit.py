@@ -449,7 +449,11 @@ def test_public_files(data: Path) -> None:
             "closures-as-independent",
         },
         "created_v2.fits": {"vis2-above-one", "phase-range", "uv-stations", "uv-length"},
-        "gravity_singlesci.fits": {"unusable-unflagged", "vis2-negative"},
+        "gravity_singlesci.fits": {
+            "unusable-unflagged",
+            "vis2-negative",
+            "closures-as-independent",
+        },
         "niriss_f430m_amical.oifits": {
             "primary-keyword",
             "table-keyword",
