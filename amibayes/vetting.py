@@ -21,10 +21,15 @@ from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
-from amibayes.inference.refine import fit_single
+from amibayes.inference.refine import fit_single, single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolves_stars, search
-from amibayes.inference.significance import Significance, significance
+from amibayes.inference.significance import (
+    Significance,
+    bank_statistic,
+    profiled,
+    significance,
+)
 from amibayes.observables import Observables
 
 ALPHA = 0.003
@@ -201,7 +206,10 @@ def _by_itself(
     likelihood = Likelihood(data, BinaryModel(diameter_mas="free" if free else 0.0))
     found = search(likelihood, separation_mas)
     bank = TemplateBank(likelihood, found.grid, found.single_theta)
-    weight = significance(bank, float(found.bank_delta_chi2.max()), null_draws, rng, alpha)
+    # Neither test takes the size of the stated errors on trust.
+    residuals = single_likelihood(likelihood).residuals(found.single_theta)
+    statistic = float(bank_statistic(bank, residuals, free_scale=True)[0])
+    weight = significance(bank, statistic, null_draws, rng, alpha, free_scale=True)
     limit = detection_limit(found, weight, rng) if limits else None
     verdict = replace(verdict, companion=found, significance=weight, limit=limit)
     if not data.n_vis2:
@@ -210,7 +218,8 @@ def _by_itself(
     best, chi2 = fit_single(disc)
     point = float(disc.chi2([[0.0, 0.0, 0.0, 0.0]])[0])
     # A diameter cannot be negative: half of the χ² distribution of one degree of freedom.
-    probability = 0.5 * float(stats.chi2.sf(max(point - chi2, 0.0), 1))
+    gain = profiled(np.array([max(point - chi2, 0.0)]), np.array([point]), data.n_independent)
+    probability = 0.5 * float(stats.chi2.sf(gain[0], 1))
     return replace(verdict, diameter_mas=float(best[0]), diameter_probability=probability)
 
 
