@@ -73,7 +73,7 @@ def test_evidence_of_weak_data_is_the_prior_mean_of_the_likelihood(contrast, wis
 
 
 def test_finer_cells_change_nothing() -> None:
-    likelihood, prior = problem([150.0, -80.0, 0.003])
+    likelihood, prior = problem([150.0, -80.0, 0.004])
     grid, finer = (grid_posterior(likelihood, prior, step=s) for s in (1.5, 0.75))
     assert len(finer.cells) > 2 * len(grid.cells)
     assert grid.log_z == pytest.approx(finer.log_z, abs=0.005)
