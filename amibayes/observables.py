@@ -299,9 +299,7 @@ def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:
     yield from np.split(order, cuts)
 
 
-def kernel_blocks(
-    closure_phase: Measurements, sigma: FloatArray, *, correlated: bool = True
-) -> list[Block]:
+def kernel_blocks(closure_phase: Measurements, sigma: FloatArray) -> list[Block]:
     """Covariance blocks of closure phases given by their errors alone, K Σ Kᵀ.
 
     Parameters
@@ -310,8 +308,6 @@ def kernel_blocks(
         Unflagged.
     sigma : (n,) float array
         Errors in radians.
-    correlated : bool
-        False keeps the errors independent between triangles, but still on the kernel basis.
     """
     by_topology: dict[bytes, list[IntArray]] = {}
     for entries in closure_sets(closure_phase):
@@ -322,11 +318,7 @@ def kernel_blocks(
         matrix, _ = closure_matrix(closure_phase.stations[sets[0]])
         basis = kernel_basis(matrix)
         variance = np.array([sigma[entries] ** 2 for entries in sets])
-        full = (
-            assumed_covariance(matrix, variance.T)
-            if correlated
-            else variance[:, :, None] * np.eye(len(matrix))
-        )
+        full = assumed_covariance(matrix, variance.T)
         blocks += [Block(e, c, basis) for e, c in zip(sets, full, strict=True)]
     return blocks
 
