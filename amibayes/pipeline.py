@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from amibayes.calibration import Calibration, calibrate
-from amibayes.errors import DataError, UsageError
-from amibayes.extraction.reading import read_observations
+from amibayes.cautions import search_cautions
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.evidence import Evidence, weigh_models
 from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
@@ -22,42 +18,19 @@ from amibayes.inference.limits import detection_limit
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.multiplicity import search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
-from amibayes.inference.posterior import Posterior, modes_to_sample, sample
+from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
 from amibayes.inference.significance import Significance, bank_statistic, significance
 from amibayes.job import SearchOptions, SearchReport
-from amibayes.observables import Observables, join
+from amibayes.observables import Observables
 from amibayes.parallel import Executor, Progress
-from amibayes.vetting import Vetting, doubts, vet
-
-Stage = Callable[[str], None]
-
-
-FEWEST_TO_VET = 3
-"""Of two calibrators that disagree nothing says which is the bad one."""
-
-VETTING_DRAWS = 1000
+from amibayes.preparing import Clock, Stage, prepare
 
 MOST_FIELDS = 3
 """How often the default field is widened."""
-
-
-class _Clock:
-    """Times the stages and announces them."""
-
-    def __init__(self, announce: Stage) -> None:
-        self.seconds: dict[str, float] = {}
-        self._announce = announce
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        self._announce(name)
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - begin
 
 
 def search_companion(
@@ -98,24 +71,18 @@ def search_companion(
         Where the request makes no sense.
     """
     options = options or SearchOptions()
-    if not targets:
-        raise UsageError("no target given", remedy="name at least one file")
     streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(5)]
-    clock = _Clock(announce)
+    clock = Clock(announce)
     weight, posterior, limits = None, None, None
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
-        with clock.stage("read"):
-            parts = [_read(path, options) for path in targets]
-            references = [_read(path, options) for path in calibrators]
-        vetting, calibration, observables = _calibrated(
-            parts, references, options, streams[3], clock
-        )
+        ready = prepare(targets, calibrators, options, streams[3], clock)
+        observables = ready.observables
         with clock.stage("search"):
-            result, noise, widened = _searched(observables, options)
+            result, noise, widened = search_field(observables, options)
         if options.null_draws:
             with clock.stage("significance"):
-                weight = _weigh(result, options, streams[0], executor, progress)
+                weight = weigh(result, options, streams[0], executor, progress)
         if options.limits and weight is not None:
             with clock.stage("limits"):
                 limits = detection_limit(
@@ -127,21 +94,21 @@ def search_companion(
             onward = _Chain(chain, resume, progress)
             posterior = _sampled(result, prior, grid, streams[1], onward, clock)
         evidence = _compared(result, prior, grid, options, streams[4], clock)
-    said = [*_vetting_warnings(vetting), *widened, *_different_targets(parts)]
+    cautions = search_cautions(observables, result, noise, weight, posterior)
     return SearchReport(
         options,
         tuple(str(p) for p in targets),
         tuple(str(p) for p in calibrators),
         observables,
-        calibration,
-        tuple(references),
-        vetting,
+        ready.calibration,
+        ready.references,
+        ready.vetting,
         result,
         noise,
         weight,
         posterior,
         limits,
-        (*said, *_warnings(observables, result, noise, weight, posterior)),
+        (*ready.cautions, *widened, *cautions),
         grid,
         evidence,
         clock.seconds,
@@ -163,7 +130,7 @@ def _sampled(
     grid: GridPosterior | None,
     rng: np.random.Generator,
     chain: _Chain,
-    clock: _Clock,
+    clock: Clock,
 ) -> Posterior:
     with clock.stage("posterior"):
         return sample(
@@ -177,35 +144,7 @@ def _sampled(
         )
 
 
-def _calibrated(
-    parts: list[Observables],
-    references: list[Observables],
-    options: SearchOptions,
-    rng: np.random.Generator,
-    clock: _Clock,
-) -> tuple[Vetting | None, Calibration | None, Observables]:
-    """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
-    if not references:
-        return None, None, join(parts)
-    vetting, believed = None, references
-    if len(references) >= FEWEST_TO_VET and not options.keep_all:
-        with clock.stage("vet"):
-            vetting = vet(
-                references,
-                separation_mas=options.separation_mas,
-                null_draws=VETTING_DRAWS,
-                limits=False,
-                seed=options.seed,
-            )
-            believed = _believed(references, vetting)
-    with clock.stage("calibrate"):
-        calibration = calibrate(
-            parts, believed, method=options.calibration, clip=options.clip, rng=rng
-        )
-    return vetting, calibration, calibration.observables
-
-
-def _searched(
+def search_field(
     observables: Observables, options: SearchOptions
 ) -> tuple[SearchResult, ExtraNoise, list[str]]:
     """Search the field; the default one is widened where something around it fits better."""
@@ -228,55 +167,6 @@ def _searched(
     return result, noise, said
 
 
-def _different_targets(parts: list[Observables]) -> list[str]:
-    names = dict.fromkeys(s.target for p in parts for s in p.setups if s.target)
-    if len(names) < 2:
-        return []
-    return [f"targets of different names are fitted as one: {', '.join(names)}"]
-
-
-def _read(path: str | Path, options: SearchOptions) -> Observables:
-    return read_observations(
-        path,
-        options.images,
-        insname=options.insname,
-        target=options.target,
-        closure_covariance=options.closure_covariance,
-    )
-
-
-def _believed(references: list[Observables], vetting: Vetting) -> list[Observables]:
-    """The calibrators that vetting kept.
-
-    Raises
-    ------
-    DataError
-        Where it kept none.
-    """
-    kept = [r for r, v in zip(references, vetting.calibrators, strict=True) if v.kept]
-    if not kept:
-        raise DataError(
-            f"no calibrator is left: {vetting.calibrators[0].path} "
-            f"{vetting.calibrators[0].reason}, and so on",
-            source="--cal",
-            remedy="give other calibrators, or --keep-all",
-        )
-    return kept
-
-
-def _vetting_warnings(vetting: Vetting | None) -> list[str]:
-    if vetting is None:
-        return []
-    dropped = [
-        f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
-    ]
-    return dropped + [
-        f"calibrator {v.path} {doubt}"
-        for v in vetting.calibrators
-        for doubt in doubts(v, vetting.alpha)
-    ]
-
-
 def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
     diameter = options.diameter
     if diameter is None:
@@ -290,7 +180,7 @@ def _prior(result: SearchResult, options: SearchOptions) -> Prior:
 
 
 def _integrated(
-    result: SearchResult, prior: Prior, options: SearchOptions, clock: _Clock
+    result: SearchResult, prior: Prior, options: SearchOptions, clock: Clock
 ) -> GridPosterior | None:
     """Integrate the posterior over a grid where something needs it and it is cheap enough."""
     wanted = options.posterior or _counts(options)
@@ -306,7 +196,7 @@ def _compared(
     grid: GridPosterior | None,
     options: SearchOptions,
     rng: np.random.Generator,
-    clock: _Clock,
+    clock: Clock,
 ) -> Evidence | None:
     """Weigh the asked numbers of companions against each other."""
     counts = _counts(options)
@@ -331,7 +221,7 @@ def _counts(options: SearchOptions) -> tuple[int, ...]:
     return options.companions
 
 
-def _weigh(
+def weigh(
     result: SearchResult,
     options: SearchOptions,
     rng: np.random.Generator,
@@ -356,49 +246,3 @@ def _weigh(
         executor=executor,
         progress=progress,
     )
-
-
-def _warnings(
-    observables: Observables,
-    result: SearchResult,
-    noise: ExtraNoise,
-    weight: Significance | None,
-    posterior: Posterior | None,
-) -> tuple[str, ...]:
-    found = [*result.warnings, *observables.notes]
-    if noise.any:
-        found.append(
-            f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "
-            f"{np.degrees(noise.closure_phase_rad):.2g} deg in closure phase was added in "
-            "quadrature; chi2 and errors include it"
-        )
-    elif result.chi2_binary / result.ndof > 2.0:
-        found.append(
-            f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "
-            "errors are too small or the model is incomplete, and significance and errors are "
-            "too optimistic"
-        )
-    if weight is not None and weight.detected is None:
-        found.append(
-            f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
-            f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
-        )
-    elif weight is not None and weight.tail is not None:
-        found.append(
-            f"none or few of the {weight.n_draws} null draws reach the observed statistic: the "
-            f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "
-            "is extrapolated"
-        )
-    if posterior is not None and len(posterior.mode_probability) > 1:
-        share = posterior.mode_probability[0]
-        if share < 0.99 and len(modes_to_sample(result)) == 1:
-            found.append(
-                f"the posterior is that of the reported position, whose probability among "
-                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
-            )
-    if posterior is not None and not posterior.converged:
-        found.append(
-            f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "
-            f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
-        )
-    return tuple(found)

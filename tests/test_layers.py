@@ -39,6 +39,8 @@ LAYERS = [
     "validation",
     "plots",
     "job",
+    "cautions",
+    "preparing",
     "pipeline",
     "pictures",
     "report",

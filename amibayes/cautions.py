@@ -1,0 +1,73 @@
+"""What the reader of a result has to be warned of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amibayes.inference.noise import ExtraNoise
+from amibayes.inference.posterior import Posterior, modes_to_sample
+from amibayes.inference.results import SearchResult
+from amibayes.inference.significance import Significance
+from amibayes.observables import Observables
+from amibayes.vetting import Vetting, doubts
+
+
+def vetting_cautions(vetting: Vetting | None) -> list[str]:
+    """Name the calibrators that vetting dropped, and what it doubts of the kept ones."""
+    if vetting is None:
+        return []
+    dropped = [
+        f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
+    ]
+    return dropped + [
+        f"calibrator {v.path} {doubt}"
+        for v in vetting.calibrators
+        for doubt in doubts(v, vetting.alpha)
+    ]
+
+
+def search_cautions(
+    observables: Observables,
+    result: SearchResult,
+    noise: ExtraNoise,
+    weight: Significance | None,
+    posterior: Posterior | None,
+) -> tuple[str, ...]:
+    """Say what makes the numbers of a search less than they seem."""
+    found = [*result.warnings, *observables.notes]
+    if noise.any:
+        found.append(
+            f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "
+            f"{np.degrees(noise.closure_phase_rad):.2g} deg in closure phase was added in "
+            "quadrature; chi2 and errors include it"
+        )
+    elif result.chi2_binary / result.ndof > 2.0:
+        found.append(
+            f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "
+            "errors are too small or the model is incomplete, and significance and errors are "
+            "too optimistic"
+        )
+    if weight is not None and weight.detected is None:
+        found.append(
+            f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
+            f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
+        )
+    elif weight is not None and weight.tail is not None:
+        found.append(
+            f"none or few of the {weight.n_draws} null draws reach the observed statistic: the "
+            f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "
+            "is extrapolated"
+        )
+    if posterior is not None and len(posterior.mode_probability) > 1:
+        share = posterior.mode_probability[0]
+        if share < 0.99 and len(modes_to_sample(result)) == 1:
+            found.append(
+                f"the posterior is that of the reported position, whose probability among "
+                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
+            )
+    if posterior is not None and not posterior.converged:
+        found.append(
+            f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "
+            f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
+        )
+    return tuple(found)

@@ -1,0 +1,118 @@
+"""The summary of the main job on the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from amibayes.inference.evidence import Evidence
+from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.posterior import Posterior
+from amibayes.inference.results import SearchResult
+from amibayes.job import SearchReport
+from amibayes.report.result import upper_limit
+
+
+def summary(report: SearchReport, folder: Path) -> list[str]:
+    """Say the result in at most 20 lines."""
+    result, c = report.result, report.result.companion
+    used = result.likelihood.observables
+    lines = [
+        f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
+        f"{used.n_independent} independent ({used.covariance_kind} covariance)",
+        f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
+        f"{len(result.grid)} positions",
+        _verdict(report),
+        "best fit    no companion improves the fit"
+        if c.contrast <= 0.0
+        else f"best fit    {c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
+        f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
+        f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)",
+        f"contrast    {c.contrast:.5f} +/- {c.contrast_error:.5f} "
+        f"(delta mag {c.delta_mag:.2f} +/- {c.delta_mag_error:.2f})",
+        f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
+        f"({result.ndof} dof: reduced {result.chi2_single / result.ndof:.3f} -> "
+        f"{result.chi2_binary / result.ndof:.3f})",
+        f"strength    delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
+        f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
+    ]
+    lines += _nuisance_lines(result)
+    if report.posterior is not None:
+        lines += _posterior_lines(report.posterior)
+    lines += _upper_limit_lines(report)
+    if report.evidence is not None:
+        lines += _evidence_lines(report.evidence)
+    if report.limits is not None:
+        lines += _limit_lines(report.limits)
+    room = 19 - len(lines)
+    lines += [f"WARNING     {text}" for text in report.warnings[:room]]
+    if len(report.warnings) > room:
+        lines[-1] = f"WARNING     {len(report.warnings) - room + 1} more warnings in result.json"
+    return [*lines, f"written to  {folder}"]
+
+
+def _verdict(report: SearchReport) -> str:
+    weight = report.significance
+    if weight is None:
+        return "companion   not judged: no false-alarm probability was asked for"
+    if weight.detected is None:
+        return f"companion   not judged: {weight.n_draws} null draws are too few"
+    low, high = weight.interval
+    chance = f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g})"
+    verdict = "DETECTED" if weight.detected else "not detected"
+    return f"companion   {verdict}; {chance} in {weight.n_draws} null searches"
+
+
+def _nuisance_lines(result: SearchResult) -> list[str]:
+    lines = []
+    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
+        label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
+        error = np.sqrt(result.theta_covariance[k, k])
+        lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")
+    return lines
+
+
+def _limit_lines(limits: DetectionLimit) -> list[str]:
+    usable = np.isfinite(limits.delta_mag)
+    delta, rho = limits.delta_mag[usable], limits.separation_mas[usable]
+    if not len(delta):
+        return ["limits      no injected companion is recovered reliably in this field"]
+    return [
+        f"limits      delta mag {delta.min():.2f} to {delta.max():.2f} at {rho.min():.0f} to "
+        f"{rho.max():.0f} mas ({limits.completeness:.0%} recovered, false-positive rate "
+        f"{limits.false_positive_rate:.2g})"
+    ]
+
+
+def _upper_limit_lines(report: SearchReport) -> list[str]:
+    limit = upper_limit(report) if report.significance is not None else None
+    if limit is None:
+        return []
+    return [
+        f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
+        f"({limit['level']:.0%}, anywhere in the field; prior: {limit['prior']})"
+    ]
+
+
+def _evidence_lines(evidence: Evidence) -> list[str]:
+    shares = zip(evidence.companions, evidence.log_z, evidence.probability, strict=True)
+    parts = [f"{k}: ln Z {z:.1f} ({p:.2g})" for k, z, p in shares]
+    return [f"evidence    companions (probability) {', '.join(parts)}"]
+
+
+def _posterior_lines(posterior: Posterior) -> list[str]:
+    parts = []
+    for name, unit in (
+        ("separation_mas", "mas"),
+        ("position_angle_deg", "deg"),
+        ("delta_mag", "mag"),
+    ):
+        median, low, high = posterior.interval(name)
+        parts.append(f"{median:.2f} +{high - median:.2f} -{median - low:.2f} {unit}")
+    state = "converged" if posterior.converged else "NOT CONVERGED"
+    return [
+        f"posterior   {', '.join(parts)} (median, 68%)",
+        f"chain       {posterior.n_steps} steps, tau {posterior.autocorrelation_time:.1f}, "
+        f"split R-hat {posterior.split_rhat:.3f}: {state}",
+    ]
