@@ -52,12 +52,6 @@ def search_cautions(
             f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
             f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
         )
-    elif weight is not None and weight.tail is not None:
-        found.append(
-            f"none or few of the {weight.n_draws} null draws reach the observed statistic: the "
-            f"false-alarm probability is below about {weight.interval[1]:.1g}; anything smaller "
-            "is extrapolated"
-        )
     if posterior is not None and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:

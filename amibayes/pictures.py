@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.inference.significance import Significance
 from amibayes.job import SearchOptions, SearchReport, calibrator_verdicts
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
@@ -15,19 +16,26 @@ from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
 from amibayes.plots.corner_plot import corner_plot
 from amibayes.plots.coverage import coverage_plot
 from amibayes.plots.fit import fit_plot
-from amibayes.plots.maps import detection_map, save_maps_fits
+from amibayes.plots.maps import (
+    detection_map,
+    false_alarm_map,
+    local_n_sigma,
+    probability_maps,
+    save_maps_fits,
+    sky_map,
+)
 from amibayes.plots.null_plot import null_plot
 from amibayes.plots.residual_corr import correlation_plot
 from amibayes.plots.style import save
-from amibayes.units import contrast_to_delta_mag
+from amibayes.units import FloatArray, contrast_to_delta_mag
 
 MAPS = "maps.fits"
 
 
 def picture_names(options: SearchOptions, *, calibrated: bool) -> list[str]:
     """List the files that `save_pictures` will write for a job."""
-    names = ["map.png", "fit.png", "coverage.png", "correlation.png", MAPS]
-    names += ["null.png"] if options.null_draws else []
+    names = ["map.png", "nsigma.png", "fit.png", "coverage.png", "correlation.png", MAPS]
+    names += ["null.png", "false_alarm.png"] if options.null_draws else []
     names += ["corner.png", "chains.png"] if options.posterior else []
     names += ["limits.png", "completeness.png"] if options.limits and options.null_draws else []
     return names + (["calibrators.png"] if calibrated else [])
@@ -39,23 +47,36 @@ def save_pictures(report: SearchReport, folder: Path) -> list[Path]:
     for name, draw in pictures(report).items():
         save(draw(), folder / name)
         drawn.append(folder / name)
-    save_maps_fits(folder / MAPS, report.result)
+    save_maps_fits(folder / MAPS, report.result, _probabilities(report))
     return drawn
+
+
+def _probabilities(report: SearchReport) -> dict[str, FloatArray]:
+    """False-alarm probabilities per position, by the name of their FITS extension."""
+    weight = report.significance
+    if weight is None or weight.field is None:
+        return {}
+    return {f"FAP_{name}": p for name, p in probability_maps(weight).items()}
 
 
 def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
     """Name the pictures of a report and the functions that draw them."""
     result = report.result
     out: dict[str, Callable[[], Figure]] = {
-        "map.png": lambda: detection_map(result, contrast="positive"),
+        "map.png": lambda: detection_map(result, quantity="delta_chi2", contrast="positive"),
+        "nsigma.png": lambda: sky_map(
+            result, local_n_sigma(result), "CANDID nσ of the best companion at each position (σ)"
+        ),
         "fit.png": lambda: fit_plot(result),
         "coverage.png": lambda: coverage_plot(result.likelihood.observables),
         "correlation.png": lambda: correlation_plot(result.likelihood.observables),
     }
     if report.calibration is not None:
         out["calibrators.png"] = lambda: _calibrators(report)
-    if report.significance is not None:
-        out["null.png"] = lambda: _null(report)
+    weight = report.significance
+    if weight is not None:
+        out["null.png"] = lambda: _null(weight)
+        out["false_alarm.png"] = lambda: false_alarm_map(result, weight)
     if report.posterior is not None:
         out["corner.png"] = lambda: _corner(report)
         out["chains.png"] = lambda: _chains(report)
@@ -70,10 +91,19 @@ def _calibrators(report: SearchReport) -> Figure:
     return calibrator_plot(report.references, kept, [Path(p).name for p in report.calibrators])
 
 
-def _null(report: SearchReport) -> Figure:
-    weight = report.significance
-    assert weight is not None
-    return null_plot(weight.null, weight.statistic, alpha=weight.alpha)
+def _null(weight: Significance) -> Figure:
+    label = (
+        "Largest 2Δln L anywhere in the field, scale of the noise free"
+        if weight.free_scale
+        else "Largest Δχ² anywhere in the field"
+    )
+    return null_plot(
+        weight.null,
+        weight.statistic,
+        weight.tail_curves(),
+        alpha=weight.alpha,
+        statistic=label,
+    )
 
 
 def _corner(report: SearchReport) -> Figure:

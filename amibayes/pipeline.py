@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,12 @@ from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import look_outside, resolves_stars, search
-from amibayes.inference.significance import Significance, bank_statistic, significance
+from amibayes.inference.significance import (
+    Significance,
+    bank_statistic,
+    significance,
+    statistic_field,
+)
 from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
 from amibayes.parallel import Executor, Progress
@@ -235,14 +240,16 @@ def weigh(
     """
     bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
     residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
-    statistic = float(bank_statistic(bank, residuals, free_scale=options.extra_noise)[0])
-    return significance(
+    free_scale = options.extra_noise
+    weight = significance(
         bank,
-        statistic,
+        float(bank_statistic(bank, residuals, free_scale=free_scale)[0]),
         options.null_draws,
         rng,
         options.alpha,
-        free_scale=options.extra_noise,
+        free_scale=free_scale,
         executor=executor,
         progress=progress,
     )
+    field = statistic_field(bank, residuals[:, 0], free_scale=free_scale)
+    return replace(weight, field=field)

@@ -220,7 +220,8 @@ def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys)
     assert "result of other data" in error_of(capsys)
     assert run(other, *FAST, "--out", out, "--overwrite", "--quiet") == 0
     left = sorted(p.name for p in out.iterdir())
-    assert left == ["correlation.png", "coverage.png", "fit.png", "map.png", "maps.fits", RESULT]
+    pictures = ["correlation.png", "coverage.png", "fit.png", "map.png", "maps.fits", "nsigma.png"]
+    assert left == [*pictures, RESULT]
 
 
 def test_absurd_field_is_refused(target, tmp_path, capsys) -> None:

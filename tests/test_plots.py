@@ -25,6 +25,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.search import search
+from amibayes.inference.significance import Significance
 from amibayes.observables import Observables
 from amibayes.plots.calibration import _keys, calibrator_plot
 from amibayes.plots.chains import trace_plot
@@ -36,6 +37,7 @@ from amibayes.plots.maps import (
     detection_map,
     false_alarm_map,
     local_n_sigma,
+    probability_maps,
     save_maps_fits,
     sky_map,
 )
@@ -46,6 +48,8 @@ from amibayes.plots.style import save
 TRUTH = (90.0, 110.0, 0.01)
 UNITS = ("(mas)", "(m)", "(Mλ)", "(°)", "(σ)", "(%)", "(µm)", "(flux ratio)")
 PURE_NUMBERS = (
+    "Local",
+    "Global",
     "V²",
     "σ of V²",
     "Δχ²",
@@ -120,6 +124,7 @@ PICTURES: dict[str, Callable[[SearchResult], Figure]] = {
     "map and signed contrast": lambda r: detection_map(r, quantity="delta_chi2", contrast="signed"),
     "map and contrast": lambda r: detection_map(r, contrast="positive"),
     "n sigma": lambda r: sky_map(r, local_n_sigma(r), "Local nσ (σ)", vmin=0.0),
+    "false alarms": lambda r: false_alarm_map(r, replace(weight_of(r), n_free=30)),
     "fit": fit_plot,
     "fit of closure phases": lambda r: fit_plot(
         by_hand(r.likelihood.observables.only(["cp"]), TRUTH)
@@ -267,13 +272,22 @@ def test_fits_maps_without_coordinates_are_offsets_in_mas(
     assert north == pytest.approx(found.grid.north_mas[peak])
 
 
-def test_false_alarm_map_counts_the_draws_at_least_as_large(found: SearchResult) -> None:
-    null = np.array([9.0, 3.0, 5.0, 1e9])
-    gain = found.bank_delta_chi2
-    expected = [(1 + (null >= g).sum()) / 5.0 for g in gain]
-    np.testing.assert_allclose(false_alarm_map(found, null), expected)
-    tie = found.bank_delta_chi2[[7]]
-    assert false_alarm_map(found, tie)[7] == 1.0
+def weight_of(result: SearchResult) -> Significance:
+    null = np.sort(null_maxima())
+    return Significance(31.0, null, 1e-3, (0.0, 4e-3), None, 0.0013, True, result.bank_delta_chi2)
+
+
+def test_false_alarm_probability_is_lowest_where_the_statistic_is_highest(
+    found: SearchResult,
+) -> None:
+    maps = probability_maps(replace(weight_of(found), n_free=30))
+    peak = int(np.argmax(found.bank_delta_chi2))
+    for p in maps.values():
+        assert p.argmin() == peak
+        assert ((p > 0) & (p <= 1)).all()
+    assert (maps["local"] <= maps["global"]).all()
+    with pytest.raises(ValueError, match="no statistic per position"):
+        probability_maps(replace(weight_of(found), field=None))
 
 
 def test_a_map_of_another_size_is_refused(found: SearchResult, tmp_path: Path) -> None:

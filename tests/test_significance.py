@@ -11,7 +11,16 @@ from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.search import search
-from amibayes.inference.significance import clopper_pearson, null_maxima, significance
+from amibayes.inference.significance import (
+    Significance,
+    bank_statistic,
+    clopper_pearson,
+    extreme_value_survival,
+    null_maxima,
+    pareto_survival,
+    significance,
+    statistic_field,
+)
 
 
 def kernel_bank(step_mas: float) -> TemplateBank:
@@ -92,3 +101,62 @@ def test_strong_companion_is_bounded_by_the_draws_and_the_tail_says_it_is_extrap
 def test_clopper_pearson_is_scipys_exact_interval(k: int, n: int) -> None:
     expected = stats.binomtest(k, n).proportion_ci(0.95, method="exact")
     np.testing.assert_allclose(clopper_pearson(k, n), [expected.low, expected.high], atol=1e-12)
+
+
+def test_survival_is_the_share_of_the_draws_and_then_a_law_without_a_step() -> None:
+    null = np.sort(np.random.default_rng(8).exponential(2.0, 10_000))
+    weight = Significance(5.0, null, 0.1, (0.0, 1.0), None, 0.0013)
+    inside = np.array([0.0, 1.0, 8.0])
+    counted = [(1 + (null >= x).sum()) / 10_001 for x in inside]
+    np.testing.assert_allclose(weight.survival(inside), counted)
+    x = np.linspace(0.0, 40.0, 2000)
+    p = weight.survival(x)
+    assert (np.diff(p) <= 0).all()
+    just = weight.survival(weight.reach + np.array([-1e-9, 1e-9]))
+    assert just[0] == pytest.approx(just[1], rel=0.11)  # one draw of ten
+    # The law of an exponential is exp(-x/2): to a factor of two at 1e-6.
+    assert abs(np.log(weight.survival(np.array(27.6)) / 1e-6)) < np.log(3.0)
+
+
+@pytest.mark.parametrize(
+    ("law", "far"),
+    [(stats.expon(scale=2.0), 1e-6), (stats.gumbel_r(6, 2), 1e-6), (stats.genpareto(0.1), 1e-5)],
+)
+def test_both_tails_find_laws_they_did_not_make(law, far) -> None:
+    """Median over 40 samples of 10 000 within a factor of 2 (an error of 0.3 dex / √40)."""
+    x = np.array(law.isf(far))
+    for survival in (pareto_survival, extreme_value_survival):
+        draws = [
+            np.sort(law.rvs(10_000, random_state=np.random.default_rng([9, k]))) for k in range(40)
+        ]
+        found = np.median([float(survival(null, x)) for null in draws])
+        assert 0.5 < found / far < 2.0, survival.__name__
+
+
+@pytest.mark.parametrize("free_scale", [True, False])
+def test_local_probability_is_uniform_at_a_fixed_position(free_scale) -> None:
+    """4000 null data sets; half of them gain nothing there. Binomial chance 1e-5 per level."""
+    model = BinaryModel(background="free")
+    bank = TemplateBank(Likelihood(niriss(), model), make_grid(100.0, 110.0, 47.0), np.array([0.0]))
+    white = np.random.default_rng(10).standard_normal((bank.n_data, 4000))
+    field = np.array([statistic_field(bank, w, free_scale=free_scale)[3] for w in white.T])
+    n_free = bank.n_data - bank.n_nuisance
+    weight = Significance(1.0, field, 1.0, (0, 1), None, 0.1, free_scale, None, n_free)
+    p = weight.local_survival(field)
+    for level in (0.3, 0.1, 0.02):
+        assert stats.binomtest(int((p < level).sum()), 4000, level).pvalue > 1e-5
+
+
+def test_field_peaks_at_the_statistic_of_the_search(rng) -> None:
+    data = simulated(niriss(), [150.0, -80.0, 0.005], rng)
+    result = search(Likelihood(data), (50, 400))
+    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    white = result.likelihood.observables.covariance.whiten(result.likelihood.observables.data)
+    white = white - result.likelihood.observables.covariance.whiten(
+        Likelihood(niriss()).observables.data
+    )
+    for free in (True, False):
+        field = statistic_field(bank, white, free_scale=free)
+        assert field.max() == pytest.approx(
+            bank_statistic(bank, white[:, None], free_scale=free)[0], rel=1e-5
+        )

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import gamma, gammaln
 
 from amibayes.inference.bank import TemplateBank
 from amibayes.parallel import Executor, Progress, SerialExecutor, run_job, slices, spawn
@@ -24,6 +25,9 @@ ALPHA = 0.0013
 
 TAIL_FRACTION = 0.05
 """Share of the null draws above the threshold of the generalised Pareto fit."""
+
+FEWEST_ABOVE = 10
+"""Draws that have to reach a statistic for their share to be its probability."""
 
 BOOTSTRAPS = 40
 
@@ -42,7 +46,8 @@ class Tail:
     ----------
     generalised_pareto, extreme_value : float
         Probability of the observed statistic by a generalised Pareto fit of the largest
-        `TAIL_FRACTION` of the draws, and by a generalised extreme-value fit of all.
+        `TAIL_FRACTION` of the draws, and by a generalised extreme-value fit of the largest
+        of blocks of draws.
     log10_error : float
         Half the 68 % bootstrap interval of log10 of the Pareto probability, dex.
     """
@@ -72,6 +77,10 @@ class Significance:
         Detection means ``probability`` < ``alpha``.
     free_scale : bool
         The statistic is that of `profiled`: the size of the noise is not taken on trust.
+    field : (n_grid,) float array, optional
+        The statistic of the data at every position of the bank.
+    n_free : int
+        Number of independent data less the nuisance parameters.
     """
 
     statistic: float
@@ -81,6 +90,8 @@ class Significance:
     tail: Tail | None
     alpha: float
     free_scale: bool = False
+    field: FloatArray | None = None
+    n_free: int = 0
 
     @property
     def n_draws(self) -> int:
@@ -97,6 +108,49 @@ class Significance:
     def threshold(self, alpha: float | None = None) -> float:
         """Statistic that noise alone exceeds with probability alpha."""
         return float(np.quantile(self.null, 1.0 - (alpha or self.alpha)))
+
+    @property
+    def reach(self) -> float:
+        """Statistic beyond which fewer than `FEWEST_ABOVE` draws count: past it, extrapolation."""
+        return float(self.null[-min(FEWEST_ABOVE, self.n_draws)])
+
+    def survival(self, statistic: FloatArray) -> FloatArray:
+        """Global false-alarm probability of any values of the statistic, same shape.
+
+        The share of the draws as far as they `reach`; past that the generalised Pareto law,
+        joined without a step.
+        """
+        x, n = np.asarray(statistic, dtype=float), self.n_draws
+        counted = (1.0 + n - np.searchsorted(self.null, x, side="left")) / (1.0 + n)
+        if n * TAIL_FRACTION < FEWEST_ABOVE:
+            return np.asarray(counted)
+        at_reach = (1.0 + min(FEWEST_ABOVE, n)) / (1.0 + n)
+        law = pareto_survival(self.null, np.maximum(x, self.reach))
+        law *= at_reach / pareto_survival(self.null, np.array(self.reach))
+        return np.where(x > self.reach, np.maximum(law, LEAST_PROBABILITY), counted)
+
+    def local_survival(self, statistic: FloatArray) -> FloatArray:
+        """Probability that noise alone reaches the statistic at one given position.
+
+        One side of a normal deviate (Δχ²), or of Student's t with the scale free: exact for
+        one linear parameter, so it needs no draws.
+        """
+        x = np.asarray(statistic, dtype=float)
+        if not self.free_scale:
+            return np.asarray(stats.norm.sf(np.sqrt(x)))
+        ratio = np.expm1(x / self.n_free)
+        return np.asarray(stats.t.sf(np.sqrt((self.n_free - 1) * ratio), self.n_free - 1))
+
+    def tail_curves(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Both fitted laws, for a picture: statistic and probability to exceed it."""
+        if self.tail is None:
+            return {}
+        begin = float(np.quantile(self.null, 1.0 - TAIL_FRACTION))
+        x = np.linspace(begin, max(self.statistic, 1.5 * float(self.null[-1])), 300)
+        return {
+            "generalised Pareto law of the largest draws": (x, pareto_survival(self.null, x)),
+            "extreme-value law of blocks' maxima": (x, extreme_value_survival(self.null, x)),
+        }
 
 
 def profiled(gain: FloatArray, chi2: FloatArray, n_data: int) -> FloatArray:
@@ -123,6 +177,19 @@ def bank_statistic(bank: TemplateBank, white: FloatArray, *, free_scale: bool) -
     if not free_scale:
         return gain
     return profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
+
+
+def statistic_field(bank: TemplateBank, white: FloatArray, *, free_scale: bool) -> FloatArray:
+    """Statistic of one whitened data set (n_data,) at every position, (n_grid,).
+
+    Its maximum is that of `bank_statistic`.
+    """
+    contrast, sigma = bank.scan(white)
+    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+    if not free_scale:
+        return gain
+    chi2 = np.full(len(gain), float((bank.project(white) ** 2).sum()))
+    return profiled(gain, chi2, bank.n_data - bank.n_nuisance)
 
 
 def null_maxima(
@@ -201,7 +268,8 @@ def significance(
         null_maxima(bank, n_draws, rng, free_scale=free_scale, executor=executor, progress=progress)
     )
     above = int((null >= statistic).sum())
-    tail = _tail(null, statistic, rng) if above < 10 <= n_draws * TAIL_FRACTION else None
+    extrapolate = above < FEWEST_ABOVE <= n_draws * TAIL_FRACTION
+    tail = _tail(null, statistic, rng) if extrapolate else None
     return Significance(
         statistic,
         null,
@@ -210,6 +278,7 @@ def significance(
         tail,
         alpha,
         free_scale,
+        n_free=bank.n_data - bank.n_nuisance,
     )
 
 
@@ -222,22 +291,41 @@ def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[f
 
 
 def _tail(null: FloatArray, statistic: float, rng: np.random.Generator) -> Tail:
-    pareto = _pareto_survival(null, statistic)
+    at = np.array(statistic)
     resampled: NDArray[np.float64] = np.array(
-        [
-            _pareto_survival(np.sort(rng.choice(null, len(null))), statistic)
-            for _ in range(BOOTSTRAPS)
-        ]
+        [pareto_survival(np.sort(rng.choice(null, len(null))), at) for _ in range(BOOTSTRAPS)]
     )
-    shape, location, scale = stats.genextreme.fit(null, 0.0, loc=null.mean(), scale=null.std())
     logs = np.log10(np.maximum(resampled, LEAST_PROBABILITY))
     low, high = np.quantile(logs, [0.16, 0.84])
-    extreme = float(stats.genextreme.sf(statistic, shape, location, scale))
-    return Tail(pareto, extreme, float(0.5 * (high - low)))
+    pareto, extreme = pareto_survival(null, at), extreme_value_survival(null, at)
+    return Tail(float(pareto), float(extreme), float(0.5 * (high - low)))
 
 
-def _pareto_survival(null: FloatArray, statistic: float) -> float:
-    """P(null ≥ statistic) by a generalised Pareto law over a high threshold.
+def extreme_value_survival(null: FloatArray, statistic: FloatArray) -> FloatArray:
+    """P(null ≥ statistic), any shape, by a generalised extreme-value law of blocks' maxima.
+
+    The law G of the largest of m = 1/`TAIL_FRACTION` draws by L-moments (Hosking, Wallis &
+    Wood 1985), taken over all ways to form the blocks; then P = 1 − G^(1/m).
+    """
+    n, block = len(null), round(1.0 / TAIL_FRACTION)
+    rank = np.arange(n + 1)
+    # Share of the blocks whose largest member is at most the i-th smallest draw.
+    log_share = gammaln(rank + 1.0) - gammaln(np.maximum(rank - block, 0) + 1.0)
+    below = np.where(rank >= block, np.exp(log_share - log_share[-1]), 0.0)
+    weight, middle = np.diff(below), 0.5 * (below[1:] + below[:-1])
+    first, second, third = (float((weight * null * middle**k).sum()) for k in range(3))
+    spread = 2.0 * second - first
+    skewness = (6.0 * third - 6.0 * second + first) / spread
+    ratio = 2.0 / (3.0 + skewness) - np.log(2.0) / np.log(3.0)
+    shape = 7.859 * ratio + 2.9554 * ratio**2
+    scale = spread * shape / ((1.0 - 2.0**-shape) * gamma(1.0 + shape))
+    location = first - scale * (1.0 - gamma(1.0 + shape)) / shape
+    log_cdf = stats.genextreme.logcdf(statistic, shape, location, scale)
+    return np.asarray(-np.expm1(log_cdf / block))
+
+
+def pareto_survival(null: FloatArray, statistic: FloatArray) -> FloatArray:
+    """P(null ≥ statistic), any shape, by a generalised Pareto law over a high threshold.
 
     Moments (Hosking & Wallis 1987) rather than maximum likelihood: they are explicit, and
     stable near the exponential tail that the maximum of a χ² field has.
@@ -247,4 +335,5 @@ def _pareto_survival(null: FloatArray, statistic: float) -> float:
     mean, variance = (excess - threshold).mean(), (excess - threshold).var(ddof=1)
     shape = 0.5 * (1.0 - mean * mean / variance)
     scale = 0.5 * mean * (1.0 + mean * mean / variance)
-    return float(TAIL_FRACTION * stats.genpareto.sf(statistic - threshold, shape, scale=scale))
+    beyond = stats.genpareto.sf(np.asarray(statistic) - threshold, shape, scale=scale)
+    return np.asarray(TAIL_FRACTION * beyond)

@@ -18,6 +18,7 @@ from amibayes.inference.bank import Grid
 from amibayes.inference.detection import candid_n_sigma
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolution_mas
+from amibayes.inference.significance import Significance
 from amibayes.plots.style import (
     BLACK,
     DIVERGING,
@@ -36,6 +37,9 @@ MAP_TITLES = {
     "sqrt_delta_chi2": "√Δχ² of the best companion at each position",
     "delta_chi2": "Δχ² of the best companion at each position",
 }
+
+LEAST_SHOWN = 1e-12
+"""Probabilities below this have one colour."""
 
 HALO = [withStroke(linewidth=3.5, foreground="white")]
 """Markers stand out on dark and on bright parts of a map."""
@@ -104,6 +108,63 @@ def sky_map(
     figure.suptitle(_headline(result))
     figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+@styled()
+def false_alarm_map(result: SearchResult, weight: Significance) -> Figure:
+    """Draw the false-alarm probability of every position: there alone, and anywhere.
+
+    Parameters
+    ----------
+    result : SearchResult
+    weight : Significance
+        Of the same search, with its ``field``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Above the local probability (noise reaches this statistic at this position), below the
+        global one (anywhere in the field). What lies within the white line is extrapolated
+        past the null draws.
+    """
+    figure = new_figure(11.6)
+    axes = figure.subplots(2, 1)
+    for ax, (name, p) in zip(axes, probability_maps(weight).items(), strict=True):
+        value = np.log10(np.maximum(p, LEAST_SHOWN))
+        low = min(float(value.min()), -2.0)
+        label = f"{name.capitalize()} false-alarm probability (power of ten)"
+        _paint(figure, ax, result.grid, value, label, cmap=f"{SEQUENTIAL}_r", vmin=low, vmax=0.0)
+        _mark(ax, result)
+    _outline_extrapolation(axes[1], result.grid, weight)
+    figure.suptitle(_headline(result))
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def probability_maps(weight: Significance) -> dict[str, FloatArray]:
+    """Local and global false-alarm probability at every position, (n_grid,) each.
+
+    Raises
+    ------
+    ValueError
+        Where the significance holds no field.
+    """
+    if weight.field is None:
+        raise ValueError("this significance holds no statistic per position")
+    return {"local": weight.local_survival(weight.field), "global": weight.survival(weight.field)}
+
+
+def _outline_extrapolation(ax: Axes, grid: Grid, weight: Significance) -> None:
+    """Draw where the statistic is larger than the null draws reach."""
+    beyond = np.asarray(weight.field) > weight.reach
+    if not beyond.any():
+        return
+    axis = np.arange(-grid.half_width, grid.half_width + 1) * grid.step_mas
+    inside = np.nan_to_num(grid.image(beyond.astype(float)))
+    ax.contour(axis, axis, inside, levels=[0.5], colors="white", linewidths=1.6)
+    ax.contour(axis, axis, inside, levels=[0.5], colors=BLACK, linewidths=0.8)
+    ax.plot([], [], color=BLACK, lw=0.8, label="inside: past the null draws, extrapolated")
 
 
 def _headline(result: SearchResult) -> str:
@@ -219,24 +280,6 @@ def local_n_sigma(result: SearchResult) -> FloatArray:
     """CANDID's nσ of the best positive contrast at every position of the grid, (n_grid,)."""
     chi2 = result.chi2_single - result.bank_delta_chi2
     return candid_n_sigma(result.chi2_single, chi2, result.ndof)
-
-
-def false_alarm_map(result: SearchResult, null: FloatArray) -> FloatArray:
-    """Probability that noise alone reaches the gain of each position somewhere in the field.
-
-    Parameters
-    ----------
-    result : SearchResult
-    null : (n_draws,) float array
-        Largest gain anywhere in the field of each null data set.
-
-    Returns
-    -------
-    (n_grid,) float array
-        (1 + number of draws at least as large) / (1 + number of draws).
-    """
-    below = np.searchsorted(np.sort(null), result.bank_delta_chi2, side="left")
-    return np.asarray((1.0 + len(null) - below) / (1.0 + len(null)))
 
 
 def save_maps_fits(

@@ -10,6 +10,7 @@ from amibayes.inference.evidence import Evidence
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.results import SearchResult
+from amibayes.inference.significance import LEAST_PROBABILITY, Significance
 from amibayes.job import SearchReport
 from amibayes.report.result import upper_limit
 
@@ -58,10 +59,32 @@ def _verdict(report: SearchReport) -> str:
         return "companion   not judged: no false-alarm probability was asked for"
     if weight.detected is None:
         return f"companion   not judged: {weight.n_draws} null draws are too few"
-    low, high = weight.interval
-    chance = f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g})"
     verdict = "DETECTED" if weight.detected else "not detected"
-    return f"companion   {verdict}; {chance} in {weight.n_draws} null searches"
+    return f"companion   {verdict}; {_chance(weight)}"
+
+
+def _chance(weight: Significance) -> str:
+    """The false-alarm probability, and past the draws what is no more than extrapolated."""
+    low, high = weight.interval
+    tail = weight.tail
+    if tail is None:
+        return (
+            f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g}) "
+            f"in {weight.n_draws} null searches"
+        )
+    above = int((weight.null >= weight.statistic).sum())
+    return (
+        f"{above or 'none'} of {weight.n_draws} null searches reach it: false-alarm probability "
+        f"below {high:.2g} (95%); extrapolated {_power(tail.generalised_pareto)} (Pareto), "
+        f"{_power(tail.extreme_value)} (extreme value)"
+    )
+
+
+def _power(probability: float) -> str:
+    """An extrapolation is worth a power of ten."""
+    if probability <= LEAST_PROBABILITY:
+        return f"< {LEAST_PROBABILITY:.0e}"
+    return f"{probability:.0e}"
 
 
 def _nuisance_lines(result: SearchResult) -> list[str]:
