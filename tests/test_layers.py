@@ -45,6 +45,7 @@ LAYERS = [
     "pictures",
     "report",
     "vetting_report",
+    "survey",
     "cli",
     "__main__",
 ]

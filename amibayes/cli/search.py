@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common, data_options
+from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ EXAMPLES = """examples:
   amibayes search target.oifits --cal cal*.oifits
   amibayes search epoch1.oifits epoch2.oifits --separation 50:400 --observables cp
   amibayes search pionier.oifits --diameter free --separation 1:50 --out axcir
+  amibayes search --batch targets.ecsv --workers 4
 """
 
 
@@ -25,8 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``search``."""
     parser.epilog = EXAMPLES
     parser.add_argument(
-        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+        "targets", nargs="*", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
     )
+    batch.add_batch_option(parser)
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
@@ -39,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
     stages.add_argument(
-        "--resume", action="store_true", help="go on with a posterior that was cut off"
+        "--resume",
+        action="store_true",
+        help="go on with a posterior that was cut off; with --batch, leave finished targets",
     )
     common.add_seed_option(stages)
     common.add_parallel_options(parser)
@@ -122,8 +126,19 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the main job and write its files."""
+    """Run the main job, for one target or for each of a table, and write its files."""
     common.configure_logging(arguments)
+    if arguments.batch is not None:
+        return batch.run_batch(arguments)
+    report, folder = perform(arguments)
+    common.finish(arguments, _json(report), lambda: _summary(report, folder))
+    return 0
+
+
+def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path]:
+    """Run the main job for one target and write its files, without a word."""
+    if not arguments.targets:
+        raise UsageError("no target given", remedy="name at least one file, or --batch TABLE")
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.files import output_folder
 
@@ -137,8 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
     for stale in set(_names(type(options)(), calibrated=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
     _write(report, folder)
-    common.finish(arguments, _json(report), lambda: _summary(report, folder))
-    return 0
+    return report, folder
 
 
 def _names(options: SearchOptions, *, calibrated: bool) -> list[str]:

@@ -69,7 +69,7 @@ def limits_plot(
             ax.fill_between(separation_mas, curve.low, curve.high, color=colour, alpha=0.2, lw=0)
     if companion is not None:
         _mark_companion(ax, companion)
-    _magnitude_axis(ax)
+    magnitude_axis(ax)
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(2, len(labels)))
     return figure
@@ -111,7 +111,7 @@ def completeness_map(
         if values is not None:
             ax.plot(separation_mas, values, color="white", lw=4.0)
             ax.plot(separation_mas, values, color=BLACK, ls=dash, lw=2.0, label=name)
-    _magnitude_axis(ax, limits=(float(np.min(rows)), float(np.max(rows))))
+    magnitude_axis(ax, limits=(float(np.min(rows)), float(np.max(rows))))
     figure.colorbar(
         mesh, ax=ax, label="Share of injected companions found", location="top", aspect=35
     )
@@ -146,7 +146,7 @@ def _mark_companion(ax: Axes, companion: Companion) -> None:
     )
 
 
-def _magnitude_axis(ax: Axes, limits: tuple[float, float] | None = None) -> None:
+def magnitude_axis(ax: Axes, limits: tuple[float, float] | None = None) -> None:
     """Label the axes: magnitudes left, growing downward, decades of contrast right."""
     low, high = limits or ax.get_ylim()
     ax.set_ylim(high, low)
