@@ -83,6 +83,7 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
         "completeness", "calibrators",
     ):  # fmt: skip
         assert (out / f"{name}.png").stat().st_size > 5000, name
+    assert (out / "report.html").stat().st_size > 1e5
     again = tmp_path / "again"
     calibrated = out / "calibrated.oifits"
     assert run(calibrated, "--out", again, "--separation", "50:400", "--null-draws", "0",
@@ -221,7 +222,7 @@ def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys)
     assert run(other, *FAST, "--out", out, "--overwrite", "--quiet") == 0
     left = sorted(p.name for p in out.iterdir())
     pictures = ["correlation.png", "coverage.png", "fit.png", "map.png", "maps.fits", "nsigma.png"]
-    assert left == [*pictures, RESULT]
+    assert left == [*pictures, "report.html", RESULT]
 
 
 def test_absurd_field_is_refused(target, tmp_path, capsys) -> None:

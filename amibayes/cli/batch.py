@@ -56,7 +56,7 @@ class Job:
         files = [[Path(p) for p in paths] for paths in _paths(self.arguments)]
         if not all(path.is_file() for paths in files for path in paths):
             return ""
-        apart = {flag.removeprefix("--") for flag in NOT_OF_A_ROW} | {"targets"}
+        apart = {flag.removeprefix("--") for flag in NOT_OF_A_ROW} | {"targets", "words"}
         options = {k: v for k, v in vars(self.arguments).items() if k not in apart}
         return digest(options, files)
 
@@ -137,7 +137,7 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
     own.batch, own.workers, own.scheduler = None, 1, None
     own.quiet, own.json = True, False
     try:
-        _set_options(own, row)
+        words = _set_options(own, row)
     except UsageError as error:
         raise UsageError(
             f"target {row.name}: {error.what}", source=arguments.batch, remedy=error.remedy
@@ -147,10 +147,14 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
         own.cal = row.files(row.cal) if row.cal else arguments.cal
     except DataError as error:
         return Job(row.name, None, str(error))
+    given = common.without(arguments.words[1:], common.OF_THE_RUN | {"--cal": sys.maxsize})
+    files = [*own.targets, *(["--cal", *own.cal] if own.cal else [])]
+    own.words = [own.command, *files, *given, *words]
     return Job(row.name, own)
 
 
-def _set_options(own: argparse.Namespace, row: SurveyTarget) -> None:
+def _set_options(own: argparse.Namespace, row: SurveyTarget) -> list[str]:
+    """Set the options of a row; give them as they would stand on the command line."""
     parser = _RowParser(add_help=False, allow_abbrev=False)
     importlib.import_module(f"amibayes.cli.{own.command}").add_arguments(parser)
     words = [
@@ -159,6 +163,7 @@ def _set_options(own: argparse.Namespace, row: SurveyTarget) -> None:
     targets = own.targets
     parser.parse_args(words, namespace=own)
     own.targets = targets
+    return words
 
 
 def _words(parser: argparse.ArgumentParser, column: str, value: object) -> Iterator[str]:

@@ -129,6 +129,38 @@ def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executo
     return open_executor(arguments.workers, arguments.scheduler)
 
 
+OF_THE_RUN = {
+    "--out": 1, "--batch": 1, "--workers": 1, "--scheduler": 1, "--overwrite": 0, "--resume": 0,
+    "--json": 0, "--quiet": 0, "--verbose": 0, "--debug": 0,
+}  # fmt: skip
+"""Options that leave the numbers of a result alone, and how many words follow each."""
+
+
+def without(words: list[str], flags: dict[str, int]) -> list[str]:
+    """Leave options out of a command line, with the words that belong to them."""
+    kept, belonging = [], 0
+    for word in words:
+        flag = word.split("=")[0]
+        if flag in flags:
+            belonging = 0 if "=" in word else flags[flag]
+        elif belonging and not word.startswith("--"):
+            belonging -= 1
+        else:
+            belonging = 0
+            kept.append(word)
+    return kept
+
+
+def command_line(arguments: argparse.Namespace) -> str:
+    """Say how to get the same numbers again: what was asked for, with its seed."""
+    import shlex
+
+    words = without(arguments.words, OF_THE_RUN)
+    if not any(word.split("=")[0] == "--seed" for word in words):
+        words += ["--seed", str(arguments.seed)]
+    return shlex.join(["amibayes", *words])
+
+
 def progress_of(
     arguments: argparse.Namespace, description: str, *, unit: str = "piece", scale: float = 1.0
 ) -> AbstractContextManager[Told]:

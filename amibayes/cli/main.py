@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status (0, 2, 3 or 4)."""
     words = list(sys.argv[1:] if argv is None else argv)
     command = next((word for word in words if word in COMMANDS), None)
-    arguments = build_parser(command).parse_args(words)
+    arguments = build_parser(command).parse_args(words, argparse.Namespace(words=words))
     try:
         run = importlib.import_module(f"amibayes.cli.{arguments.command}").run
         return int(run(arguments))

@@ -12,7 +12,8 @@ from amibayes.errors import UsageError
 if TYPE_CHECKING:
     from amibayes.job import SearchOptions, SearchReport
 
-RESULT, CHAIN, CALIBRATED = "result.json", "posterior.h5", "calibrated.oifits"
+RESULT, REPORT = "result.json", "report.html"
+CHAIN, CALIBRATED = "posterior.h5", "calibrated.oifits"
 
 EXAMPLES = """examples:
   amibayes search target.oifits --cal cal*.oifits
@@ -130,12 +131,12 @@ def run(arguments: argparse.Namespace) -> int:
     common.configure_logging(arguments)
     if arguments.batch is not None:
         return batch.run_batch(arguments)
-    report, folder = perform(arguments)
-    common.finish(arguments, _json(report), lambda: _summary(report, folder))
+    report, folder, content = perform(arguments)
+    common.finish(arguments, content, lambda: _summary(report, folder))
     return 0
 
 
-def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path]:
+def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str, object]]:
     """Run the main job for one target and write its files, without a word."""
     if not arguments.targets:
         raise UsageError("no target given", remedy="name at least one file, or --batch TABLE")
@@ -151,15 +152,14 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path]:
     report = _search(arguments, options, folder)
     for stale in set(_names(type(options)(), calibrated=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
-    _write(report, folder)
-    return report, folder
+    return report, folder, _write(arguments, report, folder)
 
 
 def _names(options: SearchOptions, *, calibrated: bool) -> list[str]:
     """List the files of a run."""
     from amibayes.pictures import picture_names
 
-    names = [RESULT, *picture_names(options, calibrated=calibrated)]
+    names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated)]
     names += [CHAIN] if options.posterior else []
     return [*names, CALIBRATED] if calibrated else names
 
@@ -230,21 +230,21 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
     )
 
 
-def _write(report: SearchReport, folder: Path) -> None:
+def _write(arguments: argparse.Namespace, report: SearchReport, folder: Path) -> dict[str, object]:
+    """Write everything but the chain; the result last, so that it stands for a whole run."""
     from amibayes.files import write_json
     from amibayes.oifits import write_oifits
     from amibayes.pictures import save_pictures
+    from amibayes.report import captioned, result_json, search_page, write_page
 
     if report.calibration is not None:
         write_oifits(folder / CALIBRATED, report.observables, overwrite=True)
-    save_pictures(report, folder)
-    write_json(folder / RESULT, _json(report))
-
-
-def _json(report: SearchReport) -> dict[str, object]:
-    from amibayes.report import result_json
-
-    return result_json(report)
+    drawn = save_pictures(report, folder)
+    content = result_json(report)
+    figures = captioned(folder, [path.name for path in drawn])
+    write_page(folder / REPORT, search_page(content, figures, common.command_line(arguments)))
+    write_json(folder / RESULT, content)
+    return content
 
 
 def _summary(report: SearchReport, folder: Path) -> list[str]:

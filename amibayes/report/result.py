@@ -76,6 +76,7 @@ def _data(report: SearchReport) -> Json:
         "covariance": used.covariance_kind,
         "n_integrations": used.n_integrations,
         "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
+        "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
         "separation_mas": [report.result.grid.inner_mas, report.result.grid.outer_mas],
     }
 

@@ -1,0 +1,246 @@
+"""The sections of ``report.html`` on the fit: search, significance, posterior, limits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from amibayes.report.page import Column, Fact, Figure, Section, Table
+from amibayes.report.statement import field
+from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
+
+Json = dict[str, Any]
+
+UNITS = {
+    "separation_mas": ("Separation", "mas"),
+    "position_angle_deg": ("Position angle", "°"),
+    "east_mas": ("East", "mas"),
+    "north_mas": ("North", "mas"),
+    "contrast": ("Contrast (flux ratio)", ""),
+    "delta_mag": ("Magnitude difference", "mag"),
+    "diameter_mas": ("Diameter of the star", "mas"),
+    "background": ("Over-resolved flux (star = 1)", ""),
+}
+
+
+def search(content: Json, figures: tuple[Figure, ...]) -> Section:
+    """The best fit, χ² and the other local maxima."""
+    fit = content["fit"]
+    text = (
+        f"Every position of the field, {field(content)}, was tried. χ² falls from "
+        f"{fixed(fit['chi2_single'], 1)} without a companion to "
+        f"{fixed(fit['chi2_binary'], 1)} with one, for {count(fit['ndof'], 'degree')} of freedom: "
+        f"reduced, from {fixed(fit['chi2r_single'], 3)} to {fixed(fit['chi2r_binary'], 3)}.",
+    )
+    return Section("Search", text, tables=(_fit(fit), *_modes(content)), figures=figures)
+
+
+def _fit(fit: Json) -> Table:
+    rows = []
+    for key, (name, unit) in UNITS.items():
+        error = fit["errors"].get(key)
+        if key in ("diameter_mas", "background") and error is None:
+            rows.append((name, f"{plain(fit[key])} (fixed)", unit))
+        else:
+            rows.append((name, measured(fit[key], error), unit))
+    caption = "Joint best fit; errors are 1σ, from the curvature of χ²"
+    return Table(
+        caption, (Column("", "text"), Column("Value"), Column("Unit", "text")), tuple(rows)
+    )
+
+
+def _modes(content: Json) -> tuple[Table, ...]:
+    modes = content["modes"]
+    if len(modes) < 2:
+        return ()
+    columns = ("Separation (mas)", "Position angle (°)", "Contrast", "Δχ²", "Probability")
+    rows = tuple(
+        (
+            fixed(m["separation_mas"], 2),
+            fixed(m["position_angle_deg"], 2),
+            plain(m["contrast"]),
+            fixed(m["delta_chi2"], 1),
+            chance(m["probability"]) if "probability" in m else NONE,
+        )
+        for m in modes
+    )
+    caption = "Positions that fit nearly as well, best first; the probability is among these"
+    return (Table(caption, tuple(Column(c) for c in columns), rows),)
+
+
+def significance(content: Json, figures: tuple[Figure, ...]) -> Section:
+    """Every number of significance, with what it means and what it does not."""
+    s = content["significance"]
+    facts = [_false_alarm(s), _local(content)]
+    if s.get("threshold") is not None:
+        facts.append(
+            Fact(
+                "Statistic of the search",
+                plain(s["statistic"], 4),
+                f"The best value anywhere in the field. A detection needs {plain(s['threshold'])}, "
+                f"which noise alone reaches with probability {plain(s['alpha'], 2)}.",
+            )
+        )
+    facts += [
+        Fact(
+            "Δχ²",
+            fixed(s["delta_chi2"], 1),
+            "χ² of the best fit without a companion minus that with one. What a value is worth "
+            "depends on how many positions were tried.",
+        ),
+        Fact(
+            "CANDID nσ",
+            fixed(s["candid_n_sigma"], 1),
+            "Compares the two reduced χ² at one position (Gallenne et al. 2015, eq. 8); given "
+            "for comparison with other papers. It is not a false-alarm rate.",
+        ),
+    ]
+    return Section("Significance", facts=tuple(facts), figures=figures)
+
+
+def _false_alarm(s: Json) -> Fact:
+    meaning = (
+        "Share of data sets without a companion, simulated with the noise of these, whose best "
+        "position anywhere in the field is as good as that of the data."
+    )
+    probability = s["false_alarm_probability"]
+    if probability is None:
+        return Fact("Global false-alarm probability", "not computed", meaning)
+    low, high = s["false_alarm_interval"]
+    bounds = f"95 % interval {chance(low)} to {chance(high)}, {count(s['n_null_draws'], 'draw')}."
+    return Fact("Global false-alarm probability", chance(probability), f"{meaning} {bounds}")
+
+
+def _local(content: Json) -> Fact:
+    fit = content["fit"]
+    error = fit["errors"]["contrast"]
+    value = NONE if not error else f"{fixed(fit['contrast'] / error, 1)} σ"
+    return Fact(
+        "Local significance",
+        value,
+        "Contrast over its error at this one position, as if no other had been tried; the field "
+        "makes it worth less.",
+    )
+
+
+def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
+    """Medians and intervals, and whether the chain has converged."""
+    p = content["posterior"]
+    if p is None:
+        return None
+    state = "It has converged" if p["converged"] else "IT HAS NOT CONVERGED"
+    text = (
+        f"Prior: {p['prior']['form']}; separation {plain(p['prior']['separation_mas'][0])} to "
+        f"{plain(p['prior']['separation_mas'][1])} mas, contrast "
+        f"{plain(p['prior']['contrast'][0])} to {plain(p['prior']['contrast'][1])}.",
+        f"{state}: {count(p['n_walkers'], 'walker')} of {count(p['n_steps'], 'step')}, "
+        f"autocorrelation time {plain(p['autocorrelation_time'])} steps, "
+        f"{count(p['n_effective'], 'independent sample')}, split R̂ "
+        f"{fixed(p['split_rhat'], 3)}.",
+    )
+    return Section("Posterior", text, tables=(_intervals(p),), figures=figures)
+
+
+def _intervals(p: Json) -> Table:
+    names = [key for key, value in p.items() if isinstance(value, dict) and "median" in value]
+    rows = []
+    for key in names:
+        name, unit = UNITS.get(key, (key, ""))
+        q = p[key]
+        places = _places(q)
+        rows.append(
+            (
+                f"{name} ({unit})" if unit else name,
+                fixed(q["median"], places),
+                f"{fixed(q['lower'], places)} to {fixed(q['upper'], places)}",
+                f"{fixed(q['lower_95'], places)} to {fixed(q['upper_95'], places)}",
+            )
+        )
+    columns = (Column("", "text"), Column("Median"), Column("68 %"), Column("95 %"))
+    return Table("Marginal posterior of each quantity", columns, tuple(rows))
+
+
+def _places(quantity: Json) -> int:
+    width = 0.5 * (quantity["upper"] - quantity["lower"])
+    return min(max(places_of(width), 0), 9) if width > 0.0 else 3
+
+
+def evidence(content: Json) -> Section | None:
+    """Models with different numbers of companions, weighed against each other."""
+    e = content["evidence"]
+    if e is None:
+        return None
+    rows = tuple(
+        (str(n), measured(z, error), chance(share), method)
+        for n, z, error, share, method in zip(
+            e["companions"],
+            e["log_z"],
+            e["log_z_error"],
+            e["probability"],
+            e["method"],
+            strict=True,
+        )
+    )
+    columns = (
+        Column("Companions"),
+        Column("ln Z"),
+        Column("Probability"),
+        Column("Computed by", "text"),
+    )
+    text = (
+        "The evidence Z weighs models with all their parameters integrated over the prior; the "
+        "probabilities are those of the models given the data, and depend on that prior.",
+    )
+    table = Table("Evidence and probability of each number of companions", columns, rows)
+    return Section("Evidence", text, tables=(table, *_two(e)))
+
+
+def _two(e: Json) -> tuple[Table, ...]:
+    two = e["two_companions"]
+    if two is None:
+        return ()
+    rows = tuple(
+        (
+            measured(c["separation_mas"], c["errors"]["separation_mas"]),
+            measured(c["position_angle_deg"], c["errors"]["position_angle_deg"]),
+            measured(c["contrast"], c["errors"]["contrast"]),
+        )
+        for c in two["companions"]
+    )
+    columns = (Column("Separation (mas)"), Column("Position angle (°)"), Column("Contrast"))
+    caption = (
+        f"Joint fit of two companions: χ² {fixed(two['chi2'], 1)} for "
+        f"{count(two['ndof'], 'degree')} of freedom"
+    )
+    return (Table(caption, columns, rows),)
+
+
+def limits(content: Json, figures: tuple[Figure, ...]) -> Section | None:
+    """What could have been seen."""
+    found = content["limits"]
+    if found is None:
+        return None
+    share = f"{100.0 * found['completeness']:.0f} %"
+    text = (
+        f"Companions were injected into data without one and searched for by the same criterion "
+        f"(method {found['method']}, false-positive rate "
+        f"{plain(found['false_positive_rate'], 2)}). A dash stands where none is recovered "
+        "reliably, whatever its brightness.",
+    )
+    rows = tuple(
+        (fixed(rho, 1), fixed(mag, 2), plain(contrast), fixed(half, 2))
+        for rho, mag, contrast, half in zip(
+            found["separation_mas"],
+            found["delta_mag_3sigma"],
+            found.get("contrast") or [None] * len(found["separation_mas"]),
+            found.get("delta_mag_50") or [None] * len(found["separation_mas"]),
+            strict=True,
+        )
+    )
+    columns = (
+        Column("Separation (mas)"),
+        Column(f"Δmag, {share} recovered"),
+        Column(f"Contrast, {share}"),
+        Column("Δmag, 50 % recovered"),
+    )
+    table = Table("Limit at each separation", columns, rows)
+    return Section("Detection limits", text, tables=(table,), figures=figures)

@@ -1,0 +1,220 @@
+"""``report.html`` of a search, from the content of ``result.json`` and the pictures."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from amibayes.report import fit_sections
+from amibayes.report.page import (
+    Column,
+    Fact,
+    Figure,
+    Page,
+    Section,
+    Table,
+    figures_named,
+)
+from amibayes.report.statement import field, sky_of, statement_of
+from amibayes.report.words import chance, count, measured, plain, sentence
+
+Json = dict[str, Any]
+
+COVARIANCE = {
+    "diagonal": "every number independent of the others",
+    "assumed": "triangles correlated through the baselines that they share",
+    "given": "all correlations as the files give them",
+    "estimated": "all correlations as estimated from the data",
+}
+
+PLACED = {
+    "map": "search",
+    "null": "significance",
+    "false_alarm": "significance",
+    "nsigma": "significance",
+    "fit": "search",
+    "coverage": "data",
+    "correlation": "data",
+    "calibrators": "data",
+    "corner": "posterior",
+    "chains": "posterior",
+    "limits": "limits",
+    "completeness": "limits",
+}
+"""The section of each picture; one that is not named here stands at the end."""
+
+
+def search_page(content: Json, figures: Sequence[Figure] = (), command: str = "") -> Page:
+    """Tell a search so that a referee can follow it.
+
+    Parameters
+    ----------
+    content : dict
+        As `amibayes.report.result_json` gives it, or as read back from ``result.json``.
+    figures : sequence of Figure
+    command : str
+        The command line that gives the same result again.
+    """
+    names = content["data"].get("targets") or [
+        Path(i["path"]).name for i in content["inputs"] if i["role"] == "target"
+    ]
+    sections = [
+        _data(content, _placed(figures, "data")),
+        fit_sections.search(content, _placed(figures, "search")),
+        fit_sections.significance(content, _placed(figures, "significance")),
+        fit_sections.posterior(content, _placed(figures, "posterior")),
+        fit_sections.evidence(content),
+        fit_sections.limits(content, _placed(figures, "limits")),
+        _others(figures),
+        _again(content, command),
+    ]
+    return Page(
+        "amibayes search",
+        ", ".join(names),
+        _subtitle(content),
+        statement_of(content),
+        _tiles(content),
+        tuple(s for s in sections if s is not None),
+        sky_of(content),
+        tuple(sentence(w) for w in content["warnings"]),
+    )
+
+
+def _placed(figures: Sequence[Figure], section: str) -> tuple[Figure, ...]:
+    return figures_named(figures, *(name for name, where in PLACED.items() if where == section))
+
+
+def _others(figures: Sequence[Figure]) -> Section | None:
+    left = tuple(figure for figure in figures if figure.name not in PLACED)
+    return Section("More pictures", figures=left) if left else None
+
+
+def _subtitle(content: Json) -> str:
+    data = content["data"]
+    return (
+        f"{', '.join(data['instruments'])}: {data['n_vis2']} squared visibilities and "
+        f"{data['n_closure_phases']} closure phases, {data['n_independent']} independent numbers"
+    )
+
+
+def _tiles(content: Json) -> tuple[Fact, ...]:
+    fit, errors = content["fit"], content["fit"]["errors"]
+    probability = content["significance"]["false_alarm_probability"]
+    if fit["contrast"] <= 0.0:
+        place: tuple[Fact, ...] = ()
+    else:
+        place = tuple(
+            Fact(name, measured(fit[key], errors[key], unit))
+            for name, key, unit in (
+                ("Separation", "separation_mas", " mas"),
+                ("Position angle", "position_angle_deg", "°"),
+                ("Magnitude difference", "delta_mag", ""),
+            )
+        )
+        if not content["significance"]["detected"]:
+            place = tuple(Fact(f"{f.name} (best fit)", f.value) for f in place)
+    told = "not computed" if probability is None else chance(probability)
+    return (*place, Fact("False-alarm probability", told, "by noise, anywhere in the field"))
+
+
+def _data(content: Json, figures: tuple[Figure, ...]) -> Section:
+    data = content["data"]
+    text = [
+        f"{count(data['n_vis2'], 'squared visibility', 'squared visibilities')} and "
+        f"{count(data['n_closure_phases'], 'closure phase')} hold "
+        f"{count(data['n_independent'], 'independent number')}: "
+        f"{COVARIANCE[data['covariance']]} ({data['covariance']} covariance)."
+    ]
+    calibration = content["calibration"]
+    tables = [_inputs(content)]
+    if calibration is None:
+        text.append("No calibrators were given: the data were taken as calibrated.")
+    else:
+        text.append(_calibration(calibration))
+        tables.append(_calibrators(calibration))
+    return Section(
+        "Data and calibration",
+        (*text, _noise(content["noise"])),
+        tables=tuple(tables),
+        figures=figures,
+    )
+
+
+def _inputs(content: Json) -> Table:
+    columns = (Column("Role", "text"), Column("File", "code"), Column("SHA-256", "code"))
+    rows = tuple((i["role"], i["path"], i["sha256"]) for i in content["inputs"])
+    return Table("Files that were read", columns, rows)
+
+
+def _calibration(calibration: Json) -> str:
+    kept = sum(c["kept"] for c in calibration["calibrators"])
+    said = (
+        f"{count(kept, 'calibrator')} of {len(calibration['calibrators'])} used, combined by the "
+        f"{calibration['method']} method."
+    )
+    tau = calibration["tau"]
+    parts = [
+        f"{plain(tau[key], 2)}{unit} in {name}"
+        for key, unit, name in (
+            ("vis2", "", "V²"),
+            ("closure_phase_deg", "°", "closure phase"),
+        )
+        if tau.get(key) is not None
+    ]
+    if not parts:
+        return said
+    return f"{said} They scatter by {' and '.join(parts)} more than their errors say."
+
+
+def _calibrators(calibration: Json) -> Table:
+    columns = (
+        Column("Calibrator", "code"),
+        Column("Use", "text"),
+        Column("Agreement"),
+        Column("Reason", "text"),
+    )
+    rows = tuple(
+        (
+            c["path"],
+            "kept" if c["kept"] else "dropped",
+            plain(c.get("agreement_probability"), 2),
+            c["reason"] or "–",
+        )
+        for c in calibration["calibrators"]
+    )
+    caption = (
+        "Calibrators; agreement is the probability that one which is like the others would "
+        "differ from them at least as much"
+    )
+    return Table(caption, columns, rows)
+
+
+def _noise(noise: Json) -> str:
+    vis2, closure = noise["extra_vis2"], noise["extra_closure_phase_deg"]
+    if not vis2 and not closure:
+        return "The stated errors explain the residuals: no noise was added."
+    return (
+        f"The stated errors do not explain the residuals: noise of {plain(vis2, 2)} in V² and "
+        f"{plain(closure, 2)}° in closure phase was added in quadrature, and every χ² and error "
+        "on this page includes it."
+    )
+
+
+def _again(content: Json, command: str) -> Section:
+    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "astropy"))
+    return Section(
+        "How to run it again",
+        (
+            "The same files (see the checksums), options and seed give the same numbers, for any "
+            "number of workers.",
+        ),
+        code=command,
+        notes=(
+            f"amibayes {content['amibayes']}, seed {content['seed']}, field {field(content)}; "
+            f"Python {platform.python_version()}, {packages}. Every number of this page stands "
+            "in result.json with all its digits.",
+        ),
+    )

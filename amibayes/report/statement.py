@@ -1,0 +1,149 @@
+"""The answer of a search in words, from the content of ``result.json``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from amibayes.report.page import Mark, Sky, Statement
+from amibayes.report.words import chance, count, fixed, measured, plain
+from amibayes.units import offset
+
+Json = dict[str, Any]
+
+LABELS = {True: "Companion detected", False: "No companion detected", None: "No claim is made"}
+
+
+def statement_of(content: Json) -> Statement:
+    """Say what was found, how sure that is, and what could have been seen.
+
+    Parameters
+    ----------
+    content : dict
+        As `amibayes.report.result_json` gives it.
+    """
+    detected = content["significance"]["detected"]
+    kind = {True: "found", False: "none", None: "open"}[detected]
+    headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
+    sentences = [_chance(content), _others(content), _limits(content), _upper_limit(content)]
+    return Statement(kind, LABELS[detected], headline, tuple(s for s in sentences if s))  # type: ignore[arg-type]
+
+
+def place(content: Json) -> str:
+    """Where the best fit is, and how bright, with errors."""
+    fit, errors = content["fit"], content["fit"]["errors"]
+    return (
+        f"{measured(fit['separation_mas'], errors['separation_mas'])} mas, position angle "
+        f"{measured(fit['position_angle_deg'], errors['position_angle_deg'], '°')}, "
+        f"{measured(fit['delta_mag'], errors['delta_mag'])} mag fainter than the star"
+    )
+
+
+def field(content: Json) -> str:
+    """The separations that were searched."""
+    inner, outer = content["data"]["separation_mas"]
+    return f"{plain(inner)} to {plain(outer)} mas"
+
+
+def _found(content: Json) -> str:
+    return f"A companion at {place(content)}."
+
+
+def _nothing(content: Json) -> str:
+    return f"No companion is detected at {field(content)} from the star."
+
+
+def _unjudged(content: Json) -> str:
+    if content["fit"]["contrast"] <= 0.0:
+        return f"Nothing at {field(content)} from the star improves the fit."
+    return f"The best fit is a companion at {place(content)}; its chance is not known."
+
+
+def _chance(content: Json) -> str:
+    significance = content["significance"]
+    probability, draws = significance["false_alarm_probability"], significance["n_null_draws"]
+    if probability is None:
+        return (
+            "No data without a companion were simulated, so nothing is said of how often noise "
+            "alone would look like this."
+        )
+    low, high = significance["false_alarm_interval"]
+    asked = f"a detection is claimed below {plain(significance['alpha'], 2)}"
+    if significance["detected"] is None:
+        asked = f"too few to tell anything below {plain(significance['alpha'], 2)}"
+    return (
+        "The chance that noise alone gives something as good anywhere in the field "
+        f"({field(content)}) is {chance(probability)}, and with 95 % confidence between "
+        f"{chance(low)} and {chance(high)}: from the same search in {count(draws, 'data set')} "
+        f"simulated without a companion; {asked}."
+    )
+
+
+def _others(content: Json) -> str:
+    """Whether the position is the only one."""
+    modes = content["modes"]
+    if len(modes) < 2 or content["significance"]["detected"] is False:
+        return ""
+    others = [m for m in modes[1:] if m.get("probability", 1.0) >= 0.01]
+    if not others:
+        return ""
+    told = "; ".join(
+        f"{plain(m['separation_mas'], 4)} mas at {plain(m['position_angle_deg'], 4)}°"
+        + (f" (probability {chance(m['probability'])})" if "probability" in m else "")
+        for m in others[:3]
+    )
+    more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+    return f"The data do not rule out another position: {told}{more}."
+
+
+def _limits(content: Json) -> str:
+    limits = content["limits"]
+    if limits is None:
+        return ""
+    curve = [
+        (rho, mag)
+        for rho, mag in zip(limits["separation_mas"], limits["delta_mag_3sigma"], strict=True)
+        if mag is not None
+    ]
+    if not curve:
+        return "No injected companion is recovered reliably anywhere in this field."
+    best = max(curve, key=lambda point: point[1])
+    worst = min(curve, key=lambda point: point[1])
+    return (
+        f"Companions up to {fixed(worst[1], 2)} mag fainter than the star (at "
+        f"{plain(worst[0])} mas) to {fixed(best[1], 2)} mag (at {plain(best[0])} mas) would be "
+        f"found {100.0 * limits['completeness']:.0f} % of the time, at a false-positive rate of "
+        f"{plain(limits['false_positive_rate'], 2)}."
+    )
+
+
+def _upper_limit(content: Json) -> str:
+    posterior = content["posterior"]
+    limit = None if posterior is None else posterior["upper_limit"]
+    if limit is None or content["significance"]["detected"] is None:
+        return ""
+    return (
+        f"With {100.0 * limit['level']:.0f} % probability a companion anywhere in the field is "
+        f"more than {fixed(limit['delta_mag'], 2)} mag fainter than the star (prior: "
+        f"{limit['prior']})."
+    )
+
+
+def sky_of(content: Json) -> Sky:
+    """Sketch the field, the best fit and the other modes."""
+    inner, outer = content["data"]["separation_mas"]
+    fit, detected = content["fit"], content["significance"]["detected"]
+    marks = []
+    for mode in content["modes"][1:]:
+        east, north = offset(mode["separation_mas"], mode["position_angle_deg"])
+        marks.append(Mark(float(east), float(north), "mode"))
+    told = f"Sketch of the field, {field(content)} around the star, north up and east left"
+    if fit["contrast"] > 0.0:
+        kind = "companion" if detected else "candidate"
+        marks.append(Mark(fit["east_mas"], fit["north_mas"], kind))  # type: ignore[arg-type]
+        told += (
+            f"; the {'companion' if detected else 'best fit'} is at "
+            f"{plain(fit['separation_mas'], 4)} mas, {plain(fit['position_angle_deg'], 4)}°"
+        )
+    if content["modes"][1:]:
+        told += f"; {count(len(content['modes']) - 1, 'other local maximum', 'other local maxima')}"
+    return Sky(inner, outer, tuple(marks), told + ".")

@@ -1,0 +1,80 @@
+"""Numbers as a reader wants them: as many digits as the error leaves, and a dash for none."""
+
+from __future__ import annotations
+
+import math
+
+NONE = "–"
+
+PLUS_MINUS, TIMES = "\u00a0±\u00a0", "\u00a0×\u00a0"
+"""No line breaks within a number."""
+
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def plain(value: float | None, digits: int = 3) -> str:
+    """Write a number with so many digits that count; powers of ten where it is far from 1."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    rounded = float(f"{value:.{digits - 1}e}")
+    if rounded and not 1e-4 <= abs(rounded) < 1e6:
+        mantissa, power = f"{rounded:.{digits - 1}e}".split("e")
+        shown = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+        return f"{shown}{TIMES}10{str(int(power)).translate(SUPERSCRIPT)}".replace("-", "−")
+    places = max(0, digits - 1 - _power(rounded)) if rounded else 0
+    text = f"{rounded:.{places}f}"
+    return (text.rstrip("0").rstrip(".") if "." in text else text).replace("-", "−")
+
+
+def fixed(value: float | None, places: int) -> str:
+    """Write a number with so many decimals."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    return f"{value:.{places}f}".replace("-", "−")
+
+
+def measured(value: float | None, error: float | None, unit: str = "") -> str:
+    """Write a number and its error, both to the error's second digit."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if error is None or not math.isfinite(error) or error <= 0.0:
+        return f"{plain(value, 4)}{unit}"
+    places = places_of(error)
+    if places > 6:
+        power = _power(max(abs(value), error))
+        places = max(0, places_of(error / 10.0**power))
+        scaled = f"({value / 10.0**power:.{places}f}{PLUS_MINUS}{error / 10.0**power:.{places}f})"
+        return f"{scaled}{TIMES}10{str(power).translate(SUPERSCRIPT)}{unit}".replace("-", "−")
+    both = f"{value:.{max(places, 0)}f}{PLUS_MINUS}{error:.{max(places, 0)}f}"
+    return f"{both}{unit}".replace("-", "−")
+
+
+def places_of(error: float) -> int:
+    """Decimals that show two digits of an error."""
+    return 1 - _power(float(f"{error:.1e}"))
+
+
+def _power(value: float) -> int:
+    return math.floor(math.log10(abs(value)))
+
+
+def chance(probability: float) -> str:
+    """Write a probability; 0 and 1 are said as what they are."""
+    if 0.001 <= probability < 0.01:
+        return plain(probability, 2)
+    if 0.01 <= probability <= 0.99:
+        return f"{100.0 * probability:.2g} %"
+    return plain(probability, 2)
+
+
+def count(number: int, one: str, many: str | None = None) -> str:
+    """Write a number of things: 1 mode, 2 modes, 10 000 draws."""
+    written = f"{number:,}".replace(",", "\u202f")
+    return f"{written} {one if number == 1 else many or one + 's'}"
+
+
+def sentence(text: str) -> str:
+    """Begin with a capital and end with a stop."""
+    text = text.strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else text + "."

@@ -1,0 +1,324 @@
+"""report.html: what it says, that it says it safely, and how a real browser shows it."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+
+from amibayes.cli import main
+from amibayes.errors import DataError
+from amibayes.job import SearchOptions
+from amibayes.oifits import write_oifits
+from amibayes.pictures import picture_names
+from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
+from amibayes.report.captions import CAPTIONS
+from amibayes.report.page import Sky, page_html
+from amibayes.report.search_page import PLACED
+from amibayes.report.statement import statement_of
+from amibayes.report.words import chance, count, measured, plain
+
+HOSTILE = "<b>bold</b>&\"'<img src=x onerror=alert(1)>.oifits".replace("/", "")
+TRUTH = [110.0, -75.0, 0.02]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A search of a file with a hostile name, with calibrators."""
+    base = tmp_path_factory.mktemp("report")
+    target, cals = base / HOSTILE, [base / f"cal{k}.oifits" for k in range(2)]
+    write_oifits(target, simulated(niriss(), TRUTH, np.random.default_rng(1)))
+    for k, path in enumerate(cals):
+        write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(5 + k)))
+    words = ["search", str(target), "--cal", *map(str, cals), "--separation", "50:400"]
+    out = base / "out"
+    assert main([*words, "--null-draws", "2000", "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def content(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "result.json").read_text())
+
+
+class Reader(HTMLParser):
+    """Collects what a page links to, loads, names and says."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.tags: set[str] = set()
+        self.said = ""
+        self._silent = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.tags.add(tag)
+        self._silent = tag == "style"
+        if values.get("id"):
+            self.ids.append(str(values["id"]))
+        if tag == "a":
+            self.links.append(str(values["href"]))
+        if tag == "img":
+            self.images.append(values)
+
+    def handle_data(self, data: str) -> None:
+        self.said += "" if self._silent else data
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Reader:
+    return Reader((folder / "report.html").read_text())
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "written"),
+    [
+        (151.8588, 2.825, "151.9 ± 2.8"),
+        (0.0097167, 0.00028957, "0.00972 ± 0.00029"),
+        (1234.5, 99.6, "1234 ± 100"),
+        (-28.506, 0.0996, "−28.51 ± 0.10"),
+        (5e-9, 1.2e-10, "(5.00 ± 0.12) × 10⁻⁹"),
+        (3.0, math.nan, "3"),
+        (None, 1.0, "–"),
+        (math.nan, 1.0, "–"),
+    ],
+)
+def test_as_many_digits_as_the_error_leaves(value, error, written) -> None:
+    assert measured(value, error).replace("\u00a0", " ") == written
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [(0.0, "0"), (752.62, "753"), (9.9999e-5, "0.0001"), (3.21e-7, "3.21 × 10⁻⁷"),
+     (1e6, "1 × 10⁶"), (-2.5, "−2.5"), (math.inf, "–"), (0.99999, "1"), (100.0, "100")],
+)  # fmt: skip
+def test_plain_numbers(value, written) -> None:
+    assert plain(value) == written
+
+
+def test_chances_and_counts() -> None:
+    assert [chance(p) for p in (0.0, 1.0, 0.343, 0.0013)] == ["0", "1", "34 %", "0.0013"]
+    assert chance(8e-254) == "8 × 10⁻²⁵⁴"
+    assert count(1, "mode") == "1 mode"
+    assert count(10000, "draw") == "10\u202f000 draws"
+
+
+def test_the_answer_stands_in_words(page: Reader, content) -> None:
+    fit = content["fit"]
+    said = page.said.replace("\u00a0", " ")
+    place = f"A companion at {fit['separation_mas']:.1f} ± {fit['errors']['separation_mas']:.1f}"
+    assert place in said
+    assert "The chance that noise alone gives something as good anywhere in the field" in said
+    for entry in content["inputs"]:
+        assert entry["sha256"] in said
+        assert entry["path"] in said
+    for title in ("Data and calibration", "Search", "Significance", "Posterior", "Evidence",
+                  "Detection limits", "How to run it again"):  # fmt: skip
+        assert title in said
+    assert "--null-draws 2000" in said
+    assert "--seed 1" in said
+    for warning in content["warnings"]:
+        assert warning[1:] in page.said
+        said = said.replace(warning[1:], "")
+    assert not re.search(r"\b(nan|None|inf)\b", said)
+
+
+def test_the_page_is_whole_and_safe(page: Reader, folder: Path) -> None:
+    text = (folder / "report.html").read_text()
+    assert not page.tags & {"b", "script", "iframe", "object", "embed"}
+    assert not re.search(r"(?:src|href)=\"(?!data:|#)", text)
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "srcset" not in text
+    assert len(page.ids) == len(set(page.ids))
+    assert {link.removeprefix("#") for link in page.links} <= set(page.ids)
+    names = [p.stem for p in folder.glob("*.png")]
+    assert sorted(i.removeprefix("figure-") for i in page.ids if i.startswith("figure-")) == sorted(
+        names
+    )
+    assert all(str(i["src"]).startswith("data:image/png;base64,") for i in page.images)
+    assert all(i["alt"] and int(str(i["width"])) > 300 for i in page.images)
+
+
+def test_every_picture_has_its_words_and_its_place() -> None:
+    """A new picture of the main job needs a caption and a section."""
+    drawn = {n.removesuffix(".png") for n in picture_names(SearchOptions(), calibrated=True)
+             if n.endswith(".png")}  # fmt: skip
+    assert drawn <= set(CAPTIONS)
+    assert drawn <= set(PLACED)
+
+
+def test_no_detection_states_a_limit(content) -> None:
+    none = copy.deepcopy(content)
+    none["significance"] |= {"detected": False, "false_alarm_probability": 0.34}
+    none["posterior"]["upper_limit"] = {
+        "level": 0.95, "contrast": 0.001, "delta_mag": 7.5, "prior": "uniform in area",
+        "contrast_uniform_prior": 0.002, "method": "grid",
+    }  # fmt: skip
+    said = statement_of(none)
+    assert said.kind == "none"
+    assert said.headline.startswith("No companion is detected at 50 to 400 mas")
+    words = " ".join(said.sentences)
+    assert "34 %" in words
+    assert "more than 7.50 mag fainter" in words
+    assert "would be found 95 % of the time" in words
+    assert search_page(none).facts[0].name == "Separation (best fit)"
+
+
+def test_nothing_is_claimed_without_null_draws_and_absent_stages_are_absent(content) -> None:
+    bare = copy.deepcopy(content)
+    bare["significance"] |= {
+        "detected": None, "false_alarm_probability": None, "false_alarm_interval": None,
+        "n_null_draws": 0,
+    }  # fmt: skip
+    bare |= {"posterior": None, "limits": None, "evidence": None, "calibration": None}
+    bare["warnings"] = []
+    bare["fit"]["errors"] = dict.fromkeys(bare["fit"]["errors"])
+    for mode in bare["modes"]:
+        mode.pop("probability", None)
+    reader = Reader(page_html(search_page(bare)))
+    assert "its chance is not known" in reader.said
+    assert not {"posterior", "evidence", "detection-limits"} & set(reader.ids)
+    assert not re.search(r"\b(nan|None|inf)\b", reader.said)
+    bare["fit"] |= {"contrast": 0.0, "delta_mag": None}
+    assert "improves the fit" in statement_of(bare).headline
+
+
+def test_any_command_can_make_a_page() -> None:
+    table = Table("<i>t</i>", (Column("a", "text"), Column("b")), (("<u>x</u>", "1"),))
+    page = Page("amibayes validate", "Validation", "", Statement("open", "l", "<b>h</b>"),
+                sections=(Section("A & B", ("<script>",), tables=(table,)),))  # fmt: skip
+    reader = Reader(page_html(page))
+    assert not reader.tags & {"i", "u", "b", "script"}
+    assert "a-b" in reader.ids
+    assert "Warnings" not in reader.said
+    with pytest.raises(ValueError, match="one text for each column"):
+        Table("t", (Column("a"),), (("1", "2"),))
+
+
+def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "map.png").write_text("no picture")
+    with pytest.raises(DataError, match="is no PNG"):
+        captioned(tmp_path, ["map.png", "maps.fits"])
+    with pytest.raises(DataError, match="cannot be read"):
+        captioned(tmp_path, ["gone.png"])
+
+
+@pytest.mark.parametrize(("outer", "bar"), [(752.6, 200.0), (1.2, 0.5), (50.0, 20.0), (9.0, 2.0)])
+def test_scale_bar_is_a_round_number(outer: float, bar: float) -> None:
+    assert Sky(0.1, outer, (), "").bar_mas == pytest.approx(bar)
+
+
+PHONE, DESKTOP = (390, 844), (1280, 900)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A headless Chromium; skips where there is none."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    driver = shutil.which("chromedriver")
+    if not chromium or not driver:
+        pytest.skip("no chromium with chromedriver on this machine: pages not seen in a browser")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(word)
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('profile')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driven = webdriver.Chrome(options=options, service=Service(driver))
+    yield driven
+    driven.quit()
+
+
+def shown(browser: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
+    """Open a page on a screen of this size."""
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 500},
+    )
+    scheme_now = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme_now})
+    browser.get_log("browser")
+    browser.get(path.as_uri())
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_in_a_browser(browser: Any, folder: Path, size, scheme) -> None:
+    shown(browser, folder / "report.html", size, scheme)
+    wide = browser.execute_script(
+        "return [document.scrollingElement.scrollWidth, window.innerWidth]"
+    )
+    assert wide[0] <= wide[1] == size[0]
+    images = browser.execute_script(
+        "return [...document.images].map(i => [i.complete, i.naturalWidth, i.clientWidth])"
+    )
+    assert len(images) == len(list(folder.glob("*.png")))
+    assert all(done and natural > 300 and seen > 200 for done, natural, seen in images)
+    loose = browser.execute_script(
+        "return [...document.querySelectorAll('a')].map(a => a.hash)"
+        ".filter(h => !document.getElementById(decodeURIComponent(h.slice(1))))"
+    )
+    assert loose == []
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out_from_its_ground(browser: Any, folder: Path, scheme) -> None:
+    """WCAG AA: a contrast of 4.5 for text of every colour the page uses."""
+    shown(browser, folder / "report.html", DESKTOP, scheme)
+    names = ("paper", "card", "ink", "soft", "accent", "found", "open")
+    colours = browser.execute_script(
+        "const s = getComputedStyle(document.documentElement);"
+        "return arguments[0].map(n => s.getPropertyValue('--' + n).trim())",
+        list(names),
+    )
+    light = {n: luminance(c) for n, c in zip(names, colours, strict=True)}
+    for ground in ("paper", "card"):
+        for text in names[2:]:
+            high, low = sorted((light[ground], light[text]), reverse=True)
+            assert (high + 0.05) / (low + 0.05) >= 4.5, (scheme, ground, text)
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of #rrggbb (WCAG 2)."""
+    channels = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_a_link_leads_to_its_section(browser: Any, folder: Path) -> None:
+    shown(browser, folder / "report.html", PHONE)
+    browser.find_element("link text", "Significance").click()
+    top = "return document.getElementById('significance').getBoundingClientRect().top"
+    assert 0 <= browser.execute_script(top) < 60
+
+
+def test_it_prints(browser: Any, folder: Path) -> None:
+    import base64
+
+    shown(browser, folder / "report.html", DESKTOP)
+    pdf = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {})["data"])
+    assert pdf.startswith(b"%PDF")
+    assert 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 20
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    hidden = "return getComputedStyle(document.querySelector('nav')).display"
+    assert browser.execute_script(hidden) == "none"
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
