@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import copy
 import json
 import math
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 
-from amibayes.cli import main
+from amibayes.cli import common, main
 from amibayes.errors import DataError
 from amibayes.job import SearchOptions
 from amibayes.oifits import write_oifits
@@ -107,12 +108,12 @@ def test_as_many_digits_as_the_error_leaves(value, error, written) -> None:
      (1e6, "1 × 10⁶"), (-2.5, "−2.5"), (math.inf, "–"), (0.99999, "1"), (100.0, "100")],
 )  # fmt: skip
 def test_plain_numbers(value, written) -> None:
-    assert plain(value) == written
+    assert plain(value).replace("\u00a0", " ") == written
 
 
 def test_chances_and_counts() -> None:
     assert [chance(p) for p in (0.0, 1.0, 0.343, 0.0013)] == ["0", "1", "34 %", "0.0013"]
-    assert chance(8e-254) == "8 × 10⁻²⁵⁴"
+    assert chance(8e-254) == "8\u00a0×\u00a010⁻²⁵⁴"
     assert count(1, "mode") == "1 mode"
     assert count(10000, "draw") == "10\u202f000 draws"
 
@@ -322,3 +323,16 @@ def test_it_prints(browser: Any, folder: Path) -> None:
     hidden = "return getComputedStyle(document.querySelector('nav')).display"
     assert browser.execute_script(hidden) == "none"
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
+def test_the_command_line_keeps_what_decides_the_numbers() -> None:
+    words = ["search", "a b.oifits", "--out", "x", "--seed", "3", "--workers=4", "--cal", "c", "d",
+             "--json", "--no-limits", "--resume"]  # fmt: skip
+    arguments = argparse.Namespace(words=words, seed=3)
+    kept = "amibayes search 'a b.oifits' --seed 3 --cal c d --no-limits"
+    assert common.command_line(arguments) == kept
+    assert common.without(words, {"--cal": 99}) == [
+        w for w in words if w not in ("--cal", "c", "d")
+    ]
+    plain = argparse.Namespace(words=["search", "t"], seed=1)
+    assert common.command_line(plain) == "amibayes search t --seed 1"
