@@ -15,6 +15,7 @@ LAYERS = [
     "disc",
     "orientation",
     "errors",
+    "damage",
     "files",
     "parallel",
     "settings",

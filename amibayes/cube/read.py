@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.io.fits.verify import VerifyWarning
-from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
 from amibayes.cube.container import Cube
+from amibayes.damage import reporting_damage
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
 from amibayes.orientation import Orientation
@@ -39,7 +38,8 @@ class CubeFile:
     def read(self, start: int = 0, stop: int | None = None) -> Cube:
         """Read the integrations from ``start`` up to ``stop``."""
         part = slice(start, self.n_integrations if stop is None else stop)
-        arrays = {name: _section(hdu, part) for name, hdu in self._hdus.items()}
+        with reporting_damage(self.template.source):
+            arrays = {name: _section(hdu, part) for name, hdu in self._hdus.items()}
         mjd = None if self._mjd is None else self._mjd[part]
         return replace(
             self.template,
@@ -119,21 +119,27 @@ def open_cube(
         instrument, filter or pixel scale it is of.
     """
     source = str(path)
+    given = {
+        "instrument": instrument,
+        "filter": filter,
+        "pixel_scale_rad": pixel_scale_rad,
+        "position_angle_deg": position_angle_deg,
+    }
     with _opened(Path(path)) as hdus:
-        science = _science(hdus, source)
-        chosen = {"SCI": science} | _companions(hdus, science, source)
-        _check_complete(hdus, source)
-        header = _merged(hdus, science)
-        keys.check_mask(header, source)
-        given = {
-            "instrument": instrument,
-            "filter": filter,
-            "pixel_scale_rad": pixel_scale_rad,
-            "position_angle_deg": position_angle_deg,
-        }
-        template = _template(header, science, given, source)
-        n = science.shape[0] if len(science.shape) == 3 else 1
-        yield CubeFile(template, n, chosen, _mid_times(hdus, n, source))
+        with reporting_damage(path):
+            file = _described(hdus, given, source)
+        yield file
+
+
+def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile:
+    science = _science(hdus, source)
+    chosen = {"SCI": science} | _companions(hdus, science, source)
+    _check_complete(hdus, source)
+    header = _merged(hdus, science)
+    keys.check_mask(header, source)
+    template = _template(header, science, given, source)
+    n = science.shape[0] if len(science.shape) == 3 else 1
+    return CubeFile(template, n, chosen, _mid_times(hdus, n, source))
 
 
 @contextmanager
@@ -141,19 +147,11 @@ def _opened(path: Path) -> Iterator[Any]:
     """Open a FITS file, with every complaint of the library as one line."""
     if path.is_dir():
         raise DataError("is a folder", source=path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", VerifyWarning)
-            warnings.simplefilter("ignore", AstropyUserWarning)
-            hdus = fits.open(path, memmap=False)
-            len(hdus)  # reads every header
-    except FileNotFoundError:
-        raise DataError("is not there", source=path) from None
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        raise DataError(
-            f"is not a readable FITS file: {str(error).splitlines()[0] if str(error) else error!r}",
-            source=path,
-        ) from error
+    if not path.exists():
+        raise DataError("is not there", source=path)
+    with reporting_damage(path):
+        hdus = fits.open(path, memmap=False)
+        len(hdus)  # reads every header
     with hdus:
         yield hdus
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from astropy.io import fits
 
+from amibayes.damage import UNREADABLE
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.observables import Observables, join
@@ -41,7 +42,7 @@ def holds_images(path: str | Path) -> bool:
             if any(hdu.name.startswith("OI_") for hdu in hdus):
                 return False
             return any(hdu.is_image and len(hdu.shape) > 1 for hdu in hdus)
-    except (OSError, ValueError, TypeError, KeyError, IndexError):
+    except UNREADABLE:
         return False
 
 

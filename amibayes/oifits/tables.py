@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import struct
-import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +15,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from amibayes.damage import reporting_damage
 from amibayes.errors import DataError
 
 USED = ("OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS2", "OI_T3", "OI_CORR", "V2COV", "CPCOV")
@@ -24,22 +23,6 @@ USED = ("OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS2", "OI_T3", "OI_CORR",
 
 OWN_KEY = "AMIBAYES"
 """First word of the hierarchical keywords that hold what OIFITS has no place for."""
-
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    AttributeError,
-    ArithmeticError,
-    AssertionError,
-    MemoryError,
-    EOFError,
-    struct.error,
-    zlib.error,
-    fits.VerifyError,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +129,8 @@ def open_oifits(path: str | Path) -> OIFits:
         Where the file is missing, empty, cut short, no FITS file or holds no OIFITS table.
     """
     raw = _fits_bytes(Path(path))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            content = _content(str(path), raw)
-    except DataError:
-        raise
-    except _UNREADABLE as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DataError(
-            f"is a damaged FITS file: {reason}", source=path, remedy="copy or download it again"
-        ) from error
+    with reporting_damage(path):
+        content = _content(str(path), raw)
     if not any(table.name.startswith("OI_") for table in content.tables):
         raise DataError(
             "holds no OIFITS table", source=path, remedy="give an OIFITS file, not an image"

@@ -1,0 +1,53 @@
+"""Damaged FITS files: every complaint of the library becomes one line about the file."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from astropy.io import fits
+
+from amibayes.errors import AmibayesError, DataError
+
+UNREADABLE = (
+    OSError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    MemoryError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    fits.VerifyError,
+)
+"""What astropy raises, sooner or later, where headers or data are not what they should be."""
+
+
+@contextmanager
+def reporting_damage(source: str | Path) -> Iterator[None]:
+    """Turn what a library raises over a damaged file into a `DataError`, and hush its warnings.
+
+    Raises
+    ------
+    DataError
+        Naming the file and what the library found.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except AmibayesError:
+        raise
+    except UNREADABLE as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DataError(
+            f"is a damaged FITS file: {reason}", source=source, remedy="copy or download it again"
+        ) from error
