@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from amibayes.cube import Cube, open_cube, read_cube, write_cube
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.extraction import extract
+    from amibayes.inference.analytic_limits import AnalyticLimit, analytic_limit
     from amibayes.inference.bank import TemplateBank
     from amibayes.inference.evidence import Evidence, weigh_models
     from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
@@ -25,11 +26,13 @@ if TYPE_CHECKING:
     from amibayes.inference.multiplicity import TwoCompanions, search_second
     from amibayes.inference.posterior import Posterior, sample
     from amibayes.inference.priors import Prior
+    from amibayes.inference.recovery import Recovery, recover
     from amibayes.inference.results import Companion, SearchResult
     from amibayes.inference.search import search
     from amibayes.inference.significance import Significance, significance
     from amibayes.instrument import Instrument, instrument_names, load_instrument
     from amibayes.job import SearchOptions, SearchReport
+    from amibayes.limits_job import LimitsOptions, LimitsReport, measure_limits
     from amibayes.observables import Observables, join
     from amibayes.oifits import (
         OIFits,
@@ -51,6 +54,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
+    "AnalyticLimit": "amibayes.inference.analytic_limits",
     "BinaryModel": "amibayes.inference.model",
     "Calibration": "amibayes.calibration",
     "Companion": "amibayes.inference.results",
@@ -64,6 +68,8 @@ _HOME = {
     "GridPosterior": "amibayes.inference.grid_posterior",
     "Instrument": "amibayes.instrument",
     "Likelihood": "amibayes.inference.likelihood",
+    "LimitsOptions": "amibayes.limits_job",
+    "LimitsReport": "amibayes.limits_job",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
     "Observables": "amibayes.observables",
@@ -72,6 +78,7 @@ _HOME = {
     "Posterior": "amibayes.inference.posterior",
     "Prior": "amibayes.inference.priors",
     "PupilMap": "amibayes.optics",
+    "Recovery": "amibayes.inference.recovery",
     "RunError": "amibayes.errors",
     "Scene": "amibayes.scene",
     "SearchOptions": "amibayes.job",
@@ -82,6 +89,7 @@ _HOME = {
     "TwoCompanions": "amibayes.inference.multiplicity",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
+    "analytic_limit": "amibayes.inference.analytic_limits",
     "calibrate": "amibayes.calibration",
     "detection_limit": "amibayes.inference.limits",
     "expect": "amibayes.planning",
@@ -93,6 +101,7 @@ _HOME = {
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
     "make_plan": "amibayes.planning",
+    "measure_limits": "amibayes.limits_job",
     "observables_of": "amibayes.oifits",
     "open_cube": "amibayes.cube",
     "open_executor": "amibayes.parallel",
@@ -101,11 +110,12 @@ _HOME = {
     "psf": "amibayes.optics",
     "read_cube": "amibayes.cube",
     "read_oifits": "amibayes.oifits",
+    "recover": "amibayes.inference.recovery",
     "sample": "amibayes.inference.posterior",
     "scene_image": "amibayes.optics",
     "search": "amibayes.inference.search",
-    "search_second": "amibayes.inference.multiplicity",
     "search_companion": "amibayes.pipeline",
+    "search_second": "amibayes.inference.multiplicity",
     "significance": "amibayes.inference.significance",
     "simulate": "amibayes.simulation",
     "weigh_models": "amibayes.inference.evidence",
@@ -115,6 +125,7 @@ _HOME = {
 
 __all__ = [
     "AmibayesError",
+    "AnalyticLimit",
     "BinaryModel",
     "Calibration",
     "Companion",
@@ -128,6 +139,8 @@ __all__ = [
     "GridPosterior",
     "Instrument",
     "Likelihood",
+    "LimitsOptions",
+    "LimitsReport",
     "OIFits",
     "OITable",
     "Observables",
@@ -136,6 +149,7 @@ __all__ = [
     "Posterior",
     "Prior",
     "PupilMap",
+    "Recovery",
     "RunError",
     "Scene",
     "SearchOptions",
@@ -147,6 +161,7 @@ __all__ = [
     "UsageError",
     "Wavefront",
     "__version__",
+    "analytic_limit",
     "calibrate",
     "detection_limit",
     "expect",
@@ -158,6 +173,7 @@ __all__ = [
     "load_instrument",
     "load_scene",
     "make_plan",
+    "measure_limits",
     "observables_of",
     "open_cube",
     "open_executor",
@@ -166,6 +182,7 @@ __all__ = [
     "psf",
     "read_cube",
     "read_oifits",
+    "recover",
     "sample",
     "scene_image",
     "search",

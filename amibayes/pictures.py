@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.search import resolution_mas
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchOptions, SearchReport, calibrator_verdicts
+from amibayes.limits_job import NAMES, LimitsReport
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
@@ -123,36 +126,72 @@ def _chains(report: SearchReport) -> Figure:
 def _limits(report: SearchReport) -> Figure:
     limits = report.limits
     assert limits is not None
+    middle = contrast_to_delta_mag(limits.contrast_50)
     curves = {
-        f"{limits.completeness:.0%} recovered": Curve(limits.delta_mag),
-        "50% recovered": Curve(contrast_to_delta_mag(limits.contrast_50)),
+        f"{limits.completeness:.0%} recovered": Curve(
+            limits.delta_mag, by_detection=limits.by_detection
+        ),
+        "50% recovered": Curve(middle, by_detection=limits.by_detection),
     }
     weight = report.significance
     found = report.result.companion if weight is not None and weight.detected else None
-    return limits_plot(limits.separation_mas, curves, found)
+    fringe = resolution_mas(report.result.likelihood)
+    return limits_plot(limits.separation_mas, curves, found, fringe_mas=fringe)
 
 
 def _completeness(report: SearchReport) -> Figure:
-    limits = report.limits
-    assert limits is not None
-    magnitude = np.linspace(
-        float(contrast_to_delta_mag(limits.level.max())),
-        float(contrast_to_delta_mag(limits.level.min())),
-        40,
-    )
-    share = limits.recovered / limits.trials
+    assert report.limits is not None
+    return completeness_picture(report.limits)
+
+
+def completeness_picture(limits: DetectionLimit) -> Figure:
+    """Draw the completeness map of a limit by injection."""
+    magnitude = contrast_to_delta_mag(limits.level)
+    low, high = float(magnitude.min()), float(magnitude.max())
+    regular = np.linspace(low, high, 60)
     fraction = np.array(
         [
-            np.interp(magnitude, mag, s, left=np.nan, right=np.nan)
-            for mag, s in zip(
-                contrast_to_delta_mag(limits.level)[:, ::-1], share[:, ::-1], strict=True
-            )
+            np.interp(regular, mag, s, left=np.nan, right=np.nan)
+            for mag, s in zip(magnitude[:, ::-1], limits.share[:, ::-1], strict=True)
         ]
     )
     return completeness_map(
         limits.separation_mas,
-        magnitude,
+        regular,
         fraction,
         c50=contrast_to_delta_mag(limits.contrast_50),
         c95=limits.delta_mag,
+    )
+
+
+def limits_picture_names(method: str) -> list[str]:
+    """List the files that `save_limits_pictures` will write."""
+    return ["limits.png", "completeness.png"] if method == "injection" else ["limits.png"]
+
+
+def save_limits_pictures(report: LimitsReport, folder: Path) -> None:
+    """Draw the curves of all limits, and the completeness map of the main one."""
+    save(limits_picture(report), folder / "limits.png")
+    if isinstance(report.main.limit, DetectionLimit):
+        save(completeness_picture(report.main.limit), folder / "completeness.png")
+
+
+def limits_picture(report: LimitsReport) -> Figure:
+    """Draw all limits in one picture, with their spread over the position angle."""
+    curves = {}
+    for measured in report.limits:
+        limit = measured.limit
+        low, _, high = contrast_to_delta_mag(limit.spread).T
+        marked = limit.by_detection if isinstance(limit, DetectionLimit) else None
+        curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
+            limit.delta_mag, low, high, marked
+        )
+    weight, main = report.main.significance, report.main.result
+    found = main.companion if weight is not None and weight.detected else None
+    return limits_plot(
+        report.main.limit.separation_mas,
+        curves,
+        found,
+        fringe_mas=resolution_mas(main.likelihood),
+        masses=report.options.masses,
     )

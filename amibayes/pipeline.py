@@ -31,7 +31,7 @@ from amibayes.inference.significance import (
 )
 from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
-from amibayes.parallel import Executor, Progress
+from amibayes.parallel import Executor, Journal, Progress
 from amibayes.preparing import Clock, Stage, prepare
 
 MOST_FIELDS = 3
@@ -232,6 +232,7 @@ def weigh(
     rng: np.random.Generator,
     executor: Executor | None,
     progress: Progress | None,
+    journal: Journal | None = None,
 ) -> Significance:
     """Weigh the search; unless errors are to be trusted, by a statistic free of their scale.
 
@@ -250,6 +251,7 @@ def weigh(
         free_scale=free_scale,
         executor=executor,
         progress=progress,
+        journal=journal,
     )
     field = statistic_field(bank, residuals[:, 0], free_scale=free_scale)
     return replace(weight, field=field)

@@ -47,8 +47,11 @@ def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
-def add_image_options(parser: argparse.ArgumentParser) -> None:
-    """Add what image cubes may need: what their header does not say, and the method."""
+def add_image_options(parser: argparse.ArgumentParser, method: str = "--method") -> None:
+    """Add what image cubes may need: what their header does not say, and the method.
+
+    ``method`` is the option's name, where ``--method`` is that of the command itself.
+    """
     group = parser.add_argument_group("image cubes")
     group.add_argument("--instrument", metavar="NAME", help="name or TOML file, such as niriss")
     group.add_argument("--filter", metavar="NAME", help="such as F480M")
@@ -60,7 +63,8 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
         help="of the image's +y, east of north",
     )
     group.add_argument(
-        "--method",
+        method,
+        dest="extraction",
         choices=METHODS,
         default=METHODS[0],
         help="fit of the images (fringes), or a way to sample their Fourier transform "
@@ -80,7 +84,7 @@ def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
         "pixel_scale_rad": arguments.pixel_scale * MAS if arguments.pixel_scale else None,
         "position_angle_deg": arguments.position_angle,
     }
-    return ImageOptions(ExtractOptions(method=arguments.method), header)
+    return ImageOptions(ExtractOptions(method=arguments.extraction), header)
 
 
 def finite_float(text: str) -> float:
@@ -268,10 +272,10 @@ def numbers(text: str) -> list[float]:
 
 def observable_kinds(text: str) -> tuple[str, ...]:
     """Parse ``vis2,cp``: one or both, once each."""
-    kinds = tuple(text.split(","))
+    kinds = text.split(",")
     if not set(kinds) <= {"vis2", "cp"} or len(set(kinds)) != len(kinds):
         raise argparse.ArgumentTypeError(f"{text!r} is not vis2, cp or vis2,cp")
-    return kinds
+    return tuple(sorted(kinds, reverse=True))
 
 
 def companion_counts(text: str) -> tuple[int, ...]:
@@ -316,6 +320,8 @@ class Progress:
     def update(self, done: int, expected: int) -> None:
         """Say how much of the stage is done."""
         if self._bar is not None:
+            if self._bar.n == 0:  # what an earlier run left counts for nothing in the rate
+                self._bar.initial = done
             self._bar.total = max(expected, done)
             self._bar.n = done
             self._bar.refresh()

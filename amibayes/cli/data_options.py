@@ -59,3 +59,58 @@ def add_null_draws(group: argparse._ActionsContainer, default: int, least: int =
         help="null searches for the false-alarm probability"
         f"{'; 0: none' if least == 0 else ''} (default: %(default)s)",
     )
+
+
+def add_model(group: argparse._ActionsContainer) -> None:
+    """Add field, primary and channel: what is fitted."""
+    add_separation(group)
+    group.add_argument(
+        "--diameter",
+        type=common.number_or_free,
+        metavar="MAS|free",
+        help="uniform-disc diameter of the primary (default: 0; free where V2 is used and the "
+        "longest baseline would notice a disc of 0.3 mas)",
+    )
+    group.add_argument(
+        "--background",
+        type=common.number_or_free,
+        default=0.0,
+        metavar="FLUX|free",
+        help="over-resolved flux, primary = 1 (default: 0)",
+    )
+    group.add_argument(
+        "--smearing",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="average the model over the width of each channel (default: yes)",
+    )
+
+
+def add_observables(
+    group: argparse._ActionsContainer, default: tuple[str, ...] | None, explained: str
+) -> None:
+    """Add ``--observables``."""
+    group.add_argument(
+        "--observables",
+        type=common.observable_kinds,
+        default=default,
+        metavar="vis2,cp",
+        help=explained,
+    )
+
+
+def add_data(group: argparse._ActionsContainer) -> None:
+    """Add how data are read, calibrated and believed."""
+    add_closure_covariance(group)
+    add_calibration(group)
+    group.add_argument(
+        "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
+    )
+    group.add_argument(
+        "--extra-noise",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="add noise where the stated errors do not explain the residuals (default: yes)",
+    )
+    add_insname(group)
+    group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")

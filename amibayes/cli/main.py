@@ -15,6 +15,7 @@ from amibayes.errors import AmibayesError
 
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
+    "limits": "say what companions a target's data would have shown",
     "calibrate": "divide the instrument out of a target's data with calibrators",
     "vet": "say which calibrators may be believed, and why",
     "extract": "measure V² and closure phases in image cubes",

@@ -33,9 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
-    _add_model(parser.add_argument_group("model"))
+    data_options.add_model(parser.add_argument_group("model"))
     _add_weighing(parser.add_argument_group("prior and evidence"))
-    _add_data(parser.add_argument_group("data"))
+    data = parser.add_argument_group("data")
+    data_options.add_observables(data, ("vis2", "cp"), "which observables to fit (default: both)")
+    data_options.add_data(data)
     common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
     data_options.add_null_draws(stages, 10_000)
@@ -49,30 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_seed_option(stages)
     common.add_parallel_options(parser)
     common.add_output_options(parser, "search")
-
-
-def _add_model(group: argparse._ArgumentGroup) -> None:
-    data_options.add_separation(group)
-    group.add_argument(
-        "--diameter",
-        type=common.number_or_free,
-        metavar="MAS|free",
-        help="uniform-disc diameter of the primary (default: 0; free where V2 is used and the "
-        "longest baseline would notice a disc of 0.3 mas)",
-    )
-    group.add_argument(
-        "--background",
-        type=common.number_or_free,
-        default=0.0,
-        metavar="FLUX|free",
-        help="over-resolved flux, primary = 1 (default: 0)",
-    )
-    group.add_argument(
-        "--smearing",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="average the model over the width of each channel (default: yes)",
-    )
 
 
 def _add_weighing(group: argparse._ArgumentGroup) -> None:
@@ -101,29 +79,6 @@ def _add_weighing(group: argparse._ArgumentGroup) -> None:
         help="integrate directly, or by Laplace's approximation, or by nested sampling with "
         "dynesty (default: %(default)s)",
     )
-
-
-def _add_data(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--observables",
-        type=common.observable_kinds,
-        default=("vis2", "cp"),
-        metavar="vis2,cp",
-        help="which observables to fit (default: both)",
-    )
-    data_options.add_closure_covariance(group)
-    data_options.add_calibration(group)
-    group.add_argument(
-        "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
-    )
-    group.add_argument(
-        "--extra-noise",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="add noise where the stated errors do not explain the residuals (default: yes)",
-    )
-    data_options.add_insname(group)
-    group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -193,6 +193,16 @@ class TemplateBank:
 
         return best
 
+    def scan_at(
+        self, residuals: FloatArray, east_mas: FloatArray, north_mas: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """As `scan`, at any positions (m,), on the lattice or off it."""
+        data = self.project(residuals)
+        even, odd = self._parts_at(east_mas, north_mas)
+        match = data[self._even.rows] @ even + data[self._odd.rows] @ odd
+        norm = self._norm(even, odd)[: len(east_mas)]
+        return match / norm, 1.0 / np.sqrt(norm)
+
     def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
         """Templates of unit norm (n_data, m) at any positions, on the lattice or off it."""
         even, odd = self._parts_at(east_mas, north_mas)

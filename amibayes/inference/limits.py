@@ -1,42 +1,50 @@
 """Detection limits by injection and recovery, by the criterion of the search itself.
 
-A companion is put into the fitted model without one, noise is drawn anew from the data's
-covariance, and the search's statistic is formed: it is recovered where the false-alarm
-probability is below α and the position is right. In whitened data a trial costs no more
-than a null search, a column of a matrix product.
+Companions are injected at rings of separations and levels of contrast, in rounds whose size
+is fixed beforehand: the first spreads evenly, the next go where the share of recovered ones
+is least certain. The limit of a ring is the contrast that a logistic fit gives to the wanted
+share.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.refine import single_likelihood
+from amibayes.inference.logistic import fit_logistic
+from amibayes.inference.recovery import (
+    Recovery,
+    ambiguous,
+    injected_signal,
+    nearer_aliases,
+    recover,
+)
 from amibayes.inference.results import SearchResult
+from amibayes.inference.rings import Rings, make_rings
+from amibayes.inference.rounds import IntArray, Setting, Trials, inject, spawned
 from amibayes.inference.search import resolution_mas
-from amibayes.inference.significance import Significance, profiled
+from amibayes.inference.significance import Significance, clopper_pearson, null_maxima
 from amibayes.observables import BoolArray
-from amibayes.parallel import Executor, Progress, SerialExecutor, run_job, slices, spawn
-from amibayes.units import FloatArray, contrast_to_delta_mag, offset
+from amibayes.parallel import Executor, Journals, Progress
+from amibayes.units import FloatArray, contrast_to_delta_mag
+
+__all__ = ["DetectionLimit", "Recovery", "detection_limit", "injected_signal", "recover"]
 
 N_SEPARATIONS = 16
-N_LEVELS = 12
+N_LEVELS = 14
 TRIALS_PER_CELL = 40
 
-LEVELS = (0.45, 3.0)
+LEVELS = (0.4, 4.0)
 """Injected contrasts, in units of the one that linear theory detects half of the time."""
-
-TRIALS_AT_ONCE = 2048
 
 COMPLETENESS = 0.95
 
-ALIAS = 0.875
-"""Correlation of two templates above which the inner of their positions is reported."""
+SPREAD = (0.16, 0.5, 0.84)
+"""Quantiles over the position angle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +56,32 @@ class DetectionLimit:
     method : str
     separation_mas : (n,) float array
     contrast : (n,) float array
-        Recovered with probability ``completeness``; NaN where no injected one is.
+        Recovered with probability ``completeness``, averaged over the position angle; NaN
+        where no injected one is.
     contrast_50 : (n,) float array
         Recovered half of the time.
-    log_error : (n,) float array
-        1σ error of ln contrast.
-    false_positive_rate, completeness : float
+    log_error, log_error_50 : (n,) float array
+        1σ errors of ln contrast.
+    spread : (n, 3) float array
+        Contrast recovered with probability ``completeness`` at one position angle: the 16, 50
+        and 84 % points over all of them.
+    by_detection : (n,) bool array
+        Where the data cannot tell a position from one nearer to the star in more than
+        1 − ``completeness`` of the directions, no contrast can be found at its place that
+        often: there a companion counts as recovered wherever it is seen.
+    ambiguous : (n,) float array
+        Share of the directions in which that is so.
+    threshold : float
+        Statistic of a detection.
+    false_positive_rate : float
+        α, at which the threshold was set.
+    false_positives : (int, int)
+        Searches of noise alone, other than those that set the threshold, that exceed it; and
+        how many there were.
+    completeness : float
     level : (n, n_levels) float array
         Injected contrasts.
-    trials, recovered : (n, n_levels) int array
+    trials, detected, located : (n, n_levels) int array
     """
 
     method: str
@@ -64,16 +89,38 @@ class DetectionLimit:
     contrast: FloatArray
     contrast_50: FloatArray
     log_error: FloatArray
+    log_error_50: FloatArray
+    spread: FloatArray
+    by_detection: BoolArray
+    ambiguous: FloatArray
+    threshold: float
     false_positive_rate: float
+    false_positives: tuple[int, int]
     completeness: float
     level: FloatArray
-    trials: FloatArray
-    recovered: FloatArray
+    trials: IntArray
+    detected: IntArray
+    located: IntArray
 
     @property
     def delta_mag(self) -> FloatArray:
         """The limit in magnitudes, (n,)."""
         return contrast_to_delta_mag(self.contrast)
+
+    @property
+    def recovered(self) -> IntArray:
+        """Recovered companions, (n, n_levels): located ones, or detected ones."""
+        return np.where(self.by_detection[:, None], self.detected, self.located)
+
+    @property
+    def share(self) -> FloatArray:
+        """Share of recovered companions, (n, n_levels); NaN where none was injected."""
+        return np.where(self.trials > 0, self.recovered / np.maximum(self.trials, 1), np.nan)
+
+    @property
+    def false_positive_interval(self) -> tuple[float, float]:
+        """95 % Clopper–Pearson interval of the measured false-positive rate."""
+        return clopper_pearson(*self.false_positives)
 
     def jeffreys(self, level: float = 0.68) -> tuple[FloatArray, FloatArray]:
         """Jeffreys interval of the completeness of every cell, (n, n_levels) each."""
@@ -88,9 +135,11 @@ def detection_limit(
     rng: np.random.Generator,
     *,
     n_separations: int = N_SEPARATIONS,
+    separation_mas: Sequence[float] | None = None,
     trials_per_cell: int = TRIALS_PER_CELL,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    journals: Journals | None = None,
 ) -> DetectionLimit:
     """Measure the detection limit of a search by injection and recovery.
 
@@ -101,178 +150,147 @@ def detection_limit(
     significance : Significance
         Its null draws set the threshold, at its α.
     rng : numpy.random.Generator
-    n_separations, trials_per_cell : int
-    executor, progress
-        As in `recover`.
+    n_separations : int
+        Rings from the inner to the outer edge of the field.
+    separation_mas : sequence of float, optional
+        These rings instead.
+    trials_per_cell : int
+        On average; there are `N_LEVELS` contrasts per ring.
+    executor : Executor, optional
+        Where it is computed; the result does not depend on it.
+    progress : callable, optional
+        Told (trials done, trials in all).
+    journals : Journals, optional
+        Keep finished pieces.
 
     Returns
     -------
     DetectionLimit
     """
-    likelihood = result.likelihood
-    bank = TemplateBank(likelihood, result.grid, result.single_theta)
-    threshold = significance.threshold()
-    rho = np.linspace(result.grid.inner_mas, result.grid.outer_mas, n_separations + 2)[1:-1]
-    half = _linear_half(result, rho, _gain_at(significance, bank))
-    level = half[:, None] * np.geomspace(*LEVELS, N_LEVELS)
-    shape = (n_separations, N_LEVELS, trials_per_cell)
-    angle = rng.uniform(0.0, 360.0, shape)
-    east, north = offset(np.broadcast_to(rho[:, None, None], shape), angle)
-    contrast = np.minimum(np.broadcast_to(level[:, :, None], shape), 1.0)
-    theta = np.stack([east, north, contrast], axis=-1).reshape(-1, 3)
-    found = recover(
-        likelihood,
+    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    rings = make_rings(result, n_separations, separation_mas)
+    gain = _gain_at(significance, bank)
+    sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
+    half = np.sqrt(gain) * np.median(sigma, axis=1)
+    level = np.minimum(half[:, None] * np.geomspace(*LEVELS, N_LEVELS), 1.0)
+    nearer = _nearer(bank, rings, result, executor, journals)
+    seen_at = np.full(nearer.shape, (np.sqrt(gain) + stats.norm.ppf(COMPLETENESS)) ** 2)
+    lost = ambiguous(nearer, seen_at).mean(axis=1)
+    setting = Setting(
+        result,
         bank,
-        result.single_theta,
-        theta,
-        threshold,
-        rng,
-        free_scale=significance.free_scale,
-        executor=executor,
-        progress=progress,
-    ).reshape(shape)
-    recovered = found.sum(axis=2)
-    trials = np.full(recovered.shape, trials_per_cell)
-    fits = [_logistic(np.log(c), r, n) for c, r, n in zip(level, recovered, trials, strict=True)]
-    middle, slope, error = np.array(fits).T
-    log_limit = middle + special.logit(COMPLETENESS) / slope
-    return DetectionLimit(
-        "injection",
-        rho,
-        _inside(log_limit, level),
-        _inside(middle, level),
-        error,
-        significance.alpha,
-        COMPLETENESS,
+        rings,
+        nearer,
         level,
-        trials,
-        recovered,
+        lost > 1.0 - COMPLETENESS,
+        significance.threshold(),
+        significance.free_scale,
+        executor,
+        journals,
+    )
+    trials = inject(setting, trials_per_cell, rng, progress)
+    false = _false_positives(setting, significance, rng)
+    return _summarised(setting, trials, sigma, lost, significance.alpha, false)
+
+
+def _nearer(
+    bank: TemplateBank,
+    rings: Rings,
+    result: SearchResult,
+    executor: Executor | None,
+    journals: Journals | None,
+) -> FloatArray:
+    """Correlation with the best alias nearer to the star, (n, n_angles)."""
+    journal = journals.of("aliases") if journals else None
+    fringe = resolution_mas(result.likelihood)
+    places = rings.places.reshape(*rings.east_mas.shape, 2)
+    return nearer_aliases(bank, places, fringe, executor=executor, journal=journal)
+
+
+def _false_positives(
+    setting: Setting, significance: Significance, rng: np.random.Generator
+) -> tuple[int, int]:
+    """Count false alarms among as many fresh searches of noise as set the threshold."""
+    journal = setting.journals.of("false-positives") if setting.journals else None
+    null = null_maxima(
+        setting.bank,
+        significance.n_draws,
+        spawned(rng),
+        free_scale=setting.free_scale,
+        executor=setting.executor,
+        journal=journal,
+    )
+    return int((null > setting.threshold).sum()), len(null)
+
+
+def _summarised(
+    setting: Setting,
+    trials: Trials,
+    sigma: FloatArray,
+    lost: FloatArray,
+    alpha: float,
+    false: tuple[int, int],
+) -> DetectionLimit:
+    """Fit every ring and gather what was found."""
+    shape, level = setting.level.shape, setting.level
+    n = trials.counts(np.ones(len(trials.ring), dtype=bool), shape)
+    detected, located = (trials.counts(w, shape) for w in (trials.detected, trials.located))
+    recovered = np.where(setting.by_detection[:, None], detected, located)
+    limit, middle = (
+        np.array([_crossing(*ring, p) for ring in zip(level, recovered, n, strict=True)])
+        for p in (COMPLETENESS, 0.5)
+    )
+    return DetectionLimit(
+        method="injection",
+        separation_mas=setting.rings.separation_mas,
+        contrast=limit[:, 0],
+        contrast_50=middle[:, 0],
+        log_error=limit[:, 1],
+        log_error_50=middle[:, 1],
+        spread=_spread(setting, trials, sigma),
+        by_detection=setting.by_detection,
+        ambiguous=lost,
+        threshold=setting.threshold,
+        false_positive_rate=alpha,
+        false_positives=false,
+        completeness=COMPLETENESS,
+        level=level,
+        trials=n,
+        detected=detected,
+        located=located,
     )
 
 
-def recover(
-    likelihood: Likelihood,
-    bank: TemplateBank,
-    single: FloatArray,
-    theta: FloatArray,
-    threshold: float,
-    rng: np.random.Generator,
-    *,
-    free_scale: bool = False,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-) -> BoolArray:
-    """Inject companions and say which of them the search recovers.
+def _crossing(
+    level: FloatArray, recovered: IntArray, trials: IntArray, probability: float
+) -> tuple[float, float]:
+    """Contrast of a given completeness, and the error of its logarithm; NaN outside the levels."""
+    fit = fit_logistic(np.log(level), recovered.astype(float), trials.astype(float))
+    x, error = fit.crossing(probability)
+    if not np.log(level[0]) <= x <= np.log(level[-1]) or not recovered.any():
+        return np.nan, np.nan
+    return float(np.exp(x)), error
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-    bank : TemplateBank
-    single : (n_nuisance,) float array
-        The fit without a companion.
-    theta : (n, 3) float array
-        east_mas, north_mas, contrast of each trial.
-    threshold : float
-        Statistic that counts as a detection.
-    rng : numpy.random.Generator
-    free_scale : bool
-        The statistic is `profiled`, else the gain in χ².
-    executor : Executor, optional
-        Where it is computed; the result does not depend on it.
-    progress : callable, optional
-        Told (pieces done, pieces in all).
 
-    Returns
-    -------
-    (n,) bool array
+def _spread(setting: Setting, trials: Trials, sigma: FloatArray) -> FloatArray:
+    """Quantiles over the position angle of the limit at one position angle, (n, 3).
+
+    At one position recovery depends on the contrast in units of its error there, c/σ(angle):
+    a fit in that variable gives every direction its own limit.
     """
-    parts = slices(len(theta), TRIALS_AT_ONCE)
-    pieces = [(theta[p], seed) for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)]
-    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale)
-    return np.concatenate(
-        list(run_job(work, pieces, executor or SerialExecutor(), progress=progress))
-    )
-
-
-def _recover_piece(
-    likelihood: Likelihood,
-    bank: TemplateBank,
-    single: FloatArray,
-    threshold: float,
-    free_scale: bool,
-    piece: tuple[FloatArray, np.random.SeedSequence],
-) -> BoolArray:
-    theta, seed = piece
-    signal = injected_signal(likelihood, single, theta)
-    noise = np.random.default_rng(seed).standard_normal(signal.shape)
-    data = bank.project(signal + noise)
-    gain, position = bank.largest_gain(data.astype(np.float32))
-    if free_scale:
-        gain = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
-    east, north = bank.grid.east_mas[position], bank.grid.north_mas[position]
-    away = np.hypot(east - theta[:, 0], north - theta[:, 1])
-    near = away < 0.5 * resolution_mas(likelihood)
-    # An alias farther out than the companion is reported at the companion's own place.
-    outer = np.hypot(east, north) > np.hypot(theta[:, 0], theta[:, 1])
-    doubtful = np.flatnonzero((gain > threshold) & ~near & outer)
-    if len(doubtful):
-        there = bank.templates_at(east[doubtful], north[doubtful])
-        here = bank.templates_at(theta[doubtful, 0], theta[doubtful, 1])
-        near[doubtful] = (there * here).sum(axis=0) > ALIAS
-    return np.asarray(near & (gain > threshold))
-
-
-def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
-    """Whitened change of the data by companions (n, 3) on top of the fit without one."""
-    full = np.hstack([theta, np.broadcast_to(single, (len(theta), len(single)))])
-    alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
-    change = likelihood.predict(full) - alone
-    closure = change[likelihood.samples.squares.shape[0] :]
-    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-    return likelihood.observables.covariance.whiten(change)
+    out = np.full((len(sigma), len(SPREAD)), np.nan)
+    found = np.where(setting.by_detection[trials.ring], trials.detected, trials.located)
+    for k in range(len(sigma)):
+        at = np.flatnonzero(trials.ring == k)
+        strength = setting.level[k, trials.level[at]] / sigma[k, trials.angle[at]]
+        fit = fit_logistic(np.log(strength), found[at].astype(float), np.ones(len(at)))
+        x, _ = fit.crossing(COMPLETENESS)
+        if np.log(strength.min()) <= x <= np.log(strength.max()) and found[at].any():
+            out[k] = np.quantile(sigma[k], SPREAD) * np.exp(x)
+    return np.where(out <= 1.0, out, np.nan)
 
 
 def _gain_at(significance: Significance, bank: TemplateBank) -> float:
     """Gain in χ² that reaches the threshold, if the rest of χ² is its expectation."""
     threshold, n = significance.threshold(), bank.n_data - bank.n_nuisance
     return float(n * np.expm1(threshold / n)) if significance.free_scale else threshold
-
-
-def _linear_half(result: SearchResult, rho: FloatArray, threshold: float) -> FloatArray:
-    """Contrast whose expected statistic equals the threshold, median over the azimuth."""
-    distance = np.hypot(result.grid.east_mas, result.grid.north_mas)
-    width = max(0.5 * (rho[1] - rho[0]) if len(rho) > 1 else np.inf, result.grid.step_mas)
-    sigma = [np.median(result.bank_sigma[np.abs(distance - r) <= width]) for r in rho]
-    return np.asarray(np.sqrt(threshold) * np.array(sigma))
-
-
-def _inside(log_contrast: FloatArray, level: FloatArray) -> FloatArray:
-    """Contrasts that the injections bracket; NaN for what would be extrapolated."""
-    bracketed = log_contrast <= np.log(np.minimum(level[:, -1], 1.0))
-    bracketed &= log_contrast >= np.log(level[:, 0])
-    return np.exp(np.where(bracketed, log_contrast, np.nan))
-
-
-def _logistic(
-    log_contrast: FloatArray, recovered: FloatArray, trials: FloatArray
-) -> tuple[float, ...]:
-    """Fit P = 1/(1 + exp(−k(ln c − m))): m, k and the error of m.
-
-    A weak prior on ln k (width 1 about k = 6) keeps all-or-nothing data finite.
-    """
-
-    def loss(x: FloatArray) -> float:
-        slope = np.exp(x[1])
-        z = slope * (log_contrast - x[0])
-        log_p, log_q = -np.logaddexp(0.0, -z), -np.logaddexp(0.0, z)
-        prior = 0.5 * (x[1] - np.log(6.0)) ** 2
-        return float(prior - (recovered * log_p + (trials - recovered) * log_q).sum())
-
-    if not recovered.any():
-        return np.inf, 1.0, np.inf
-    start = np.array([np.interp(0.5, np.sort(recovered / trials), log_contrast), np.log(6.0)])
-    best = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-4}).x
-    slope = float(np.exp(best[1]))
-    p = special.expit(slope * (log_contrast - best[0]))
-    information = (trials * p * (1.0 - p)).sum() * slope**2
-    return float(best[0]), slope, float(1.0 / np.sqrt(max(information, 1e-12)))

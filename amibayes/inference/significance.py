@@ -17,7 +17,7 @@ from scipy import stats
 from scipy.special import gamma, gammaln
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.parallel import Executor, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
 
 ALPHA = 0.0013
@@ -200,6 +200,7 @@ def null_maxima(
     free_scale: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    journal: Journal | None = None,
 ) -> FloatArray:
     """Statistic of ``n_draws`` null data sets, (n_draws,): the largest gain over the bank.
 
@@ -214,6 +215,8 @@ def null_maxima(
         Where it is computed; the result does not depend on it.
     progress : callable, optional
         Told (pieces done, pieces in all).
+    journal : Journal, optional
+        Keeps finished pieces.
 
     Notes
     -----
@@ -223,17 +226,17 @@ def null_maxima(
     sizes = [len(range(n_draws)[part]) for part in slices(n_draws, DRAWS_AT_ONCE)]
     pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
     work = partial(_null_piece, bank, free_scale)
-    return np.concatenate(
-        list(run_job(work, pieces, executor or SerialExecutor(), progress=progress))
-    )
+    executor = executor or SerialExecutor()
+    done = run_job(work, pieces, executor, journal=journal, progress=progress)
+    return np.concatenate([piece["statistic"] for piece in done])
 
 
 def _null_piece(
     bank: TemplateBank, free_scale: bool, piece: tuple[np.random.SeedSequence, int]
-) -> FloatArray:
+) -> dict[str, FloatArray]:
     seed, size = piece
     noise = np.random.default_rng(seed).standard_normal((bank.n_data, size), dtype=np.float32)
-    return bank_statistic(bank, noise.astype(float), free_scale=free_scale)
+    return {"statistic": bank_statistic(bank, noise.astype(float), free_scale=free_scale)}
 
 
 def significance(
@@ -246,6 +249,7 @@ def significance(
     free_scale: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
+    journal: Journal | None = None,
 ) -> Significance:
     """Simulate the null distribution of a search and place the observed statistic in it.
 
@@ -261,11 +265,19 @@ def significance(
     alpha : float
     free_scale : bool
         The size of the noise was fitted: see `profiled`; the statistic has to be so too.
-    executor, progress
+    executor, progress, journal
         As in `null_maxima`.
     """
     null = np.sort(
-        null_maxima(bank, n_draws, rng, free_scale=free_scale, executor=executor, progress=progress)
+        null_maxima(
+            bank,
+            n_draws,
+            rng,
+            free_scale=free_scale,
+            executor=executor,
+            progress=progress,
+            journal=journal,
+        )
     )
     above = int((null >= statistic).sum())
     extrapolate = above < FEWEST_ABOVE <= n_draws * TAIL_FRACTION

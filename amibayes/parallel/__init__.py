@@ -15,7 +15,7 @@ from amibayes.parallel.job import (
     slices,
     spawn,
 )
-from amibayes.parallel.journal import Journal, digest
+from amibayes.parallel.journal import Journal, Journals, digest
 from amibayes.parallel.processes import ProcessExecutor
 from amibayes.parallel.progress import Progress, progress_bar
 
@@ -23,6 +23,7 @@ __all__ = [
     "DaskExecutor",
     "Executor",
     "Journal",
+    "Journals",
     "MPIExecutor",
     "ProcessExecutor",
     "Progress",

@@ -75,6 +75,34 @@ class Journal:
         return self.path / f"piece-{index:06d}.npz"
 
 
+class Journals:
+    """Journals of the several jobs of one run, each under a name of its own.
+
+    Parameters
+    ----------
+    folder, key, resume
+        As for `Journal`.
+    """
+
+    def __init__(self, folder: str | Path, key: str, *, resume: bool) -> None:
+        self.path = Path(folder) / key
+        self._resume = resume
+        if not resume:
+            self.remove()
+
+    def of(self, job: str) -> Journal:
+        """Open the journal of a job."""
+        return Journal(self.path, job, resume=self._resume)
+
+    def under(self, part: str) -> Journals:
+        """Open the journals of a part of the run."""
+        return Journals(self.path, part, resume=self._resume)
+
+    def remove(self) -> None:
+        """Forget all jobs of this run."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
 def digest(*inputs: Any) -> str:
     """Hexadecimal digest of everything that a job's answer depends on.
 

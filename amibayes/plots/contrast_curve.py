@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import ArrayLike
 
 from amibayes.inference.results import Companion
+from amibayes.mass_table import MassTable
+from amibayes.observables import BoolArray
 from amibayes.plots.style import (
     BLACK,
     DASHES,
+    GREY,
     SEQUENTIAL,
     SERIES,
     VERMILLION,
@@ -33,11 +37,14 @@ class Curve:
         NaN where there is none.
     low, high : (n,) float array, optional
         Spread with position angle, or an interval.
+    by_detection : (n,) bool array, optional
+        Where a companion counts wherever it is seen, as its place cannot be told.
     """
 
     delta_mag: FloatArray
     low: FloatArray | None = None
     high: FloatArray | None = None
+    by_detection: BoolArray | None = None
 
 
 @styled()
@@ -45,6 +52,9 @@ def limits_plot(
     separation_mas: FloatArray,
     curves: Mapping[str, Curve],
     companion: Companion | None = None,
+    *,
+    fringe_mas: float | None = None,
+    masses: MassTable | None = None,
 ) -> Figure:
     """Draw limiting magnitude differences against separation, fainter downward.
 
@@ -55,21 +65,30 @@ def limits_plot(
         By the name that the legend gives: method, and false-positive rate or completeness.
     companion : Companion, optional
         One that was found, with its errors.
+    fringe_mas : float, optional
+        λ/B of the longest baseline, for an axis in its units above.
+    masses : MassTable, optional
+        For a second axis on the right.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
-    figure = new_figure(4.9)
+    figure = new_figure(4.9 if fringe_mas is None else 5.3)
     ax = figure.subplots()
     for i, (name, curve) in enumerate(curves.items()):
         colour, dash = SERIES[i % len(SERIES)], DASHES[i % len(DASHES)]
         ax.plot(separation_mas, curve.delta_mag, color=colour, ls=dash, lw=2.0, label=name)
         if curve.low is not None and curve.high is not None:
             ax.fill_between(separation_mas, curve.low, curve.high, color=colour, alpha=0.2, lw=0)
+    _mark_ambiguous(ax, separation_mas, list(curves.values()))
     if companion is not None:
         _mark_companion(ax, companion)
     magnitude_axis(ax)
+    if fringe_mas is not None:
+        _fringe_axis(ax, fringe_mas)
+    if masses is not None:
+        _mass_axis(ax, masses)
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(2, len(labels)))
     return figure
@@ -128,6 +147,46 @@ def _edges(centres: FloatArray) -> FloatArray:
     middle = 0.5 * (centres[1:] + centres[:-1])
     first, last = 2.0 * centres[0] - middle[0], 2.0 * centres[-1] - middle[-1]
     return np.concatenate([[first], middle, [last]])
+
+
+def _mark_ambiguous(ax: Axes, separation_mas: FloatArray, curves: Sequence[Curve]) -> None:
+    """Put a cross on every point of a curve where a companion's place cannot be told."""
+    label: str | None = "seen, but its place is ambiguous"
+    for i, curve in enumerate(curves):
+        marked = curve.by_detection
+        if marked is None or not (marked & np.isfinite(curve.delta_mag)).any():
+            continue
+        at = (separation_mas[marked], curve.delta_mag[marked])
+        ax.plot(*at, "x", color=SERIES[i % len(SERIES)], markersize=7, mew=1.8, zorder=3)
+        if label:
+            ax.plot([], [], "x", color=GREY, markersize=7, mew=1.8, label=label)
+            label = None
+
+
+def _fringe_axis(ax: Axes, fringe_mas: float) -> None:
+    def inward(x: ArrayLike) -> FloatArray:
+        return np.asarray(x, dtype=float) / fringe_mas
+
+    def outward(x: ArrayLike) -> FloatArray:
+        return np.asarray(x, dtype=float) * fringe_mas
+
+    top = ax.secondary_xaxis("top", functions=(inward, outward))
+    top.set_xlabel("Separation (λ/B of the longest baseline)")
+
+
+def _mass_axis(ax: Axes, masses: MassTable) -> None:
+    """Label round masses at their magnitudes, right of the contrasts."""
+    faint, bright = ax.get_ylim()
+    span = masses.mass_at(np.clip([bright, faint], *masses.delta_mag[[0, -1]]))
+    decades = 10.0 ** np.arange(np.floor(np.log10(span[1])), np.ceil(np.log10(span[0])) + 1)
+    round_ones = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
+    marks = masses.delta_mag_at(round_ones)
+    shown = (marks >= bright) & (marks <= faint)
+    right = ax.secondary_yaxis(1.2)
+    right.yaxis.set_major_locator(FixedLocator(marks[shown].tolist()))
+    right.yaxis.set_minor_locator(NullLocator())
+    right.yaxis.set_major_formatter(FuncFormatter(lambda m, _: f"{masses.mass_at(m):.3g}"))
+    right.set_ylabel(f"Mass ({masses.unit})")
 
 
 def _mark_companion(ax: Axes, companion: Companion) -> None:

@@ -1,8 +1,16 @@
-"""What a run says: ``result.json``, the summary on the terminal, and ``report.html``."""
+"""What a run says: ``result.json``, ``limits.json``, summaries, and ``report.html``."""
 
 from amibayes.report.captions import captioned
+from amibayes.report.common import Json, number
+from amibayes.report.limits import (
+    limits_json,
+    limits_report_json,
+    limits_summary,
+    limits_table,
+    write_limits_table,
+)
 from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table, write_page
-from amibayes.report.result import Json, limits_json, number, result_json
+from amibayes.report.result import result_json
 from amibayes.report.search_page import search_page
 from amibayes.report.summary import summary
 
@@ -17,9 +25,13 @@ __all__ = [
     "Table",
     "captioned",
     "limits_json",
+    "limits_report_json",
+    "limits_summary",
+    "limits_table",
     "number",
     "result_json",
     "search_page",
     "summary",
+    "write_limits_table",
     "write_page",
 ]

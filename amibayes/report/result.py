@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from amibayes import __version__
-from amibayes.files import sha256
 from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
-from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.multiplicity import TwoCompanions
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchReport, calibrator_verdicts
+from amibayes.report.common import Json, data_json, inputs_json, number
+from amibayes.report.limits import limits_json
 from amibayes.units import contrast_to_delta_mag
-
-Json = dict[str, Any]
 
 QUANTITIES = (
     "separation_mas",
@@ -31,19 +28,14 @@ QUANTITIES = (
 )
 
 
-def number(value: float) -> float | None:
-    """Make a float for JSON: null where it is not finite."""
-    return float(value) if math.isfinite(value) else None
-
-
 def result_json(report: SearchReport) -> Json:
     """Build the content of ``result.json``, whose keys scripts rely on."""
     result = report.result
     return {
         "amibayes": __version__,
         "seed": report.options.seed,
-        "inputs": _inputs(report),
-        "data": _data(report),
+        "inputs": inputs_json(report.targets, report.calibrators),
+        "data": data_json(report.result),
         "fit": _fit(result),
         "significance": _significance(result, report.significance, report.options.alpha),
         "modes": _modes(report),
@@ -57,27 +49,6 @@ def result_json(report: SearchReport) -> Json:
         "evidence": None if report.evidence is None else evidence_json(report.evidence),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
-    }
-
-
-def _inputs(report: SearchReport) -> list[Json]:
-    files = [(p, "target") for p in report.targets] + [
-        (p, "calibrator") for p in report.calibrators
-    ]
-    return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
-
-
-def _data(report: SearchReport) -> Json:
-    used = report.result.likelihood.observables
-    return {
-        "n_vis2": used.n_vis2,
-        "n_closure_phases": used.n_closure_phases,
-        "n_independent": used.n_independent,
-        "covariance": used.covariance_kind,
-        "n_integrations": used.n_integrations,
-        "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
-        "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
-        "separation_mas": [report.result.grid.inner_mas, report.result.grid.outer_mas],
     }
 
 
@@ -257,21 +228,6 @@ def _two(two: TwoCompanions) -> Json:
             | {"errors": companion_errors(c)}
             for c in two.companions
         ],
-    }
-
-
-def limits_json(limits: DetectionLimit) -> Json:
-    """Build the content of ``limits`` in ``result.json``; null where no contrast will do."""
-    contrasts = [number(x) for x in limits.contrast]
-    return {
-        "method": limits.method,
-        "separation_mas": list(limits.separation_mas),
-        "delta_mag_3sigma": [number(x) for x in limits.delta_mag],
-        "contrast": contrasts,
-        "delta_mag_50": [number(x) for x in contrast_to_delta_mag(limits.contrast_50)],
-        "delta_mag_error": [number(2.5 / np.log(10.0) * x) for x in limits.log_error],
-        "false_positive_rate": limits.false_positive_rate,
-        "completeness": limits.completeness,
     }
 
 

@@ -1,0 +1,243 @@
+"""``amibayes limits``: what companions the data would have shown."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from amibayes.cli import common, data_options
+from amibayes.errors import UsageError
+
+if TYPE_CHECKING:
+    from amibayes.limits_job import LimitsOptions, LimitsReport
+
+RESULT, TABLE, JOURNAL = "limits.json", "limits.ecsv", "limits.journal"
+
+METHODS = ("injection", "absil", "candid", "posterior", "closure-phase")
+
+EXAMPLES = """examples:
+  amibayes limits target.oifits --cal cal*.oifits
+  amibayes limits calibrated.oifits --separation 50:400 --method candid
+  amibayes limits target.oifits --mass-table tracks.ecsv --primary-magnitude 3.2 --workers 4
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``limits``."""
+    parser.epilog = EXAMPLES
+    parser.add_argument(
+        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+    )
+    parser.add_argument(
+        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
+    )
+    _add_limit(parser.add_argument_group("limit"))
+    data_options.add_model(parser.add_argument_group("model"))
+    data = parser.add_argument_group("data")
+    data_options.add_observables(
+        data, None, "limits from these alone (default: from both, and from each by itself)"
+    )
+    data_options.add_data(data)
+    common.add_image_options(parser, "--extraction")
+    common.add_parallel_options(parser)
+    common.add_output_options(parser, "limits")
+
+
+def _add_limit(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="injection and recovery by the search's own criterion, or a closed criterion of the "
+        "literature (default: %(default)s)",
+    )
+    group.add_argument(
+        "--separations",
+        type=common.positive_integer,
+        default=24,
+        metavar="N",
+        help="how many, over the whole field (default: %(default)s)",
+    )
+    group.add_argument(
+        "--trials",
+        type=common.positive_integer,
+        default=240,
+        metavar="N",
+        help="injections per separation and contrast, on average (default: %(default)s)",
+    )
+    data_options.add_null_draws(group, 100_000)
+    group.add_argument(
+        "--mass-table",
+        metavar="FILE",
+        help="ECSV or CSV with columns mass and delta_mag (or absolute_mag), for masses",
+    )
+    group.add_argument(
+        "--primary-magnitude",
+        type=common.finite_float,
+        metavar="M",
+        help="absolute magnitude of the star, for a table of absolute magnitudes",
+    )
+    group.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
+    common.add_seed_option(group)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure the limits and write their files; a finished run is told again."""
+    common.configure_logging(arguments)
+    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    from amibayes.files import output_folder
+    from amibayes.report import limits_summary
+
+    options = _options(arguments)
+    names = _names(options)
+    overwrite = arguments.overwrite or arguments.resume
+    folder = output_folder(arguments.out, names, overwrite=overwrite)
+    request = _request(arguments, options)
+    content = _finished(folder, names, request) if arguments.resume else None
+    if content is None:
+        if arguments.resume and not arguments.overwrite:
+            _refuse_other_request(folder / RESULT, request)
+        content = _measure(arguments, options, folder, request)
+    common.finish(arguments, content, lambda: limits_summary(content, folder))
+    return 0
+
+
+def _names(options: LimitsOptions) -> list[str]:
+    """List the files of a run."""
+    from amibayes.pictures import limits_picture_names
+
+    return [RESULT, TABLE, *limits_picture_names(options.method)]
+
+
+def _request(arguments: argparse.Namespace, options: LimitsOptions) -> str:
+    """Digest all that the answer depends on: the files' content, and the options."""
+    from amibayes.errors import DataError
+    from amibayes.parallel import digest
+
+    files = [Path(p) for p in (*arguments.targets, *arguments.cal)]
+    try:
+        return digest(files, len(arguments.targets), options)
+    except OSError as error:
+        raise DataError(
+            f"cannot be read: {error.strerror or error}", source=error.filename
+        ) from error
+
+
+def _finished(folder: Path, names: list[str], request: str) -> Any:
+    """Give the content of a finished run of the same request; None where there is none."""
+    before = _read(folder / RESULT)
+    whole = all((folder / name).is_file() for name in names)
+    return before if whole and before.get("request") == request else None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    import json
+
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _refuse_other_request(path: Path, request: str) -> None:
+    """Refuse to go on in a folder that holds the answer to something else."""
+    if path.is_file() and _read(path).get("request") != request:
+        raise UsageError(
+            "is the result of other data or options",
+            source=path,
+            remedy="give --overwrite or another --out",
+        )
+
+
+def _measure(
+    arguments: argparse.Namespace, options: LimitsOptions, folder: Path, request: str
+) -> Any:
+    """Do the work, keeping what is finished; the journal ends when all files are written."""
+    from amibayes.limits_job import measure_limits
+    from amibayes.parallel import Journals
+    from amibayes.report import limits_report_json
+
+    journals = Journals(folder / JOURNAL, request, resume=arguments.resume)
+    with (
+        common.executor_of(arguments) as executor,
+        common.Progress(quiet=arguments.quiet) as progress,
+    ):
+        report = measure_limits(
+            arguments.targets,
+            arguments.cal,
+            options,
+            journals=journals,
+            announce=progress.stage,
+            progress=progress.update,
+            executor=executor,
+        )
+    content = limits_report_json(report, request)
+    _write(report, content, folder)
+    journals.remove()
+    _remove_if_empty(folder / JOURNAL)
+    return content
+
+
+def _write(report: LimitsReport, content: object, folder: Path) -> None:
+    from amibayes.files import write_json
+    from amibayes.pictures import save_limits_pictures
+    from amibayes.report import write_limits_table
+
+    save_limits_pictures(report, folder)
+    write_limits_table(folder / TABLE, report)
+    # Last: where it is, the run is finished.
+    write_json(folder / RESULT, content)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _options(arguments: argparse.Namespace) -> LimitsOptions:
+    from amibayes.job import SearchOptions
+    from amibayes.limits_job import LimitsOptions
+
+    if arguments.calibration and not arguments.cal:
+        raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
+    search = SearchOptions(
+        separation_mas=arguments.separation,
+        diameter=arguments.diameter,
+        background=arguments.background,
+        smearing=arguments.smearing,
+        closure_covariance=arguments.closure_covariance,
+        calibration=arguments.calibration,
+        clip=arguments.clip,
+        keep_all=arguments.keep_all,
+        insname=arguments.insname,
+        target=arguments.target,
+        extra_noise=arguments.extra_noise,
+        null_draws=arguments.null_draws,
+        seed=arguments.seed,
+        images=common.image_options_of(arguments),
+    )
+    return LimitsOptions(
+        search=search,
+        method=arguments.method,
+        observables=arguments.observables,
+        n_separations=arguments.separations,
+        trials_per_cell=arguments.trials,
+        masses=_masses(arguments),
+    )
+
+
+def _masses(arguments: argparse.Namespace) -> Any:
+    if arguments.mass_table is None:
+        if arguments.primary_magnitude is not None:
+            raise UsageError(
+                "needs a table", source="--primary-magnitude", remedy="give --mass-table FILE"
+            )
+        return None
+    from amibayes.mass_table import read_mass_table
+
+    return read_mass_table(arguments.mass_table, arguments.primary_magnitude)
+
+
+__all__ = ["add_arguments", "run"]

@@ -1,0 +1,242 @@
+"""Injection and recovery of companions by the criterion of the search itself.
+
+A companion is put into the fitted model without one, noise is drawn anew from the data's
+covariance, and the search's statistic is formed: it is detected where the false-alarm
+probability is below α, and located where the search would report it at its place too. In
+whitened data a trial costs no more than a null search, a column of a matrix product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from amibayes.inference.bank import TemplateBank
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.refine import single_likelihood
+from amibayes.inference.search import resolution_mas
+from amibayes.inference.significance import profiled
+from amibayes.observables import BoolArray
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.units import FloatArray
+
+TRIALS_AT_ONCE = 2048
+
+ALIAS = 0.875
+"""Correlation of two templates on the lattice above which one position stands for the other."""
+
+ALIKE = 0.75
+"""Squared correlation that `innermost_first` calls alike, however bright the companion."""
+
+SUBSTEPS = np.linspace(-0.5, 0.5, 5)
+"""Where, in steps of the lattice, an alias is looked for around its best lattice point."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """What became of injected companions.
+
+    Parameters
+    ----------
+    detected : (n,) bool array
+        The statistic exceeds the threshold, wherever its maximum is.
+    located : (n,) bool array
+        Detected, and the position that the search would report is the right one (within
+        λ/2B_max; without closure phases, or its opposite).
+    """
+
+    detected: BoolArray
+    located: BoolArray
+
+
+def recover(
+    likelihood: Likelihood,
+    bank: TemplateBank,
+    single: FloatArray,
+    theta: FloatArray,
+    threshold: float,
+    rng: np.random.Generator,
+    *,
+    free_scale: bool = False,
+    nearer: FloatArray | None = None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    journal: Journal | None = None,
+) -> Recovery:
+    """Inject companions and say which of them the search recovers.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+    bank : TemplateBank
+    single : (n_nuisance,) float array
+        The fit without a companion.
+    theta : (n, 3) float array
+        east_mas, north_mas, contrast of each trial. Trials at one place are cheapest side
+        by side.
+    threshold : float
+        Statistic that counts as a detection.
+    rng : numpy.random.Generator
+    free_scale : bool
+        The statistic is `profiled`, else the gain in χ².
+    nearer : (n,) float array, optional
+        From `nearer_alias` for the places of the trials, if it is known already.
+    executor : Executor, optional
+        Where it is computed; the result does not depend on it.
+    progress : callable, optional
+        Told (pieces done, pieces in all); a piece is `TRIALS_AT_ONCE` trials.
+    journal : Journal, optional
+        Keeps finished pieces.
+
+    Returns
+    -------
+    Recovery
+    """
+    parts = slices(len(theta), TRIALS_AT_ONCE)
+    pieces = [
+        (theta[p], None if nearer is None else nearer[p], seed)
+        for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)
+    ]
+    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale)
+    executor = executor or SerialExecutor()
+    done = list(run_job(work, pieces, executor, journal=journal, progress=progress))
+    return Recovery(
+        np.concatenate([d["detected"] for d in done]), np.concatenate([d["located"] for d in done])
+    )
+
+
+def _recover_piece(
+    likelihood: Likelihood,
+    bank: TemplateBank,
+    single: FloatArray,
+    threshold: float,
+    free_scale: bool,
+    piece: tuple[FloatArray, FloatArray | None, np.random.SeedSequence],
+) -> dict[str, BoolArray]:
+    theta, nearer, seed = piece
+    signal = injected_signal(likelihood, single, theta)
+    noise = np.random.default_rng(seed).standard_normal(signal.shape)
+    data = bank.project(signal + noise)
+    gain, position = bank.largest_gain(data.astype(np.float32))
+    statistic = gain
+    if free_scale:
+        statistic = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
+    detected = statistic > threshold
+    fringe = resolution_mas(likelihood)
+    found = np.column_stack([bank.grid.east_mas[position], bank.grid.north_mas[position]])
+    right = np.hypot(*(found - theta[:, :2]).T) < 0.5 * fringe
+    doubtful = np.flatnonzero(detected & ~right)
+    right[doubtful] = _correlation(bank, found[doubtful], theta[doubtful, :2]) > ALIAS
+    if nearer is None:
+        places, which = np.unique(theta[:, :2], axis=0, return_inverse=True)
+        nearer = nearer_alias(bank, fringe, places)[which.ravel()]
+    return {"detected": detected, "located": detected & right & ~ambiguous(nearer, gain)}
+
+
+def _correlation(bank: TemplateBank, there: FloatArray, here: FloatArray) -> FloatArray:
+    """Correlations of the templates at pairs of places (n, 2), (n,)."""
+    if not len(there):
+        return np.empty(0)
+    pair = [bank.templates_at(*place.T) for place in (there, here)]
+    return np.asarray((pair[0] * pair[1]).sum(axis=0))
+
+
+def ambiguous(nearer: FloatArray, gain: FloatArray) -> BoolArray:
+    """Say where the search would report an alias that is nearer to the star.
+
+    Parameters
+    ----------
+    nearer : (n,) float array
+        From `nearer_alias`.
+    gain : (n,) float array
+        In χ². Fits that differ by less than 9 over all the data are alike to
+        `amibayes.inference.search.innermost_first`, and so are any whose difference is less
+        than half of the signal.
+    """
+    alike = np.minimum(1.0 - ALIKE, 9.0 / np.maximum(gain, 1e-30))
+    return np.asarray(1.0 - np.clip(nearer, 0.0, 1.0) ** 2 < alike)
+
+
+def nearer_aliases(
+    bank: TemplateBank,
+    places: FloatArray,
+    fringe_mas: float,
+    *,
+    executor: Executor | None = None,
+    journal: Journal | None = None,
+) -> FloatArray:
+    """`nearer_alias` of many places, (n_pieces, n, 2), as a job; (n_pieces, n)."""
+    work = partial(_alias_piece, bank, fringe_mas)
+    done = run_job(work, list(places), executor or SerialExecutor(), journal=journal)
+    return np.array([piece["correlation"] for piece in done])
+
+
+def _alias_piece(
+    bank: TemplateBank, fringe_mas: float, places: FloatArray
+) -> dict[str, FloatArray]:
+    return {"correlation": nearer_alias(bank, fringe_mas, places)}
+
+
+def nearer_alias(bank: TemplateBank, fringe_mas: float, places: FloatArray) -> FloatArray:
+    """Largest correlation with a position that is nearer to the star and not the same one.
+
+    Parameters
+    ----------
+    bank : TemplateBank
+    fringe_mas : float
+        Positions within it are the same; so are those around the opposite place, which data
+        without closure phases cannot tell and no rule prefers.
+    places : (n, 2) float array
+        east_mas, north_mas.
+
+    Returns
+    -------
+    (n,) float array
+        0 where there is none.
+    """
+    own = bank.templates_at(*places.T)
+    radius, grid = np.hypot(*places.T), bank.grid
+    most, where = np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)
+    each = np.arange(len(places))
+    for index, templates in bank.chunks():
+        match = own.T @ templates
+        east, north = grid.east_mas[index], grid.north_mas[index]
+        across = np.abs(np.outer(places[:, 0], east) + np.outer(places[:, 1], north))
+        square = (east**2 + north**2)[None] + (radius**2)[:, None]
+        same = square - 2.0 * across < fringe_mas**2  # to it, or to its opposite
+        match[same | (np.hypot(east, north)[None] >= radius[:, None])] = 0.0
+        top = match.argmax(axis=1)
+        better = match[each, top] > most
+        most[better], where[better] = match[each, top][better], index[top[better]]
+    return _between_lattice_points(bank, places, most, where)
+
+
+def _between_lattice_points(
+    bank: TemplateBank, places: FloatArray, most: FloatArray, where: np.ndarray
+) -> FloatArray:
+    """Look around the best lattice points: near 1 a correlation must be known well."""
+    likely = np.flatnonzero(most**2 > 0.8 * ALIKE)
+    if not len(likely):
+        return most
+    own = bank.templates_at(*places[likely].T)
+    best = most.copy()
+    for across in SUBSTEPS * bank.grid.step_mas:
+        for along in SUBSTEPS * bank.grid.step_mas:
+            at = where[likely]
+            there = bank.templates_at(
+                bank.grid.east_mas[at] + across, bank.grid.north_mas[at] + along
+            )
+            best[likely] = np.maximum(best[likely], (own * there).sum(axis=0))
+    return best
+
+
+def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
+    """Whitened change of the data by companions (n, 3) on top of the fit without one."""
+    full = np.hstack([theta, np.broadcast_to(single, (len(theta), len(single)))])
+    alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
+    change = likelihood.predict(full) - alone
+    closure = change[likelihood.samples.squares.shape[0] :]
+    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+    return likelihood.observables.covariance.whiten(change)

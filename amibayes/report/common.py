@@ -1,0 +1,43 @@
+"""Pieces of JSON that several commands write in one and the same way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from amibayes.files import sha256
+from amibayes.inference.results import SearchResult
+
+Json = dict[str, Any]
+
+
+def number(value: float) -> float | None:
+    """Make a float for JSON: null where it is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
+def numbers(values: Iterable[float]) -> list[float | None]:
+    """Make floats for JSON: null where one is not finite."""
+    return [number(value) for value in values]
+
+
+def inputs_json(targets: Sequence[str], calibrators: Sequence[str]) -> list[Json]:
+    """Say which files went in, and what they were."""
+    files = [(p, "target") for p in targets] + [(p, "calibrator") for p in calibrators]
+    return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
+
+
+def data_json(result: SearchResult) -> Json:
+    """Say what data were fitted, and over which field."""
+    used = result.likelihood.observables
+    return {
+        "n_vis2": used.n_vis2,
+        "n_closure_phases": used.n_closure_phases,
+        "n_independent": used.n_independent,
+        "covariance": used.covariance_kind,
+        "n_integrations": used.n_integrations,
+        "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
+        "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
+        "separation_mas": [result.grid.inner_mas, result.grid.outer_mas],
+    }

@@ -1,0 +1,232 @@
+"""What `amibayes limits` says: ``limits.json``, ``limits.ecsv`` and the summary."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from astropy.table import Table
+
+from amibayes import __version__
+from amibayes.files import atomic_path
+from amibayes.inference.analytic_limits import AnalyticLimit
+from amibayes.inference.limits import DetectionLimit
+from amibayes.inference.search import resolution_mas
+from amibayes.limits_job import NAMES, LimitsReport, MeasuredLimit
+from amibayes.report.common import Json, data_json, inputs_json, number, numbers
+from amibayes.units import contrast_to_delta_mag
+
+MAG_PER_LOG = 2.5 / np.log(10.0)
+
+
+def limits_json(limits: DetectionLimit | AnalyticLimit) -> Json:
+    """Build the content of ``limits`` in ``result.json``; null where no contrast will do."""
+    out: Json = {
+        "method": limits.method,
+        "separation_mas": list(limits.separation_mas),
+        "delta_mag_3sigma": numbers(limits.delta_mag),
+        "contrast": numbers(limits.contrast),
+        "delta_mag_spread": [numbers(row) for row in contrast_to_delta_mag(limits.spread)],
+    }
+    if isinstance(limits, AnalyticLimit):
+        return out | {
+            "criterion": limits.criterion,
+            "companion_removed": limits.removed,
+            "false_positive_rate": None,
+            "completeness": None,
+        }
+    return out | {
+        "criterion": "false-alarm probability of the search below the false-positive rate, and "
+        "position within lambda/2B of the truth (anywhere, where criterion_at says detection)",
+        "criterion_at": ["detection" if d else "position" for d in limits.by_detection],
+        "ambiguous_share": list(limits.ambiguous),
+        "delta_mag_error": numbers(MAG_PER_LOG * limits.log_error),
+        "delta_mag_50": numbers(contrast_to_delta_mag(limits.contrast_50)),
+        "delta_mag_50_error": numbers(MAG_PER_LOG * limits.log_error_50),
+        "false_positive_rate": limits.false_positive_rate,
+        "false_positive_rate_measured": limits.false_positives[0] / limits.false_positives[1],
+        "false_positive_interval": list(limits.false_positive_interval),
+        "threshold": limits.threshold,
+        "completeness": limits.completeness,
+        "n_trials": int(limits.trials.sum()),
+    }
+
+
+def limits_report_json(report: LimitsReport, request: str = "") -> Json:
+    """Build the content of ``limits.json``: the main limit, all of them, and the map.
+
+    Parameters
+    ----------
+    report : LimitsReport
+    request : str
+        Digest of all that the answer depends on.
+    """
+    main = report.main
+    return {
+        "amibayes": __version__,
+        "seed": report.options.search.seed,
+        "request": request,
+        "inputs": inputs_json(report.targets, report.calibrators),
+        "data": data_json(main.result),
+        "noise": {
+            "extra_vis2": main.noise.vis2,
+            "extra_closure_phase_deg": float(np.degrees(main.noise.closure_phase_rad)),
+        },
+        "companion_detected": None if main.significance is None else main.significance.detected,
+        **_curve(main, report),
+        "curves": [_curve(limit, report) for limit in report.limits],
+        "completeness_map": _map(main.limit),
+        "warnings": list(report.warnings),
+    }
+
+
+def _curve(measured: MeasuredLimit, report: LimitsReport) -> Json:
+    limit, fringe = measured.limit, resolution_mas(measured.result.likelihood)
+    out: Json = {
+        "observables": list(measured.observables),
+        "n_independent": measured.result.likelihood.n_independent,
+        "lambda_over_b_mas": fringe,
+        **limits_json(limit),
+    }
+    if report.options.masses is not None:
+        out["mass"] = numbers(report.options.masses.mass_at(limit.delta_mag))
+        out["mass_unit"] = report.options.masses.unit
+    return out
+
+
+def _map(limit: DetectionLimit | AnalyticLimit) -> Json | None:
+    """Completeness of every cell, with its Jeffreys interval; null for closed criteria."""
+    if isinstance(limit, AnalyticLimit):
+        return None
+    low, high = limit.jeffreys()
+    return {
+        "separation_mas": list(limit.separation_mas),
+        "contrast": limit.level.tolist(),
+        "delta_mag": contrast_to_delta_mag(limit.level).tolist(),
+        "trials": limit.trials.tolist(),
+        "detected": limit.detected.tolist(),
+        "located": limit.located.tolist(),
+        "completeness": [numbers(row) for row in limit.share],
+        "jeffreys_68": [low.tolist(), high.tolist()],
+    }
+
+
+def limits_table(report: LimitsReport) -> Table:
+    """Tabulate all curves; columns carry units, and the observables in their names."""
+    main = report.main
+    table = Table()
+    table["separation"] = main.limit.separation_mas
+    table["separation"].unit = "mas"
+    table["separation_lambda_over_b"] = main.limit.separation_mas / resolution_mas(
+        main.result.likelihood
+    )
+    for measured in report.limits:
+        _add_columns(table, measured, report)
+    table.meta = {
+        "amibayes": __version__,
+        "method": report.options.method,
+        "seed": report.options.search.seed,
+    }
+    return table
+
+
+def _add_columns(table: Table, measured: MeasuredLimit, report: LimitsReport) -> None:
+    limit, name = measured.limit, "_".join(measured.observables)
+    columns = {"delta_mag_3sigma": limit.delta_mag}
+    columns |= {
+        f"delta_mag_{percent}": contrast_to_delta_mag(spread)
+        for percent, spread in zip(("p16", "p50", "p84"), limit.spread.T, strict=True)
+    }
+    if isinstance(limit, DetectionLimit):
+        columns["delta_mag_error"] = MAG_PER_LOG * limit.log_error
+        columns["delta_mag_c50"] = contrast_to_delta_mag(limit.contrast_50)
+        columns["delta_mag_c50_error"] = MAG_PER_LOG * limit.log_error_50
+        table[f"by_detection_{name}"] = limit.by_detection
+    for key, values in columns.items():
+        table[f"{key}_{name}"] = values
+        table[f"{key}_{name}"].unit = "mag"
+    if report.options.masses is not None:
+        table[f"mass_{name}"] = report.options.masses.mass_at(limit.delta_mag)
+        table[f"mass_{name}"].description = f"in {report.options.masses.unit}"
+
+
+def write_limits_table(path: str | Path, report: LimitsReport) -> None:
+    """Write the table as ECSV, whole or not at all."""
+    with atomic_path(path) as temporary:
+        limits_table(report).write(temporary, format="ascii.ecsv", overwrite=True)
+
+
+def limits_summary(content: Json, folder: Path) -> list[str]:
+    """Say the content of ``limits.json`` in at most 20 lines."""
+    data = content["data"]
+    lines = [
+        f"data        {data['n_vis2']} V2, {data['n_closure_phases']} closure phases, "
+        f"{data['n_independent']} independent ({data['covariance']} covariance)",
+        f"method      {content['method']}: {content['criterion']}",
+        *_rate_lines(content),
+        *(_curve_line(curve) for curve in content["curves"]),
+        *_marked_lines(content),
+    ]
+    room = 19 - len(lines)
+    said = content["warnings"]
+    lines += [f"WARNING     {text}" for text in said[:room]]
+    if len(said) > room:
+        lines[-1] = f"WARNING     {len(said) - room + 1} more warnings in limits.json"
+    return [*lines, f"written to  {folder}"]
+
+
+def _rate_lines(content: Json) -> list[str]:
+    if content["completeness"] is None:
+        return []
+    low, high = content["false_positive_interval"]
+    measured = content["false_positive_rate_measured"]
+    return [
+        f"limit       {content['completeness']:.0%} of companions recovered, false-positive rate "
+        f"{content['false_positive_rate']:.2g} (measured {measured:.2g}, 95%: {low:.2g} to "
+        f"{high:.2g}); {content['n_trials']} injections"
+    ]
+
+
+def _curve_line(curve: Json) -> str:
+    name = NAMES[tuple(curve["observables"])]
+    usable = [
+        (rho, mag)
+        for rho, mag in zip(curve["separation_mas"], curve["delta_mag_3sigma"], strict=True)
+        if mag is not None
+    ]
+    if not usable:
+        return f"{name:<11} no limit in this field"
+    rho, mag = zip(*usable, strict=True)
+    line = f"{name:<11} delta mag {min(mag):.2f} to {max(mag):.2f} at {rho[0]:.0f} to "
+    line += f"{rho[-1]:.0f} mas"
+    masses = [m for m in curve.get("mass", []) if m is not None]
+    if masses:
+        line += f", mass {min(masses):.3g} to {max(masses):.3g} {curve['mass_unit']}"
+    return line
+
+
+def _marked_lines(content: Json) -> list[str]:
+    at = [
+        rho
+        for rho, how in zip(
+            content["separation_mas"], content.get("criterion_at", []), strict=False
+        )
+        if how == "detection"
+    ]
+    if not at:
+        return []
+    return [
+        f"aliases     at {len(at)} of {len(content['separation_mas'])} separations, from "
+        f"{at[0]:.0f} mas, these baselines take positions for ones nearer in: there a companion "
+        "counts wherever it is seen"
+    ]
+
+
+__all__ = [
+    "limits_json",
+    "limits_report_json",
+    "limits_summary",
+    "limits_table",
+    "number",
+    "write_limits_table",
+]

@@ -1,0 +1,109 @@
+"""Detection limits from the command line: files, words, exit status, and what a kill leaves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.table import Table
+from helpers import niriss, simulated
+
+from amibayes.cli import main
+from amibayes.oifits import write_oifits
+
+FAST = ("--separations", 4, "--trials", 20, "--null-draws", 8000, "--separation", "60:400")
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("data") / "target.oifits"
+    write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))
+    return path
+
+
+def run(*words: object) -> int:
+    try:
+        return main(["limits", *map(str, words)])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def error_of(capsys: pytest.CaptureFixture[str]) -> str:
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().split("\n")
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("amibayes")
+    return lines[0]
+
+
+def test_whole_job(target: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run(target, "--out", out, *FAST) == 0
+    summary = capsys.readouterr().out.strip().split("\n")
+    assert len(summary) <= 20
+    assert {p.name for p in out.iterdir()} == {
+        "limits.json", "limits.ecsv", "limits.png", "completeness.png",
+    }  # fmt: skip
+    content = json.loads((out / "limits.json").read_text())
+    assert [c["observables"] for c in content["curves"]] == [["vis2", "cp"], ["vis2"], ["cp"]]
+    assert content["method"] == "injection"
+    assert content["delta_mag_3sigma"] == content["curves"][0]["delta_mag_3sigma"]
+    assert content["separation_mas"] == pytest.approx(np.linspace(60, 400, 4))
+    assert content["n_trials"] == np.sum(content["completeness_map"]["trials"]) == 4 * 14 * 20
+    text = (out / "limits.json").read_text()
+    assert str(out) not in text
+    assert "timing" not in text
+    table = Table.read(out / "limits.ecsv")
+    assert table["separation"].unit == "mas"
+    np.testing.assert_allclose(
+        table["delta_mag_3sigma_cp"], content["curves"][2]["delta_mag_3sigma"]
+    )
+
+
+@pytest.mark.parametrize("method", ["absil", "candid", "posterior", "closure-phase"])
+def test_closed_criteria(target: Path, tmp_path: Path, capsys, method: str) -> None:
+    out = tmp_path / "out"
+    assert run(target, "--out", out, *FAST, "--method", method, "--json") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["method"] == method
+    assert content["completeness_map"] is None
+    assert len(content["curves"]) == (1 if method == "closure-phase" else 3)
+    assert all(3.5 < mag < 9.0 for mag in content["delta_mag_3sigma"])
+    assert {p.name for p in out.iterdir()} == {"limits.json", "limits.ecsv", "limits.png"}
+
+
+def test_resume_starts_afresh_and_tells_a_finished_run_again(target, tmp_path, capsys) -> None:
+    words = (target, *FAST, "--observables", "cp", "--json", "--resume", "--out", tmp_path / "out")
+    assert run(*words) == 0
+    first = capsys.readouterr().out
+    stamp = (tmp_path / "out" / "limits.json").stat().st_mtime_ns
+    assert run(*words) == 0
+    assert capsys.readouterr().out == first == (tmp_path / "out" / "limits.json").read_text()
+    assert (tmp_path / "out" / "limits.json").stat().st_mtime_ns == stamp
+    assert run(*words, "--seed", 2) == 2
+    assert "other data or options" in error_of(capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (("--null-draws", 100), 2, "--null-draws"),
+        (("--method", "closure-phase", "--observables", "vis2"), 2, "closure phases alone"),
+        (("--calibration", "weighted"), 2, "needs calibrators"),
+        (("--primary-magnitude", 3), 2, "--mass-table"),
+        (("--mass-table", "nowhere.ecsv"), 3, "nowhere.ecsv: cannot be read"),
+        (("--method", "magic"), 2, "invalid choice"),
+        (("--trials", 0), 2, "not a positive number"),
+    ],
+)
+def test_bad_requests_are_one_line(target, tmp_path, capsys, words, status, message) -> None:
+    assert run(target, "--out", tmp_path / "out", *words) == status
+    assert message in error_of(capsys)
+
+
+def test_missing_target_is_one_line(tmp_path, capsys) -> None:
+    assert run(tmp_path / "none.oifits", "--out", tmp_path / "out") == 3
+    assert "none.oifits" in error_of(capsys)
