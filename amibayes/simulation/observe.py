@@ -183,6 +183,7 @@ def simulate(
     exposure: Exposure,
     rng: np.random.Generator,
     *,
+    maps: DetectorMaps | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     **settings: Any,
@@ -195,6 +196,8 @@ def simulate(
         What is observed, with what, and how.
     rng : numpy Generator
         Source of all randomness.
+    maps : DetectorMaps, optional
+        The detector's pixels, for exposures that share them; drawn anew by default.
     executor : Executor, optional
         Where the work is done; it changes nothing in the result.
     progress : Progress, optional
@@ -215,7 +218,8 @@ def simulate(
     observation = Observation(scene, instrument, exposure, **settings)
     of_maps, of_exposure = spawn(rng, 2)
     n = exposure.n_pixels
-    maps = draw_maps(observation.detector, (n, n), np.random.default_rng(of_maps))
+    if maps is None:
+        maps = draw_maps(observation.detector, (n, n), np.random.default_rng(of_maps))
     shutter = open_shutter(observation, of_exposure, maps)
     chunks = list(shutter.take(executor or SerialExecutor(), progress))
     return replace(

@@ -1,0 +1,172 @@
+"""One trial: a star is simulated, observed, and analysed, and the answer held to the truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.special import expit, logit
+from threadpoolctl import threadpool_limits
+
+from amibayes.calibration import calibrate
+from amibayes.cube import Cube
+from amibayes.errors import AmibayesError, RunError
+from amibayes.extraction import extract
+from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
+from amibayes.inference.limits import DetectionLimit, detection_limit
+from amibayes.inference.priors import Prior
+from amibayes.inference.results import SearchResult
+from amibayes.inference.search import resolution_mas
+from amibayes.instrument import load_instrument
+from amibayes.job import SearchOptions
+from amibayes.observables import Observables
+from amibayes.parallel import child_seeds
+from amibayes.pipeline import search_field, weigh
+from amibayes.scene import Point, Scene
+from amibayes.simulation import Detector, Exposure, draw_maps, simulate
+from amibayes.spectrum import g2v
+from amibayes.units import MAS, FloatArray, position_angle_deg
+from amibayes.validation.plan import FIELD_MAS, MAGNITUDE, RANGES, Setting, ValidationPlan
+
+RANKED = ("east_mas", "north_mas", "ln_contrast")
+"""Quantities whose ranks must be uniform; the position angle is circular."""
+
+COVERED = ("separation_mas", "position_angle_deg", "delta_mag")
+LEVELS = (0.68, 0.95)
+
+Piece = tuple[int, str, np.random.SeedSequence]
+"""Number of the trial, kind, and its randomness."""
+
+
+def run_trial(plan: ValidationPlan, piece: Piece) -> dict[str, Any]:
+    """Simulate and analyse one target with its calibrators.
+
+    Parameters
+    ----------
+    plan : ValidationPlan
+    piece : (number, kind, seed)
+
+    Returns
+    -------
+    dict
+        ``false_alarm_probability``, and for a companion ``truth`` (3,), ``rank`` (3,),
+        ``covered`` (3, 2), ``found``, ``expected`` (probability that it would be found).
+
+    Raises
+    ------
+    RunError
+        Where the analysis of simulated data fails: that too is an answer.
+    """
+    number, kind, seed = piece
+    of_truth, of_images, of_search, of_limits = child_seeds(seed, 4)
+    setting = plan.settings[number % len(plan.settings)]
+    prior = Prior(*FIELD_MAS, *RANGES.get(kind, (1e-5, 1.0)))
+    truth = None if kind == "alone" else prior.draw(np.random.default_rng(of_truth), 1)[0]
+    try:
+        with threadpool_limits(1):
+            observables = observe(setting, truth, of_images)
+            return _analysed(plan, observables, prior, truth, (of_search, of_limits))
+    except AmibayesError as error:
+        raise RunError(f"trial {number} ({kind}): {error}", source="validate") from error
+
+
+def observe(
+    setting: Setting, truth: FloatArray | None, seed: np.random.SeedSequence
+) -> Observables:
+    """Simulate a target and its calibrators on one detector, extract and calibrate them."""
+    stars = [_scene(truth), *[_scene(None)] * setting.n_calibrators]
+    of_maps, *seeds = child_seeds(seed, 1 + len(stars))
+    target, *calibrators = (
+        extract(_cube(setting, scene, of_maps, child))
+        for scene, child in zip(stars, seeds, strict=True)
+    )
+    return calibrate([target], calibrators).observables
+
+
+def _scene(truth: FloatArray | None) -> Scene:
+    companions = () if truth is None else (Point(truth[2], truth[0] * MAS, truth[1] * MAS),)
+    return Scene((Point(), *companions), "star", MAGNITUDE, "F380M", g2v())
+
+
+def _cube(
+    setting: Setting,
+    scene: Scene,
+    of_maps: np.random.SeedSequence,
+    seed: np.random.SeedSequence,
+) -> Cube:
+    exposure = Exposure(setting.n_groups, setting.n_integrations)
+    detector, shape = Detector(), (exposure.n_pixels, exposure.n_pixels)
+    return simulate(
+        scene,
+        load_instrument("niriss", setting.filter),
+        exposure,
+        np.random.default_rng(seed),
+        maps=draw_maps(detector, shape, np.random.default_rng(of_maps)),
+        detector=detector,
+    )
+
+
+def _analysed(
+    plan: ValidationPlan,
+    observables: Observables,
+    prior: Prior,
+    truth: FloatArray | None,
+    seeds: tuple[np.random.SeedSequence, np.random.SeedSequence],
+) -> dict[str, Any]:
+    options = SearchOptions(separation_mas=FIELD_MAS, alpha=plan.alpha, null_draws=plan.null_draws)
+    result, *_ = search_field(observables, options)
+    weight = weigh(result, options, np.random.default_rng(seeds[0]), None, None)
+    answer: dict[str, Any] = {"false_alarm_probability": weight.probability}
+    if truth is None:
+        return answer
+    grid = grid_posterior(result.likelihood, prior)
+    limits = detection_limit(result, weight, np.random.default_rng(seeds[1]))
+    found = bool(weight.detected) and _near(result, truth)
+    return answer | {
+        "truth": truth,
+        "rank": _ranks(grid, truth),
+        "covered": _covered(grid, truth),
+        "found": found,
+        "expected": chance_to_find(limits, truth),
+    }
+
+
+def _near(result: SearchResult, truth: FloatArray) -> bool:
+    """Whether the companion was found where it is."""
+    c = result.companion
+    away = np.hypot(c.east_mas - truth[0], c.north_mas - truth[1])
+    return bool(away < 0.5 * resolution_mas(result.likelihood))
+
+
+def _ranks(grid: GridPosterior, truth: FloatArray) -> list[float]:
+    values = [truth[0], truth[1], np.log(truth[2])]
+    return [grid.cdf(name, value) for name, value in zip(RANKED, values, strict=True)]
+
+
+def _covered(grid: GridPosterior, truth: FloatArray) -> list[list[bool]]:
+    """Whether the intervals of `LEVELS` hold the truth, for each quantity of `COVERED`."""
+    values = {
+        "separation_mas": float(np.hypot(truth[0], truth[1])),
+        "position_angle_deg": float(position_angle_deg(truth[0], truth[1])),
+        "delta_mag": float(-2.5 * np.log10(truth[2])),
+    }
+    return [[_inside(grid, name, values[name], level) for level in LEVELS] for name in COVERED]
+
+
+def _inside(grid: GridPosterior, name: str, value: float, level: float) -> bool:
+    median, low, high = grid.interval(name, level)
+    if name == "position_angle_deg":
+        value = median + (value - median + 180.0) % 360.0 - 180.0
+    return low <= value <= high
+
+
+def chance_to_find(limits: DetectionLimit, truth: FloatArray) -> float:
+    """Probability with which the limits say that a companion is found; NaN where they do not.
+
+    The logistic curve through the 50 and the 95 % contrasts at its separation.
+    """
+    rho = float(np.hypot(truth[0], truth[1]))
+    ln50 = np.interp(rho, limits.separation_mas, np.log(limits.contrast_50), np.nan, np.nan)
+    ln95 = np.interp(rho, limits.separation_mas, np.log(limits.contrast), np.nan, np.nan)
+    slope = logit(limits.completeness) / (ln95 - ln50)
+    return float(expit(slope * (np.log(truth[2]) - ln50)))
