@@ -49,6 +49,7 @@ LAYERS = [
     "report",
     "vetting_report",
     "survey",
+    "validation_report",
     "cli",
     "__main__",
 ]

@@ -22,6 +22,7 @@ COMMANDS = {
     "audit": "say what is wrong or doubtful in OIFITS files",
     "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",
+    "validate": "check on simulated exposures that the numbers mean what they say",
     "plan": "groups, integrations and time of an exposure, and what it lets one see",
 }
 """Command name → one line of help; the module of the same name holds the command."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from amibayes.observables import BoolArray, IntArray
 from amibayes.units import FloatArray
 from amibayes.validation.plan import RANGES, ValidationPlan
 from amibayes.validation.trial import COVERED, LEVELS, RANKED
@@ -93,7 +94,7 @@ class Validation:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
 
-    def of_kind(self, *kinds: str) -> FloatArray:
+    def of_kind(self, *kinds: str) -> IntArray:
         """Numbers of the trials of these kinds."""
         return np.flatnonzero(np.isin(self.kind, kinds))
 
@@ -169,11 +170,17 @@ def uniformity(group: str, name: str, values: FloatArray) -> Check:
     test = stats.kstest(values, "uniform")
     spread = float(stats.kstwo.std(n))
     return Check(
-        group, name, n, float(test.statistic), float(stats.kstwo.mean(n)), spread, test.pvalue
+        group,
+        name,
+        n,
+        float(test.statistic),
+        float(stats.kstwo.mean(n)),
+        spread,
+        float(test.pvalue),
     )
 
 
-def rate(group: str, name: str, hits: FloatArray, expected: float) -> Check:
+def rate(group: str, name: str, hits: FloatArray | BoolArray, expected: float) -> Check:
     """Check a rate against a known one (two-sided binomial)."""
     n, count = len(hits), int(np.sum(hits))
     if n < FEWEST:

@@ -1,0 +1,251 @@
+"""What a validation says: ``validation.json``, its pictures and ``validation.html``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure as Drawing
+
+from amibayes import __version__
+from amibayes.plots.validation import alarm_plot, rank_plot, reliability_plot
+from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table
+from amibayes.report.result import number
+from amibayes.validation import Check, Validation
+from amibayes.validation.plan import FIELD_MAS, RANGES
+from amibayes.validation.tally import SURPRISING
+from amibayes.validation.trial import RANKED
+
+COLUMNS = (
+    Column("Check", "text"),
+    Column("Trials"),
+    Column("Measured"),
+    Column("Expected"),
+    Column("Error"),
+    Column("p"),
+    Column("", "text"),
+)
+
+EXPLAINED = {
+    "ranks": "Truths drawn from the prior must stand at uniform ranks in their posteriors "
+    "(simulation-based calibration, Talts et al. 2018). Measured is the Kolmogorov–Smirnov "
+    "distance; expected and error are its mean and scatter for a sound programme.",
+    "coverage": "A 68 % interval must hold the truth 68 times in 100.",
+    "false alarms": "Among stars without a companion, a false-alarm probability below p must "
+    "come up with probability p.",
+    "completeness": "Companions must be found as often as the detection limits of the same data "
+    "promise.",
+}
+
+PICTURES = {
+    "ranks": ("ranks", "Ranks of the truths", "How far the ranks of the truths stray from uniform"),
+    "false alarms": (
+        "false_alarms",
+        "False alarms",
+        "Share of stars without a companion that reach a stated false-alarm probability",
+    ),
+    "completeness": (
+        "reliability",
+        "Promised and found",
+        "Share of companions found against the promise of the limits; coverage of the intervals",
+    ),
+}
+"""Group of checks → file name, title and description of its picture."""
+
+
+def validation_json(validation: Validation) -> dict[str, Any]:
+    """Build the content of ``validation.json``."""
+    plan = validation.plan
+    return {
+        "amibayes": __version__,
+        "seed": validation.seed,
+        "plan": plan.name,
+        "passed": validation.passed,
+        "n_trials": len(validation.kind),
+        "settings": [
+            {
+                "filter": s.filter,
+                "n_groups": s.n_groups,
+                "n_integrations": s.n_integrations,
+                "n_calibrators": s.n_calibrators,
+            }
+            for s in plan.settings
+        ],
+        "field_mas": list(FIELD_MAS),
+        "contrasts": {kind: list(limits) for kind, limits in RANGES.items()},
+        "null_draws": plan.null_draws,
+        "alpha": plan.alpha,
+        "checks": [_check_json(check) for check in validation.checks],
+        "trials": _trials_json(validation),
+    }
+
+
+def _check_json(check: Check) -> dict[str, Any]:
+    return {
+        "group": check.group,
+        "name": check.name,
+        "n": check.n,
+        "measured": number(check.measured),
+        "expected": number(check.expected),
+        "error": number(check.error),
+        "p_value": float(check.p_value),
+        "passed": check.passed,
+    }
+
+
+def _trials_json(validation: Validation) -> dict[str, Any]:
+    def listed(array: Any) -> Any:
+        return [listed(x) if np.ndim(x) else number(x) for x in array]
+
+    columns = ("false_alarm_probability", "truth", "rank", "covered", "found", "expected")
+    return {"kind": list(validation.kind)} | {
+        name: listed(getattr(validation, name)) for name in columns
+    }
+
+
+def validation_pictures(validation: Validation) -> dict[str, Drawing]:
+    """Draw the pictures, by file name without its ending."""
+    ranks = {kind: validation.rank[validation.of_kind(kind)] for kind in RANGES}
+    coverage = {
+        c.name.replace(" interval of ", " ").removesuffix("_mas").removesuffix("_deg"): (
+            c.expected,
+            c.measured,
+            c.error,
+        )
+        for c in validation.checks
+        if c.group == "coverage"
+    }
+    alone = validation.false_alarm_probability[validation.of_kind("alone")]
+    companions = validation.of_kind(*RANGES)
+    return {
+        "ranks": rank_plot(ranks, ("East", "North", "ln contrast")[: len(RANKED)]),
+        "false_alarms": alarm_plot(alone),
+        "reliability": reliability_plot(
+            validation.expected[companions], validation.found[companions], coverage
+        ),
+    }
+
+
+def validation_page(validation: Validation, figures: dict[str, Figure], folder: str) -> Page:
+    """Lay out ``validation.html``; ``figures`` by file name without its ending."""
+    checks = validation.checks
+    failed = [c for c in checks if not c.passed]
+    sections = [_section(validation, group, figures) for group in EXPLAINED]
+    return Page(
+        "amibayes validate",
+        "Do the numbers mean what they say?",
+        f"{len(validation.kind)} simulated stars from photons to limits, "
+        f"{validation.plan.name} plan, seed {validation.seed}",
+        _statement(len(checks), failed),
+        _tiles(validation),
+        (*sections, _what_was_done(validation, folder)),
+    )
+
+
+def verdict(n_checks: int, failed: list[Check]) -> str:
+    """Say in one sentence how it went."""
+    if not failed:
+        return f"All {n_checks} checks hold."
+    return f"{len(failed)} of {n_checks} checks fail: {'; '.join(c.name for c in failed)}."
+
+
+def _statement(n_checks: int, failed: list[Check]) -> Statement:
+    chance = 1.0 - (1.0 - SURPRISING) ** n_checks
+    return Statement(
+        "none" if not failed else "open",
+        "Sound" if not failed else "Doubtful",
+        verdict(n_checks, failed),
+        (
+            f"Each check fails by chance with probability {SURPRISING:g}; at least one of "
+            f"{n_checks} with {chance:.2g}.",
+        ),
+    )
+
+
+def _tiles(validation: Validation) -> tuple[Fact, ...]:
+    by_name = {c.name: c for c in validation.checks}
+    alarm, found = by_name["share below 0.05"], by_name["the same, near the limit"]
+    wide = by_name["68% interval of separation_mas"]
+    return (
+        Fact("Separations in their 68 % interval", _share(wide)),
+        Fact("Lone stars below a false-alarm probability of 0.05", _share(alarm)),
+        Fact("Companions near the limit that were found", _share(found), _promise(found)),
+    )
+
+
+def _share(check: Check) -> str:
+    if not np.isfinite(check.measured):
+        return f"too few trials ({check.n})"
+    return f"{check.measured:.3f} ± {check.error:.3f}"
+
+
+def _promise(check: Check) -> str:
+    return f"promised: {check.expected:.3f}" if np.isfinite(check.expected) else ""
+
+
+def _section(validation: Validation, group: str, figures: dict[str, Figure]) -> Section:
+    rows = tuple(_row(c) for c in validation.checks if c.group == group)
+    name = PICTURES[group][0] if group in PICTURES else None
+    shown = () if name is None else (figures[name],)
+    caption = f"Checks of {group}"
+    return Section(
+        group.capitalize(),
+        (EXPLAINED[group],),
+        tables=(Table(caption, COLUMNS, rows),),
+        figures=shown,
+    )
+
+
+def _row(check: Check) -> tuple[str, ...]:
+    def shown(x: float) -> str:
+        return f"{x:.3f}" if np.isfinite(x) else "–"
+
+    said = "holds" if check.passed else "FAILS"
+    return (
+        check.name,
+        str(check.n),
+        shown(check.measured),
+        shown(check.expected),
+        shown(check.error),
+        f"{check.p_value:.2g}" if np.isfinite(check.measured) else "–",
+        said if np.isfinite(check.measured) else "too few",
+    )
+
+
+def _what_was_done(validation: Validation, folder: str) -> Section:
+    plan = validation.plan
+    exposures = "; ".join(
+        f"{s.filter}, {s.n_integrations} integrations of {s.n_groups} groups, "
+        f"{s.n_calibrators} calibrator{'s' if s.n_calibrators > 1 else ''}"
+        for s in plan.settings
+    )
+    ranges = "; ".join(f"{kind} {low:g} to {high:g}" for kind, (low, high) in RANGES.items())
+    return Section(
+        "What was done",
+        (
+            "Every star is simulated as NIRISS images of a G2V star of magnitude 6 with photon, "
+            "read and flat noise, jitter and dithers, together with its calibrators; visibilities "
+            "and closure phases with their covariance are extracted from the images and "
+            "calibrated, and the field is searched and weighed by null draws as `amibayes "
+            "search` does. The posterior is integrated directly; the limits are injections.",
+            f"Exposures, in turn: {exposures}. Field: {FIELD_MAS[0]:g} to {FIELD_MAS[1]:g} mas. "
+            f"Contrasts, log-uniform: {ranges}. {plan.null_draws} null draws; detection at "
+            f"{plan.alpha:g}.",
+        ),
+        code=f"amibayes validate --{plan.name} --seed {validation.seed} --out {folder}",
+    )
+
+
+def validation_table(validation: Validation) -> list[str]:
+    """Lay the checks out as lines of text, at most 20."""
+    failed = [c for c in validation.checks if not c.passed]
+    shown = failed or [c for c in validation.checks if c.group != "ranks"]
+    lines = [
+        f"{'check':<52}{'n':>6}{'measured':>10}{'expected':>10}{'error':>8}{'p':>9}",
+        *(
+            f"{c.name:<52}{c.n:>6}{c.measured:>10.3f}{c.expected:>10.3f}{c.error:>8.3f}"
+            f"{c.p_value:>9.2g}"
+            for c in shown[:16]
+        ),
+    ]
+    return [*lines, verdict(len(validation.checks), failed)]

@@ -1,0 +1,140 @@
+"""The validation itself: its checks find what is wrong and pass what is right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from amibayes.inference.limits import DetectionLimit
+from amibayes.validation import QUICK, validate
+from amibayes.validation.plan import RANGES, ValidationPlan
+from amibayes.validation.tally import rate, sum_of_tosses, tally, unequal, uniformity
+from amibayes.validation.trial import chance_to_find
+
+PLAN = replace(QUICK, per_range=100, n_alone=400)
+
+
+def answers(plan: ValidationPlan, seed: int = 1, **spoilt: float):
+    """Answers of a sound programme; ``spoilt`` names what is wrong with it, and how much."""
+    rng = np.random.default_rng(seed)
+    for kind in plan.kinds:
+        alarm = rng.random() ** spoilt.get("alarm", 1.0)
+        if kind == "alone":
+            yield {"false_alarm_probability": alarm}
+            continue
+        rank = rng.random(3) ** np.array([1.0, 1.0, spoilt.get("contrast", 1.0)])
+        chance = rng.random()
+        yield {
+            "false_alarm_probability": alarm,
+            "truth": np.array([100.0, 50.0, 0.01]),
+            "rank": rank,
+            "covered": rng.random((3, 2)) < spoilt.get("coverage", 1.0) * np.array([0.68, 0.95]),
+            "found": rng.random() < chance * spoilt.get("found", 1.0),
+            "expected": chance,
+        }
+
+
+def test_a_sound_programme_passes() -> None:
+    """21 checks at 1e-3 on fixed seeds; 1 of 50 runs may fail one by chance, here none does."""
+    validation = tally(PLAN, 1, list(answers(PLAN)))
+    assert validation.passed, [c for c in validation.checks if not c.passed]
+    assert {c.n for c in validation.checks if c.group == "ranks"} == {100}
+    assert len(validation.of_kind("alone")) == 400
+
+
+@pytest.mark.parametrize(
+    ("fault", "size", "group"),
+    [
+        ("alarm", 1.7, "false alarms"),
+        ("contrast", 2.0, "ranks"),
+        ("coverage", 0.8, "coverage"),
+        ("found", 0.75, "completeness"),
+    ],
+)
+def test_a_fault_is_found_where_it_is(fault: str, size: float, group: str) -> None:
+    validation = tally(PLAN, 1, list(answers(PLAN, 3, **{fault: size})))
+    assert {c.group for c in validation.checks if not c.passed} == {group}
+
+
+def test_few_trials_claim_nothing() -> None:
+    plan = replace(QUICK, per_range=1, n_alone=2)
+    checks = tally(plan, 1, list(answers(plan))).checks
+    assert all(c.passed and np.isnan(c.measured) for c in checks)
+
+
+def test_kinds_take_turns() -> None:
+    kinds = QUICK.kinds
+    assert {k: kinds.count(k) for k in kinds} == dict.fromkeys(RANGES, 8) | {"alone": 32}
+    half = kinds[: len(kinds) // 2]
+    assert half.count("faint") == 4
+    assert half.count("alone") == 16
+
+
+def test_sum_of_tosses() -> None:
+    np.testing.assert_allclose(
+        sum_of_tosses(np.full(300, 0.3)), stats.binom.pmf(np.arange(301), 300, 0.3), atol=1e-13
+    )
+    both = sum_of_tosses(np.array([0.2, 0.9]))
+    np.testing.assert_allclose(both, [0.8 * 0.1, 0.2 * 0.1 + 0.8 * 0.9, 0.2 * 0.9], atol=1e-15)
+
+
+def test_p_values_of_the_checks() -> None:
+    x = (np.arange(50) + 0.5) / 50
+    assert uniformity("g", "n", x).p_value == pytest.approx(1.0, abs=1e-6)
+    assert uniformity("g", "n", 0.5 * x).p_value < 1e-10
+    hits = np.arange(100) < 68
+    assert rate("g", "n", hits, 0.68).p_value == pytest.approx(1.0, abs=1e-9)
+    assert rate("g", "n", hits, 0.5).p_value == stats.binomtest(68, 100, 0.5).pvalue
+    check = unequal("g", "n", hits, np.full(100, 0.5))
+    assert check.p_value == pytest.approx(2.0 * stats.binom.sf(67, 100, 0.5))
+    assert check.error == pytest.approx(0.05)
+
+
+def test_chance_to_find_follows_the_limits() -> None:
+    rho = np.array([50.0, 150.0, 250.0])
+    c50 = np.array([1e-3, 1e-3, np.nan])
+    blank = np.zeros((3, 1))
+    limits = DetectionLimit(
+        "injection", rho, 2.0 * c50, c50, blank[:, 0], 0.01, 0.95, blank, blank, blank
+    )
+    assert chance_to_find(limits, np.array([0.0, 100.0, 1e-3])) == pytest.approx(0.5)
+    assert chance_to_find(limits, np.array([0.0, 100.0, 2e-3])) == pytest.approx(0.95)
+    assert chance_to_find(limits, np.array([60.0, 80.0, 1e-4])) < 1e-3
+    assert np.isnan(chance_to_find(limits, np.array([0.0, 300.0, 1e-3])))
+    assert np.isnan(chance_to_find(limits, np.array([0.0, 200.0, 1e-3])))
+
+
+@pytest.fixture
+def small() -> ValidationPlan:
+    setting = replace(QUICK.settings[0], n_integrations=12)
+    return replace(QUICK, settings=(setting,), per_range=1, n_alone=1, null_draws=300)
+
+
+def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
+    """A run that was stopped after two stars gives the numbers of an undisturbed one."""
+
+    class Stopped(Exception):
+        pass
+
+    def stop(done: int, total: int) -> None:
+        if done == 2:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        validate(small, 5, journal=tmp_path, progress=stop)
+    assert len(list(tmp_path.glob("*/piece-*.npz"))) >= 1
+    seen: list[int] = []
+    resumed = validate(
+        small, 5, journal=tmp_path, resume=True, progress=lambda done, total: seen.append(done)
+    )
+    whole = validate(small, 5)
+    assert seen[0] >= 1
+    assert resumed.kind == whole.kind
+    for name in ("false_alarm_probability", "truth", "rank", "covered", "found", "expected"):
+        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
+    bright = whole.of_kind("bright")[0]
+    assert whole.found[bright] == 1.0
+    assert not list(tmp_path.glob("*/piece-*.npz"))
