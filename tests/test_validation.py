@@ -93,6 +93,13 @@ def test_p_values_of_the_checks() -> None:
     assert check.error == pytest.approx(0.05)
 
 
+def test_mean_and_scatter_of_the_distance() -> None:
+    """The exact distribution at n = 100 is within 2 % of the limit."""
+    check = uniformity("g", "n", np.linspace(0.0, 1.0, 100))
+    assert check.expected == pytest.approx(float(stats.kstwo.mean(100)), rel=0.02)
+    assert check.error == pytest.approx(float(stats.kstwo.std(100)), rel=0.02)
+
+
 def test_chance_to_find_follows_the_limits() -> None:
     rho = np.array([50.0, 150.0, 250.0])
     c50 = np.array([1e-3, 1e-3, np.nan])
@@ -116,14 +123,14 @@ def small() -> ValidationPlan:
 def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
     """A run that was stopped after two stars gives the numbers of an undisturbed one."""
 
-    class Stopped(Exception):
+    class StoppedError(Exception):
         pass
 
     def stop(done: int, total: int) -> None:
         if done == 2:
-            raise Stopped
+            raise StoppedError
 
-    with pytest.raises(Stopped):
+    with pytest.raises(StoppedError):
         validate(small, 5, journal=tmp_path, progress=stop)
     assert len(list(tmp_path.glob("*/piece-*.npz"))) >= 1
     seen: list[int] = []
