@@ -8,7 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from amibayes import __version__
-from amibayes.plots.validation import alarm_plot, rank_plot, reliability_plot
+from amibayes.plots.validation import (
+    alarm_plot,
+    completeness_plot,
+    coverage_plot,
+    rank_plot,
+)
 from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table
 from amibayes.report.result import number
 from amibayes.validation import Check, Validation
@@ -44,10 +49,11 @@ PICTURES = {
         "False alarms",
         "Share of stars without a companion that reach a stated false-alarm probability",
     ),
+    "coverage": ("coverage", "Coverage", "Share of intervals that hold the truth"),
     "completeness": (
-        "reliability",
+        "completeness",
         "Promised and found",
-        "Share of companions found against the promise of the limits; coverage of the intervals",
+        "Share of companions found against the promise of the limits",
     ),
 }
 """Group of checks → file name, title and description of its picture."""
@@ -120,8 +126,9 @@ def validation_pictures(validation: Validation) -> dict[str, Drawing]:
     return {
         "ranks": rank_plot(ranks, ("East", "North", "ln contrast")[: len(RANKED)]),
         "false_alarms": alarm_plot(alone),
-        "reliability": reliability_plot(
-            validation.expected[companions], validation.found[companions], coverage
+        "coverage": coverage_plot(coverage),
+        "completeness": completeness_plot(
+            validation.expected[companions], validation.found[companions]
         ),
     }
 
@@ -185,14 +192,12 @@ def _promise(check: Check) -> str:
 
 def _section(validation: Validation, group: str, figures: dict[str, Figure]) -> Section:
     rows = tuple(_row(c) for c in validation.checks if c.group == group)
-    name = PICTURES[group][0] if group in PICTURES else None
-    shown = () if name is None else (figures[name],)
     caption = f"Checks of {group}"
     return Section(
         group.capitalize(),
         (EXPLAINED[group],),
         tables=(Table(caption, COLUMNS, rows),),
-        figures=shown,
+        figures=(figures[PICTURES[group][0]],),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from amibayes.cli import main
 from amibayes.inference.limits import DetectionLimit
 from amibayes.validation import QUICK, validate
 from amibayes.validation.plan import RANGES, ValidationPlan
@@ -120,6 +121,7 @@ def small() -> ValidationPlan:
     return replace(QUICK, settings=(setting,), per_range=1, n_alone=1, null_draws=300)
 
 
+@pytest.mark.slow
 def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
     """A run that was stopped after two stars gives the numbers of an undisturbed one."""
 
@@ -145,3 +147,28 @@ def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
     bright = whole.of_kind("bright")[0]
     assert whole.found[bright] == 1.0
     assert not list(tmp_path.glob("*/piece-*.npz"))
+
+
+def test_command_writes_page_pictures_and_numbers(small, tmp_path, monkeypatch, capsys) -> None:
+    import json
+
+    monkeypatch.setattr("amibayes.validation.QUICK", small)
+    out = tmp_path / "out"
+    assert main(["validate", "--out", str(out), "--seed", "5", "--quiet"]) == 0
+    content = json.loads((out / "validation.json").read_text())
+    assert content["n_trials"] == 4
+    assert len(content["checks"]) == 21
+    assert content["trials"]["found"].count(None) == 1
+    page = (out / "validation.html").read_text()
+    assert page.count("data:image/png") == 4
+    assert "amibayes validate --quick --seed 5" in page
+    assert {p.name for p in out.iterdir()} == {
+        "validation.json",
+        "validation.html",
+        "ranks.png",
+        "coverage.png",
+        "false_alarms.png",
+        "completeness.png",
+    }
+    assert main(["validate", "--out", str(out), "--quiet"]) == 2
+    assert "--overwrite" in capsys.readouterr().err

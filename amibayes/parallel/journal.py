@@ -11,6 +11,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -68,8 +69,10 @@ class Journal:
         return arrays
 
     def remove(self) -> None:
-        """Forget all pieces of this job."""
+        """Forget all pieces of this job; a folder of journals that is empty then goes too."""
         shutil.rmtree(self.path, ignore_errors=True)
+        with suppress(OSError):
+            self.path.parent.rmdir()
 
     def _file(self, index: int) -> Path:
         return self.path / f"piece-{index:06d}.npz"

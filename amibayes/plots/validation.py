@@ -32,13 +32,14 @@ def rank_plot(ranks: Mapping[str, FloatArray], names: Sequence[str]) -> Figure:
         One panel for each quantity: share of ranks below each value, less that value. The
         band holds 95 % of the curves of a sound programme, whole (Kolmogorov–Smirnov).
     """
-    figure = new_figure(3.6, 3.4 * len(names))
-    axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    figure = new_figure(0.9 + 2.1 * len(names))
+    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for k, (ax, name) in enumerate(zip(axes, names, strict=True)):
         for (kind, values), colour, dash in zip(ranks.items(), SERIES, DASHES, strict=False):
             _wander(ax, values[:, k], colour, dash, f"{kind} ({len(values)})")
-        ax.set(title=name, xlabel="Rank of the truth", xlim=(0.0, 1.0))
-    axes[0].set_ylabel("Share below, less uniform")
+        ax.set(title=name, xlim=(0.0, 1.0))
+    figure.supylabel("Share of ranks below, less that of a uniform distribution", fontsize=11.0)
+    axes[-1].set_xlabel("Rank of the truth in its posterior")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure
@@ -74,25 +75,38 @@ def alarm_plot(probability: FloatArray) -> Figure:
 
 
 @styled()
-def reliability_plot(
-    chance: FloatArray, found: FloatArray, coverage: Mapping[str, tuple[float, float, float]]
-) -> Figure:
-    """Draw what was found against what the limits promised, and the coverage of intervals.
+def completeness_plot(chance: FloatArray, found: FloatArray) -> Figure:
+    """Draw the share of companions found against what the limits promised.
 
     Parameters
     ----------
     chance, found : (n,) array
         Stated probability that each companion is found; 1 where it was.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        In bins of the promise; the error bars are those of the promise.
+    """
+    figure = new_figure(4.8, 5.4)
+    _promised(figure.subplots(), chance, found)
+    return figure
+
+
+@styled()
+def coverage_plot(coverage: Mapping[str, tuple[float, float, float]]) -> Figure:
+    """Draw how many intervals hold the truth.
+
+    Parameters
+    ----------
     coverage : mapping of str to (stated, measured, error)
 
     Returns
     -------
     matplotlib.figure.Figure
     """
-    figure = new_figure(4.4, 9.0)
-    left, right = figure.subplots(1, 2)
-    _promised(left, chance, found)
-    _covered(right, coverage)
+    figure = new_figure(0.9 + 0.45 * len(coverage))
+    _covered(figure.subplots(), coverage)
     return figure
 
 
@@ -108,7 +122,6 @@ def _wander(ax: Axes, ranks: FloatArray, colour: str, dash: str, label: str) -> 
 
 
 def _promised(ax: Axes, chance: FloatArray, found: FloatArray) -> None:
-    """Draw bins of equal width; their error bars are those of the promise."""
     known = np.isfinite(chance)
     chance, found = chance[known], found[known]
     place = np.clip((chance * N_BINS).astype(int), 0, N_BINS - 1)
@@ -134,5 +147,5 @@ def _covered(ax: Axes, coverage: Mapping[str, tuple[float, float, float]]) -> No
         ax.errorbar(measured, k, xerr=error, fmt="o", color=BLUE, capsize=3)
     ax.set_yticks(range(len(coverage)), list(coverage))
     ax.invert_yaxis()
-    ax.set_xlim(0.4, 1.02)
+    ax.set_xlim(0.3, 1.03)
     ax.set_xlabel("Share of intervals that hold the truth (bar: stated)")
