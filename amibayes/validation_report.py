@@ -14,8 +14,8 @@ from amibayes.plots.validation import (
     coverage_plot,
     rank_plot,
 )
+from amibayes.report.common import number
 from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table
-from amibayes.report.result import number
 from amibayes.validation import Check, Validation
 from amibayes.validation.plan import FIELD_MAS, RANGES
 from amibayes.validation.tally import SURPRISING

@@ -68,10 +68,10 @@ def test_few_trials_claim_nothing() -> None:
 
 def test_kinds_take_turns() -> None:
     kinds = QUICK.kinds
-    assert {k: kinds.count(k) for k in kinds} == dict.fromkeys(RANGES, 8) | {"alone": 32}
+    assert {k: kinds.count(k) for k in kinds} == dict.fromkeys(RANGES, 8) | {"alone": 24}
     half = kinds[: len(kinds) // 2]
     assert half.count("faint") == 4
-    assert half.count("alone") == 16
+    assert half.count("alone") == 12
 
 
 def test_sum_of_tosses() -> None:
@@ -106,7 +106,23 @@ def test_chance_to_find_follows_the_limits() -> None:
     c50 = np.array([1e-3, 1e-3, np.nan])
     blank = np.zeros((3, 1))
     limits = DetectionLimit(
-        "injection", rho, 2.0 * c50, c50, blank[:, 0], 0.01, 0.95, blank, blank, blank
+        method="injection",
+        separation_mas=rho,
+        contrast=2.0 * c50,
+        contrast_50=c50,
+        log_error=blank[:, 0],
+        log_error_50=blank[:, 0],
+        spread=np.zeros((3, 3)),
+        by_detection=np.zeros(3, dtype=bool),
+        ambiguous=blank[:, 0],
+        threshold=15.0,
+        false_positive_rate=0.01,
+        false_positives=(1, 100),
+        completeness=0.95,
+        level=blank,
+        trials=blank.astype(int),
+        detected=blank.astype(int),
+        located=blank.astype(int),
     )
     assert chance_to_find(limits, np.array([0.0, 100.0, 1e-3])) == pytest.approx(0.5)
     assert chance_to_find(limits, np.array([0.0, 100.0, 2e-3])) == pytest.approx(0.95)

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXAMPLES
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
-        "--quick", action="store_true", help="56 stars, two minutes at most (the default)"
+        "--quick", action="store_true", help="48 stars, two minutes at most (the default)"
     )
     size.add_argument("--full", action="store_true", help="1440 stars, an hour of one core")
     common.add_seed_option(parser)

@@ -34,6 +34,8 @@ RANKED = ("east_mas", "north_mas", "ln_contrast")
 COVERED = ("separation_mas", "position_angle_deg", "delta_mag")
 LEVELS = (0.68, 0.95)
 
+TRIALS_PER_CELL = 64
+
 Piece = tuple[int, str, np.random.SeedSequence]
 """Number of the trial, kind, and its randomness."""
 
@@ -120,8 +122,10 @@ def _analysed(
     if truth is None:
         return answer
     grid = grid_posterior(result.likelihood, prior)
-    limits = detection_limit(result, weight, np.random.default_rng(seeds[1]))
-    found = bool(weight.detected) and _near(result, truth)
+    limits = detection_limit(
+        result, weight, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
+    )
+    found = bool(weight.detected) and (_near(result, truth) or _anywhere(limits, truth))
     return answer | {
         "truth": truth,
         "rank": _ranks(grid, truth),
@@ -136,6 +140,12 @@ def _near(result: SearchResult, truth: FloatArray) -> bool:
     c = result.companion
     away = np.hypot(c.east_mas - truth[0], c.north_mas - truth[1])
     return bool(away < 0.5 * resolution_mas(result.likelihood))
+
+
+def _anywhere(limits: DetectionLimit, truth: FloatArray) -> bool:
+    """Whether the limits count a companion there as found wherever it is seen."""
+    nearest = np.abs(limits.separation_mas - np.hypot(truth[0], truth[1])).argmin()
+    return bool(limits.by_detection[nearest])
 
 
 def _ranks(grid: GridPosterior, truth: FloatArray) -> list[float]:
