@@ -1,0 +1,115 @@
+"""What the documentation says exists, and what exists is in the documentation."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import amibayes
+from amibayes.cli.main import COMMANDS, build_parser
+from amibayes.job import SearchOptions
+from amibayes.pipeline import search_companion
+from amibayes.report import result_json
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+PAGES = [p for p in sorted(DOCS.rglob("*.md")) if not p.relative_to(DOCS).parts[0].startswith("_")]
+FREE_FORM = {"convergence", "prior", "timing_s"}
+"""Objects of result.json whose keys are parameters of the model, or stages."""
+
+
+@pytest.fixture(scope="module")
+def generate() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(DOCS / "generate.py")))
+
+
+def test_the_reference_of_python_lists_what_is_public_and_nothing_else() -> None:
+    text = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\.\. auto\w+:: amibayes\.(\w+)$", text, re.MULTILINE)
+    assert sorted(listed) == sorted(amibayes.__all__)
+
+
+def options_of(command: str, generate: SimpleNamespace) -> argparse.ArgumentParser:
+    return generate.child(build_parser(command), command)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_reference_of_commands_holds_every_option(
+    command: str, generate: SimpleNamespace
+) -> None:
+    parser = options_of(command, generate)
+    page = generate.page(parser, command, COMMANDS[command])
+    for option in parser._option_string_actions:
+        assert option in page
+    assert "%(default)s" not in page
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda p: p.name)
+def test_every_option_that_a_page_tells_to_use_exists(
+    page: Path, generate: SimpleNamespace
+) -> None:
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for command, rest in re.findall(r"\bamibayes ([a-z]+) ([^`\n]*)", text):
+        if command in COMMANDS:
+            known = options_of(command, generate)._option_string_actions
+            for option in re.findall(r"(?<!\S)--[a-z][a-z-]*", rest):
+                assert option in known, f"{page.name}: amibayes {command} {option}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(DOCS)))
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if "_generated/" in p.read_text()], ids=str)
+def test_pictures_are_those_that_a_script_makes(page: Path) -> None:
+    scripts = {"tutorial": "tutorial.py", "gallery": "gallery.py", "statistics": "figures.py"}
+    pictures = ROOT / "amibayes" / "pictures.py"
+    for folder, name in re.findall(r"_generated/(\w+)/(\w+)\.png", page.read_text("utf-8")):
+        code = (DOCS / scripts[folder]).read_text("utf-8") + pictures.read_text("utf-8")
+        assert name in code, f"{page.name}: {folder}/{name}.png"
+
+
+def keys_of(content: object) -> set[str]:
+    if isinstance(content, list):
+        return set().union(*(keys_of(item) for item in content)) if content else set()
+    if not isinstance(content, dict):
+        return set()
+    nested = [keys_of(value) for key, value in content.items() if key not in FREE_FORM]
+    return set(content).union(*nested)
+
+
+def test_every_key_of_the_result_is_explained() -> None:
+    data = ROOT / "examples" / "data"
+    options = SearchOptions(null_draws=1000, separation_mas=(94.0, 200.0))
+    report = search_companion([data / "target.oifits"], sorted(data.glob("cal*.oifits")), options)
+    page = (DOCS / "reference" / "result_json.md").read_text(encoding="utf-8")
+    words = set(re.findall(r"\w+", page.split("## An example")[0]))
+    missing = keys_of(result_json(report)) - words
+    assert not missing
+
+
+def test_the_mask_of_the_how_to_is_one() -> None:
+    mine = amibayes.load_instrument(DOCS / "howto" / "my_mask.toml", "K")
+    assert mine.mask.n_baselines == 15
+    assert mine.mask.non_redundant
+
+
+@pytest.mark.slow
+def test_the_tutorial_finds_its_companion(tmp_path: Path) -> None:
+    subprocess.run(
+        [sys.executable, "-W", "error", str(DOCS / "tutorial.py"), str(tmp_path)],
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
+    )
+    for name in ("map", "fit", "null", "corner", "limits"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
