@@ -42,6 +42,7 @@ html_theme = "furo"
 html_title = f"amibayes {release}"
 html_static_path = ["static"]
 html_css_files = ["amibayes.css"]
+html_extra_path = ["_generated/report"]
 html_copy_source = False
 html_show_sphinx = False
 
