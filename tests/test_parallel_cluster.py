@@ -104,6 +104,29 @@ def test_piece_that_kills_its_workers_is_one_line(
     executor.close()
 
 
+class _Late:
+    """A future that ends just when the patience of one look does."""
+
+    def __init__(self) -> None:
+        self._looks = 0
+
+    def done(self) -> bool:
+        return self._looks > 0
+
+    def result(self, timeout: float | None) -> int:
+        self._looks += 1
+        if timeout is not None:
+            raise TimeoutError
+        return 7
+
+
+def test_piece_that_ends_when_patience_does_is_no_error() -> None:
+    executor = object.__new__(DaskExecutor)
+    executor._distributed = type("distributed", (), {"KilledWorker": RuntimeError})
+    executor._alone = lambda since: None
+    assert executor._result(_Late()) == 7
+
+
 def test_scheduler_that_does_not_answer_is_one_line() -> None:
     started = time.monotonic()
     with pytest.raises(RunError, match="no dask scheduler answers"):

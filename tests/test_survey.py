@@ -20,6 +20,7 @@ from amibayes.plots.survey import Found, LimitCurve, survey_plot
 from amibayes.survey import read_targets
 
 TRUTH = [110.0, -75.0, 0.02]
+CLOSED = ("--method", "absil", "--separations", 5, "--null-draws", 0, "--observables", "cp")
 QUICK = ("--no-posterior", "--null-draws", 2000, "--no-limits", "--separation", "50:400")
 
 
@@ -89,7 +90,7 @@ def test_a_survey_does_what_it_can_and_says_what_it_could_not(survey, tmp_path, 
 def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
     survey, tmp_path, capsys
 ) -> None:
-    words = ("search", "--batch", survey, *QUICK, "--quiet")
+    words = ("limits", "--batch", survey, *CLOSED, "--quiet")
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run(*words, "--out", whole, "--workers", 2) == 4
     expected = (whole / "summary.json").read_bytes()
@@ -99,14 +100,14 @@ def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
     for entry in content["targets"][1:]:
         entry["status"] = "pending"
     (cut / "summary.json").write_text(json.dumps(content))
-    before = (cut / "HD_1" / "result.json").stat().st_mtime_ns
-    second = (cut / "single" / "result.json").stat().st_mtime_ns
+    before = (cut / "HD_1" / "limits.json").stat().st_mtime_ns
+    (cut / "single" / "limits.json").unlink()
     assert run(*words, "--out", cut) == 2
     assert run(*words, "--out", cut, "--resume") == 4
     assert (cut / "summary.json").read_bytes() == expected
     assert (cut / "summary.ecsv").read_bytes() == (whole / "summary.ecsv").read_bytes()
-    assert (cut / "HD_1" / "result.json").stat().st_mtime_ns == before
-    assert (cut / "single" / "result.json").stat().st_mtime_ns > second
+    assert (cut / "HD_1" / "limits.json").stat().st_mtime_ns == before
+    assert (cut / "single" / "limits.json").is_file()
     # Other data under the same name are not taken for finished.
     other = simulated(niriss(), TRUTH, np.random.default_rng(99))
     write_oifits(tmp_path / "bin.oifits", other, overwrite=True)
@@ -180,3 +181,18 @@ def test_the_picture_of_few_and_of_many(n: int, tmp_path: Path) -> None:
     found = {"HD 100": Found(120.0, 4.5, 3.0, 0.1), "HD 101": Found(260.0, 5.5, np.nan, np.nan)}
     save(survey_plot(curves, found), tmp_path / "picture.png")
     assert np.array(Image.open(tmp_path / "picture.png")).std() > 1
+
+
+def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
+    out = tmp_path / "out"
+    assert run("limits", "--batch", survey, "--out", out, *CLOSED) == 4
+    assert "limits" in capsys.readouterr().out
+    summary = json.loads((out / "summary.json").read_text())
+    first, second, third, _ = summary["targets"]
+    assert [e["status"] for e in (first, second, third)] == ["done", "done", "failed"]
+    assert first["limits"]["separation_mas"] == pytest.approx(np.linspace(80, 300, 5))
+    curve = first["limits"]["delta_mag_3sigma"]
+    assert first["limit_delta_mag_best"] == max(curve)
+    assert first["limit_delta_mag_worst"] == min(curve)
+    assert Table.read(out / "summary.ecsv")["limit_delta_mag"].unit == "mag"
+    assert (out / "summary.png").is_file()

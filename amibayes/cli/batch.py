@@ -39,6 +39,17 @@ def add_batch_option(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def refuse_none(arguments: argparse.Namespace) -> None:
+    """Refuse a command without targets.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not arguments.targets:
+        raise UsageError("no target given", remedy="name at least one file, or --batch TABLE")
+
+
 @dataclass(frozen=True)
 class Job:
     """One row: its folder's name, and the words of the command as if given for it alone."""

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli import common, data_options
+from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ EXAMPLES = """examples:
   amibayes limits target.oifits --cal cal*.oifits
   amibayes limits calibrated.oifits --separation 50:400 --method candid
   amibayes limits target.oifits --mass-table tracks.ecsv --primary-magnitude 3.2 --workers 4
+  amibayes limits --batch targets.ecsv --workers 4
 """
 
 
@@ -27,8 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``limits``."""
     parser.epilog = EXAMPLES
     parser.add_argument(
-        "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+        "targets", nargs="*", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
     )
+    batch.add_batch_option(parser)
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
@@ -78,16 +80,31 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         metavar="M",
         help="absolute magnitude of the star, for a table of absolute magnitudes",
     )
-    group.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
+    group.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with a run that was cut off; with --batch, leave finished targets",
+    )
     common.add_seed_option(group)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure the limits and write their files; a finished run is told again."""
+    """Measure the limits of one target, or of each of a table; a finished run is told again."""
     common.configure_logging(arguments)
+    if arguments.batch is not None:
+        return batch.run_batch(arguments)
+    from amibayes.report import limits_summary
+
+    content, folder = perform(arguments)
+    common.finish(arguments, content, lambda: limits_summary(content, folder))
+    return 0
+
+
+def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
+    """Measure the limits of one target and write their files, without a word."""
+    batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.files import output_folder
-    from amibayes.report import limits_summary
 
     options = _options(arguments)
     names = _names(options)
@@ -99,8 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.resume and not arguments.overwrite:
             _refuse_other_request(folder / RESULT, request)
         content = _measure(arguments, options, folder, request)
-    common.finish(arguments, content, lambda: limits_summary(content, folder))
-    return 0
+    return content, folder
 
 
 def _names(options: LimitsOptions) -> list[str]:
@@ -192,7 +208,7 @@ def _write(report: LimitsReport, content: object, folder: Path) -> None:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    if not any(folder.iterdir()):
+    if folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()
 
 

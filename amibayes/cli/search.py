@@ -93,8 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str, object]]:
     """Run the main job for one target and write its files, without a word."""
-    if not arguments.targets:
-        raise UsageError("no target given", remedy="name at least one file, or --batch TABLE")
+    batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.files import output_folder
 

@@ -94,10 +94,11 @@ class DaskExecutor:
     def _result(self, future: Any) -> Any:
         alone_since: float | None = None
         while True:
+            settled = future.done()
             try:
-                return future.result(timeout=1.0)
+                return future.result(timeout=None if settled else 1.0)
             except TimeoutError:
-                if future.done():  # the piece's own error, not our impatience
+                if settled:  # the piece's own error, not our impatience
                     raise
             except self._distributed.KilledWorker as error:
                 raise self._lost("a piece killed its worker again and again") from error

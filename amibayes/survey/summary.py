@@ -102,7 +102,9 @@ def _entry(outcome: Outcome) -> Json:
     entry["calibrators"] = [Path(i["path"]).name for i in inputs if i["role"] != "target"]
     entry |= {name: _at(content, path) for name, path, _ in COLUMNS if _has(content, path)}
     entry |= _limit_numbers(content)
-    entry["limits"] = content.get("limits")
+    if "companion_detected" in content:
+        entry["detected"] = content["companion_detected"]
+    entry["limits"] = _limits(content)
     entry["warnings"] = content.get("warnings") or []
     return entry
 
@@ -119,6 +121,23 @@ def _at(content: Json, path: str) -> Any:
     return found
 
 
+def _limits(content: Json) -> Json | None:
+    """What a search says of its limits, or the main curve of ``limits``."""
+    if "delta_mag_3sigma" in content:
+        return {key: content[key] for key in CURVE}
+    return content.get("limits")
+
+
+CURVE = (
+    "method",
+    "observables",
+    "separation_mas",
+    "delta_mag_3sigma",
+    "false_positive_rate",
+    "completeness",
+)
+
+
 def _limit_numbers(content: Json) -> Json:
     """Median, best and worst limit over the separations that have one."""
     curve = _curve(content)
@@ -133,7 +152,7 @@ def _limit_numbers(content: Json) -> Json:
 
 
 def _curve(content: Json) -> LimitCurve | None:
-    limits = content.get("limits")
+    limits = _limits(content)
     if not limits:
         return None
     values = [math.nan if x is None else x for x in limits["delta_mag_3sigma"]]
@@ -163,7 +182,7 @@ def summary_picture(outcomes: Sequence[Outcome]) -> Figure | None:
     done = {o.name: o.content for o in outcomes if o.content is not None}
     drawn = {name: _curve(content) for name, content in done.items()}
     curves = {n: c for n, c in drawn.items() if c is not None and np.isfinite(c.delta_mag).any()}
-    found = {n: _found(c) for n, c in done.items() if _at(c, "significance.detected") is True}
+    found = {n: _found(c) for n, c in done.items() if _at(c, "significance.detected")}
     return survey_plot(curves, found) if curves or found else None
 
 
@@ -219,7 +238,7 @@ def _said(entry: Json) -> str:
 
 def _verdict(entry: Json) -> str:
     verdict = {True: "DETECTED", False: "not detected", None: "not judged"}[entry["detected"]]
-    if entry["detected"] is False or entry["separation_mas"] is None:
+    if entry["detected"] is False or entry.get("separation_mas") is None:
         return verdict
     return (
         f"{verdict} at {entry['separation_mas']:.4g} mas, {entry['position_angle_deg']:.1f} deg, "
