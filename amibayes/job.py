@@ -12,6 +12,7 @@ from amibayes.inference.evidence import Method as EvidenceMethod
 from amibayes.inference.grid_posterior import GridPosterior
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.noise import ExtraNoise
+from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import PriorSetting
 from amibayes.inference.results import SearchResult
@@ -108,6 +109,7 @@ class SearchReport:
     warnings: tuple[str, ...]
     grid: GridPosterior | None = None
     evidence: Evidence | None = None
+    noise_posterior: dict[str, NoisePosterior] | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 

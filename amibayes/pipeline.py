@@ -16,8 +16,13 @@ from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_po
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import detection_limit
 from amibayes.inference.model import BinaryModel
-from amibayes.inference.multiplicity import search_second
+from amibayes.inference.multiplicity import TwoCompanions, search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
+from amibayes.inference.noise_marginal import (
+    MarginalLikelihood,
+    NoisePosterior,
+    marginal_likelihood,
+)
 from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
@@ -33,6 +38,9 @@ from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
 from amibayes.parallel import Executor, Journal, Progress
 from amibayes.preparing import Clock, Stage, prepare
+
+MOST_NOISE_SAMPLES = 2000
+"""Samples of the posterior that the noise is averaged over."""
 
 MOST_FIELDS = 3
 """How often the default field is widened."""
@@ -94,11 +102,13 @@ def search_companion(
                     result, weight, streams[2], executor=executor, progress=progress
                 )
         prior = _prior(result, options)
-        grid = _integrated(result, prior, options, clock)
+        two = _second(result, options, clock)
+        averaged, two = noise_averaged(result, two, observables, options)
+        grid = _integrated(averaged, prior, options, clock)
         if options.posterior:
             onward = _Chain(chain, resume, progress)
-            posterior = _sampled(result, prior, grid, streams[1], onward, clock)
-        evidence = _compared(result, prior, grid, options, streams[4], clock)
+            posterior = _sampled(averaged, prior, grid, streams[1], onward, clock)
+        evidence = _compared(averaged, two, prior, grid, options, streams[4], clock)
     cautions = search_cautions(observables, result, noise, weight, posterior)
     return SearchReport(
         options,
@@ -116,8 +126,52 @@ def search_companion(
         (*ready.cautions, *widened, *cautions),
         grid,
         evidence,
+        _noise_posterior(averaged, posterior),
         clock.seconds,
     )
+
+
+def _second(result: SearchResult, options: SearchOptions, clock: Clock) -> TwoCompanions | None:
+    if 2 not in _counts(options):
+        return None
+    with clock.stage("second companion"):
+        return search_second(result)
+
+
+def noise_averaged(
+    result: SearchResult,
+    two: TwoCompanions | None,
+    observables: Observables,
+    options: SearchOptions,
+) -> tuple[SearchResult, TwoCompanions | None]:
+    """Give search and second companion a likelihood averaged over the unknown extra noise.
+
+    Parameters
+    ----------
+    result : SearchResult
+    two : TwoCompanions, optional
+    observables : Observables
+        With the stated errors.
+    options : SearchOptions
+        Without ``extra_noise`` the stated errors are believed, and nothing changes.
+    """
+    if not options.extra_noise:
+        return result, two
+    profile = result.likelihood
+    fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
+    fits += [(two.likelihood, two.theta)] if two else []
+    averaged = marginal_likelihood(profile, observables.only(options.observables), fits)
+    if two is not None:
+        two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
+    return replace(result, likelihood=averaged), two
+
+
+def _noise_posterior(
+    averaged: SearchResult, posterior: Posterior | None
+) -> dict[str, NoisePosterior] | None:
+    if posterior is None or not isinstance(averaged.likelihood, MarginalLikelihood):
+        return None
+    return averaged.likelihood.noise_posterior(posterior.samples[:MOST_NOISE_SAMPLES])
 
 
 @dataclass(frozen=True)
@@ -197,6 +251,7 @@ def _integrated(
 
 def _compared(
     result: SearchResult,
+    two: TwoCompanions | None,
     prior: Prior,
     grid: GridPosterior | None,
     options: SearchOptions,
@@ -214,7 +269,7 @@ def _compared(
             rng,
             companions=counts,
             grid=grid,
-            two=search_second(result) if 2 in counts else None,
+            two=two,
             method=options.evidence_method,
         )
 

@@ -20,7 +20,8 @@ GROUP = "mcmc"
 
 def digest_of(likelihood: Likelihood, prior: Prior, start: FloatArray, seed: int) -> str:
     """Say in short which data, model, prior and start a chain belongs to."""
-    text = repr((likelihood.model, prior, seed, emcee.__version__)).encode()
+    kind = type(likelihood).__name__
+    text = repr((kind, likelihood.model, prior, seed, emcee.__version__)).encode()
     return sha256(text + likelihood.observables.data.tobytes() + start.tobytes()).hexdigest()
 
 

@@ -181,7 +181,7 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
     log_mass, peak = work.masses(cells)
     if not np.isfinite(log_mass).any():
         raise DataError("the likelihood is finite nowhere", source=likelihood.observables.source)
-    while (cut := _to_cut(cells, log_mass, peak - work.best_none, work.fringe_mas, step)).any():
+    while (cut := _to_cut(work, cells, log_mass, work.delta_chi2(peak), step)).any():
         children = cells[cut].halved()
         mass, top = work.masses(children)
         cells = Cells.join(cells[~cut], children)
@@ -198,7 +198,7 @@ def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:
 
 
 def _to_cut(
-    cells: Cells, log_mass: FloatArray, log_gain: FloatArray, fringe_mas: float, step: float
+    work: Integrand, cells: Cells, log_mass: FloatArray, delta_chi2: FloatArray, step: float
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Say which cells are too large for what they hold.
 
@@ -207,10 +207,10 @@ def _to_cut(
     with the separation, not below ρ/2S. What a centre may miss of its cell's peak is
     bounded in the same way, by the half diagonal.
     """
-    gain = 2.0 * np.maximum(log_gain, 0.5)
-    rate = np.maximum(2.0 * np.pi / fringe_mas, 2.0 / cells.centre[0])
+    gain = np.maximum(delta_chi2, 1.0)
+    rate = np.maximum(2.0 * np.pi / work.fringe_mas, 2.0 / cells.centre[0])
     too_large = cells.size * rate * np.sqrt(gain) > step
-    missed = 0.25 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max()
+    missed = work.likelihood.log_loss(0.5 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max())
     density = log_mass - 2.0 * np.log(cells.size)
     below = np.maximum(log_mass - log_mass.max(), density - density.max())
     return np.asarray(too_large & (below > -FLOOR - missed))

@@ -7,6 +7,7 @@ its exact prior probability; nuisance parameters over Gauss–Legendre nodes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import maximum_filter
@@ -140,7 +141,9 @@ class Integrand:
         self.nuisance = self._nuisance()
         self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
         self.log_z_none = log_evidence_none(likelihood, prior, self.single)
-        self.best_none = likelihood.log_norm - 0.5 * self.chi2_single
+        self.best_none = float(single_likelihood(likelihood).log_prob(self.single[None])[0])
+        best = self._best
+        self.most = max(self.chi2_single - float(likelihood.chi2(best[None])[0]), 0.0)
         self.n_evaluations = 0
 
     def _scan(self) -> None:
@@ -177,7 +180,7 @@ class Integrand:
         errors = self.likelihood.errors(best)[3:, 3:]
         return nuisance_nodes(self.prior, np.array([self.single, best[3:]]), errors)
 
-    @property
+    @cached_property
     def _best(self) -> FloatArray:
         """A fit with a companion, from the best position of the linear scan."""
         if not len(self.grid):
@@ -190,30 +193,41 @@ class Integrand:
 
     def log_prob(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
         """Log-likelihood (n, k) at sites (n, 2 + n_nuisance), each with k contrasts (n, k)."""
+        return self.likelihood.log_prob(self._thetas(sites, contrast)).reshape(contrast.shape)
+
+    def _log_prob_at_best_noise(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
+        """The same for one covariance, that of the search: a parabola at small contrast."""
+        chi2 = self.likelihood.chi2(self._thetas(sites, contrast))
+        return np.asarray(-0.5 * chi2).reshape(contrast.shape)
+
+    def _thetas(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
         n, k = contrast.shape
         theta = np.empty((n, k, sites.shape[1] + 1))
         theta[:, :, :2] = sites[:, None, :2]
         theta[:, :, 2] = contrast
         theta[:, :, 3:] = sites[:, None, 2:]
         self.n_evaluations += n * k
-        return self.likelihood.log_prob(theta.reshape(n * k, -1)).reshape(n, k)
+        return theta.reshape(n * k, -1)
 
     def _best_contrast(self, sites: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Most likely contrast (below zero where it is) and its error at sites, (n,) each."""
         n, most = len(sites), self.prior.contrast_max
         bright = [c for c in BRIGHT if c < most]
         trial = np.broadcast_to([0.0, 1e-3, 2e-3, *bright], (n, 3 + len(bright)))
-        value = self.log_prob(sites, trial)
+        value = self._log_prob_at_best_noise(sites, trial)
         best, sigma = _parabola(np.full(n, 1e-3), np.full(n, 1e-3), value[:, :3], np.full(n, 1.0))
         if bright:
             top = value[:, 3:].argmax(axis=1)
             brighter = np.clip(best, 0.0, most)[:, None]
-            exceeds = value[np.arange(n), 3 + top] > self.log_prob(sites, brighter)[:, 0]
+            exceeds = (
+                value[np.arange(n), 3 + top] > self._log_prob_at_best_noise(sites, brighter)[:, 0]
+            )
             best = np.where(exceeds, np.array(bright)[top], best)
         for _ in range(2):
             middle = np.clip(best, sigma, np.maximum(most, sigma))
             points = middle[:, None] + sigma[:, None] * np.array([-1.0, 0.0, 1.0])
-            best, sigma = _parabola(middle, sigma, self.log_prob(sites, points), sigma)
+            value = self._log_prob_at_best_noise(sites, points)
+            best, sigma = _parabola(middle, sigma, value, sigma)
         return best, sigma
 
     def boxes(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
@@ -261,6 +275,11 @@ class Integrand:
         bright = np.log(np.maximum(np.diff(p.contrast_cdf(edges), axis=1), 1e-300))
         log_mass = log_prob + (place[:, None] + bright)[:, None, :]
         return edges, log_mass + self.nuisance.log_weight[:, None], log_prob.max(axis=(1, 2))
+
+    def delta_chi2(self, peak: FloatArray) -> FloatArray:
+        """Δχ² over no companion of cells whose best log-likelihoods are given, (n,)."""
+        gain = self.likelihood.delta_chi2(peak - self.best_none)
+        return np.minimum(gain, max(self.most, 2.0 * float(np.max(peak - self.best_none))))
 
     def masses(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
         """Logarithm of each cell's share of the evidence, and its best log-likelihood."""

@@ -50,7 +50,7 @@ class Likelihood:
 
     def with_model(self, model: BinaryModel) -> Likelihood:
         """Make the likelihood of another model on the same data."""
-        other = object.__new__(Likelihood)
+        other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, model=model)
         return other
 
@@ -75,6 +75,14 @@ class Likelihood:
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
         return self.log_norm - 0.5 * self.chi2(theta)
+
+    def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
+        """Δχ² that goes with a gain in ln L over no companion, (n,)."""
+        return np.asarray(2.0 * log_gain)
+
+    def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
+        """What a Δχ² from the best fit costs in ln L, (n,)."""
+        return np.asarray(0.5 * delta_chi2)
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood (n,) and its gradient (n, n_dim)."""

@@ -9,6 +9,7 @@ import numpy as np
 from amibayes import __version__
 from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
 from amibayes.inference.multiplicity import TwoCompanions
+from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
@@ -17,6 +18,12 @@ from amibayes.job import SearchReport, calibrator_verdicts
 from amibayes.report.common import Json, data_json, inputs_json, number
 from amibayes.report.limits import limits_json
 from amibayes.units import contrast_to_delta_mag
+
+NOISE_KEYS = {
+    "vis2": ("extra_vis2", 1.0),
+    "closure_phase_rad": ("extra_closure_phase_deg", float(np.degrees(1.0))),
+}
+"""Names in ``result.json`` of the kinds of `ExtraNoise`, and their units."""
 
 QUANTITIES = (
     "separation_mas",
@@ -42,13 +49,39 @@ def result_json(report: SearchReport) -> Json:
         "posterior": None if report.posterior is None else _posterior(report, report.posterior),
         "calibration": _calibration(report),
         "limits": None if report.limits is None else limits_json(report.limits),
-        "noise": {
-            "extra_vis2": report.noise.vis2,
-            "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
-        },
+        "noise": _noise(report),
         "evidence": None if report.evidence is None else evidence_json(report.evidence),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
+    }
+
+
+def _noise(report: SearchReport) -> Json:
+    """Extra noise: the most likely, and what the posterior says of it."""
+    found = report.noise_posterior
+    return {
+        "extra_vis2": report.noise.vis2,
+        "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
+        "posterior": None
+        if found is None
+        else {
+            key: _noise_interval(found[name], unit)
+            for name, (key, unit) in NOISE_KEYS.items()
+            if name in found
+        },
+    }
+
+
+def _noise_interval(found: NoisePosterior, unit: float) -> Json:
+    median, lower, upper = (unit * x for x in found.interval(0.68))
+    _, lower95, upper95 = (unit * x for x in found.interval(0.95))
+    return {
+        "median": median,
+        "lower": lower,
+        "upper": upper,
+        "lower_95": lower95,
+        "upper_95": upper95,
+        "probability_errors_right": found.probability_none,
     }
 
 

@@ -14,6 +14,9 @@ from amibayes.inference.significance import LEAST_PROBABILITY, Significance
 from amibayes.job import SearchReport
 from amibayes.report.result import upper_limit
 
+EVEN = 0.5
+"""Probability that the stated errors are right above which nothing is said of extra noise."""
+
 
 def summary(report: SearchReport, folder: Path) -> list[str]:
     """Say the result in at most 20 lines."""
@@ -39,6 +42,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
     lines += _nuisance_lines(result)
+    lines += _noise_lines(report)
     if report.posterior is not None:
         lines += _posterior_lines(report.posterior)
     lines += _upper_limit_lines(report)
@@ -94,6 +98,23 @@ def _nuisance_lines(result: SearchResult) -> list[str]:
         error = np.sqrt(result.theta_covariance[k, k])
         lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")
     return lines
+
+
+def _noise_lines(report: SearchReport) -> list[str]:
+    """What the posterior says of the extra noise, where it says there is some."""
+    found = report.noise_posterior or {}
+    if all(noise.probability_none > EVEN for noise in found.values()):
+        return []
+    names = {"vis2": ("V2", 1.0), "closure_phase_rad": ("deg closure phase", np.degrees(1.0))}
+    parts = []
+    for name, noise in found.items():
+        label, unit = names[name]
+        median, low, high = (unit * x for x in noise.interval())
+        parts.append(
+            f"{median:.2g} +{high - median:.1g} -{median - low:.1g} {label} "
+            f"(errors right: {noise.probability_none:.2g})"
+        )
+    return [f"extra noise {', '.join(parts)}"]
 
 
 def _limit_lines(limits: DetectionLimit) -> list[str]:

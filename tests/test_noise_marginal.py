@@ -1,0 +1,136 @@
+"""The likelihood averaged over its extra noise: exact, calibrated, and sane where χ² is large."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+from scipy.special import logsumexp
+
+from amibayes.covariance import dense_covariance
+from amibayes.inference.grid_posterior import grid_posterior
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.noise import ExtraNoise, add_noise, search_with_noise
+from amibayes.inference.noise_marginal import MOST_INFLATION, RIGHT, marginal_likelihood
+from amibayes.inference.posterior import sample
+from amibayes.inference.priors import Prior
+from amibayes.inference.refine import single_likelihood
+
+FIELD = (50.0, 400.0)
+TRUTH = [150.0, -80.0, 0.02]
+
+
+def understated(theta, factor, rng):
+    """Data whose noise is ``factor`` times the stated errors."""
+    noisy = simulated(niriss(0.005 * factor, 0.3 * factor), theta, rng)
+    return replace(noisy, covariance=niriss().covariance)
+
+
+def averaged(data, field=FIELD):
+    result, _ = search_with_noise(Likelihood(data), field)
+    alone = single_likelihood(result.likelihood)
+    fits = [(result.likelihood, result.theta), (alone, result.single_theta)]
+    return result, marginal_likelihood(result.likelihood, data, fits)
+
+
+@pytest.mark.parametrize("kind", ["assumed", "diagonal"])
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_average_is_the_integral_over_the_noise(kind, factor, rng) -> None:
+    """Against scipy's quadrature of likelihoods whose covariances are made one by one."""
+    data = simulated(niriss(0.005 * factor, 0.3 * factor), TRUTH, rng)
+    data = replace(data, covariance=niriss(covariance=kind).covariance)
+    result, marginal = averaged(data)
+    theta = np.array([result.theta, result.theta + np.array([1.0, 2.0, 5e-4])])
+    x, w = np.polynomial.legendre.leggauss(150)
+    inflation = np.log(MOST_INFLATION) * 0.5 * (1.0 + x)
+    expected = np.zeros(2)
+    for kind_of, typical in (({"vis2"}, 0.005), ({"cp"}, np.radians(0.3))):
+        part = data.only(list(kind_of))
+        name = "vis2" if "vis2" in kind_of else "closure_phase_rad"
+        amounts = [0.0, *(typical * np.sqrt(np.expm1(2.0 * inflation)))]
+        log = np.array(
+            [Likelihood(add_noise(part, ExtraNoise(**{name: a}))).log_prob(theta) for a in amounts]
+        )
+        mass = np.concatenate([[RIGHT], (1.0 - RIGHT) * 0.5 * w])
+        expected += logsumexp(log, axis=0, b=mass[:, None])
+    np.testing.assert_allclose(marginal.log_prob(theta), expected, atol=2e-3)
+
+
+def test_correlated_kinds_share_the_relative_noise(rng) -> None:
+    """The covariance of one block grows by one factor of both kinds' noise."""
+    data = simulated(niriss(covariance="diagonal"), TRUTH, rng)
+    matrix = np.diag(data.covariance.variance)
+    matrix[0, 30] = matrix[30, 0] = 0.3 * np.sqrt(matrix[0, 0] * matrix[30, 30])
+    data = replace(data, covariance=dense_covariance(matrix))
+    _, marginal = averaged(data)
+    (term,) = marginal.terms
+    extra = ExtraNoise(0.005 * np.sqrt(3.0), np.radians(0.3) * np.sqrt(3.0))
+    noisy = Likelihood(add_noise(data, extra))
+    residual = data.data - noisy.predict([TRUTH])[:, 0]
+    found = term.log_likelihoods(residual[:, None], np.array([np.log(2.0)]))[0, 0]
+    assert found == pytest.approx(noisy.log_prob([TRUTH])[0], abs=1e-6)
+
+
+def test_noise_of_the_posterior_is_the_noise_of_the_data() -> None:
+    """Right errors: probably right. Understated by 3: certainly not, and the amount is told."""
+    rng = np.random.default_rng(5)
+    right, amounts = [], []
+    for factor in (1.0, 3.0):
+        for _ in range(12):
+            result, marginal = averaged(understated(TRUTH, factor, rng))
+            scatter = rng.multivariate_normal(result.theta, result.theta_covariance, 50)
+            found = marginal.noise_posterior(scatter)
+            right.append(found["vis2"].probability_none)
+            if factor == 3.0:
+                amounts.append([found[k].interval(0.95) for k in ("vis2", "closure_phase_rad")])
+    assert np.median(right[:12]) > 0.7
+    assert max(right[12:]) < 1e-2
+    truth = np.sqrt(8.0) * np.array([0.005, np.radians(0.3)])
+    inside = (np.array(amounts)[:, :, 1] < truth) & (truth < np.array(amounts)[:, :, 2])
+    # 24 intervals of 95 %: more than 6 missed is a 1e-4 accident.
+    assert (~inside).sum() <= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_intervals_cover_whatever_the_errors_say(factor) -> None:
+    """300 companions; 68 and 95 % intervals of east, north, ln contrast by the exact posterior.
+
+    Right errors must not be over-covered by more than 4 % (the price of asking), understated
+    ones not under-covered; binomial chance of each bound 1e-4.
+    """
+    rng = np.random.default_rng(77)
+    n, ranks, prior = 300, [], Prior(*FIELD, 1e-3, 0.9)
+    for _ in range(n):
+        place = [150.0 + rng.uniform(-20, 20), -80.0 + rng.uniform(-20, 20)]
+        truth = [*place, 0.01 * factor]
+        _, marginal = averaged(understated(truth, factor, rng))
+        grid = grid_posterior(marginal, prior)
+        pairs = zip(
+            ("east_mas", "north_mas", "ln_contrast"), [*place, np.log(truth[2])], strict=True
+        )
+        ranks.append([grid.cdf(name, value) for name, value in pairs])
+    off = np.abs(np.array(ranks) - 0.5)
+    for level in (0.68, 0.95):
+        for inside in (off < 0.5 * level).sum(axis=0):
+            assert stats.binomtest(int(inside), n, level, alternative="less").pvalue > 1e-4
+            above = min(level + 0.04, 0.99)
+            assert stats.binomtest(int(inside), n, above, alternative="greater").pvalue > 1e-4
+
+
+def test_chain_samples_the_average() -> None:
+    """Against the grid posterior of the same average."""
+    result, marginal = averaged(understated(TRUTH, 3.0, np.random.default_rng(8)))
+    prior = Prior(*FIELD)
+    posterior = sample(replace(result, likelihood=marginal), prior, np.random.default_rng(1))
+    grid = grid_posterior(marginal, prior)
+    assert posterior.converged
+    for name in ("east_mas", "north_mas", "contrast"):
+        assert posterior.interval(name)[0] == pytest.approx(
+            grid.interval(name)[0], abs=0.15 * (grid.interval(name)[2] - grid.interval(name)[1])
+        )
+        wide = [p.interval(name)[2] - p.interval(name)[1] for p in (posterior, grid)]
+        assert wide[0] == pytest.approx(wide[1], rel=0.15)
