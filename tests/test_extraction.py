@@ -231,6 +231,9 @@ def test_files_of_one_exposure_are_one(niriss: Instrument) -> None:
     assert rms(change) < 0.5
     turned = replace(halves[1], orientation=Orientation(0.5, -1))
     assert len(extract_all([halves[0], turned])) == 2
+    stars = [replace(h, header={"TARGPROP": n}) for h, n in zip(halves, "AB", strict=True)]
+    assert [e.observables.setups[0].target for e in extract_all(stars)] == ["A", "B"]
+    assert len(extract_all([stars[0], stars[0]])) == 1
 
 
 def test_oifits_keeps_everything(niriss: Instrument, tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ from amibayes.extraction.options import ExtractOptions, Method
 from amibayes.extraction.response import off_axis_response
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import Source, opened
-from amibayes.extraction.table import independent_basis, observables_of
+from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View, look_at
 from amibayes.observables import Observables, join
 from amibayes.optics import FringeBasis
@@ -137,7 +137,13 @@ def extract_all(
     groups: dict[tuple[Any, ...], list[_Part]] = {}
     for part in parts:
         t = part.template
-        key = (t.instrument.upper(), t.filter.upper(), t.orientation, round(t.pixel_scale_rad, 12))
+        key = (
+            target_of(t).casefold(),
+            t.instrument.upper(),
+            t.filter.upper(),
+            t.orientation,
+            round(t.pixel_scale_rad, 12),
+        )
         groups.setdefault(key, []).append(part)
     return [_finished(group, chosen) for group in groups.values()]
 

@@ -58,10 +58,17 @@ def observables_of(
     )
 
 
+def target_of(template: Cube) -> str:
+    """Name of the star as the header has it; empty where it has none."""
+    header = template.header
+    return str(
+        header.get("TARGNAME") or header.get("TARGPROP") or header.get("OBJECT") or ""
+    ).strip()
+
+
 def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) -> Setup:
     mask, header = view.instrument.mask, template.header
     n = mask.n_holes
-    target = str(header.get("TARGNAME") or header.get("TARGPROP") or header.get("OBJECT") or "")
     right, down = (header.get(key) for key in ("TARG_RA", "TARG_DEC"))
     between = np.zeros((n, n, response.shape[1]))
     between[np.arange(n), np.arange(n)] = response[0]
@@ -70,7 +77,7 @@ def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) 
     return Setup(
         f"{template.instrument.upper()}_{view.instrument.bandpass.name}",
         mask.name[:40],
-        target.strip(),
+        target_of(template),
         tuple(f"H{k + 1}" for k in range(n)),
         np.arange(1, n + 1),
         np.array([view.wavelength_m]),
