@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from amibayes.inference.significance import LEAST_PROBABILITY
 from amibayes.report.page import Column, Fact, Figure, Section, Table
-from amibayes.report.statement import field
+from amibayes.report.statement import false_alarm, field
 from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
 
 Json = dict[str, Any]
@@ -70,7 +71,7 @@ def _modes(content: Json) -> tuple[Table, ...]:
 def significance(content: Json, figures: tuple[Figure, ...]) -> Section:
     """Every number of significance, with what it means and what it does not."""
     s = content["significance"]
-    facts = [_false_alarm(s), _local(content)]
+    facts = [_false_alarm(s), *_extrapolated(s), _local(content)]
     if s.get("threshold") is not None:
         facts.append(
             Fact(
@@ -102,12 +103,35 @@ def _false_alarm(s: Json) -> Fact:
         "Share of data sets without a companion, simulated with the noise of these, whose best "
         "position anywhere in the field is as good as that of the data."
     )
-    probability = s["false_alarm_probability"]
-    if probability is None:
-        return Fact("Global false-alarm probability", "not computed", meaning)
-    low, high = s["false_alarm_interval"]
-    bounds = f"95 % interval {chance(low)} to {chance(high)}, {count(s['n_null_draws'], 'draw')}."
-    return Fact("Global false-alarm probability", chance(probability), f"{meaning} {bounds}")
+    if s["false_alarm_probability"] is not None:
+        low, high = s["false_alarm_interval"]
+        meaning += (
+            f" 95 % interval {chance(low)} to {chance(high)}, {count(s['n_null_draws'], 'draw')}."
+        )
+    return Fact("Global false-alarm probability", false_alarm(s), meaning)
+
+
+def _extrapolated(s: Json) -> tuple[Fact, ...]:
+    """What fitted laws say of a statistic that too few draws reach."""
+    laws = s.get("extrapolation")
+    if not laws:
+        return ()
+    pareto, extreme = (_by_law(laws[key]) for key in ("generalised_pareto", "extreme_value"))
+    return (
+        Fact(
+            "Extrapolated false-alarm probability",
+            pareto,
+            "Too few draws reach the statistic to count them. This is a generalised Pareto law "
+            f"of the largest draws; an extreme-value law gives {extreme}. So far out they are "
+            "indications, no more.",
+        ),
+    )
+
+
+def _by_law(probability: float) -> str:
+    if probability < LEAST_PROBABILITY:
+        return f"<\u00a0{chance(LEAST_PROBABILITY)}"
+    return chance(probability)
 
 
 def _local(content: Json) -> Fact:

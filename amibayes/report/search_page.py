@@ -18,8 +18,8 @@ from amibayes.report.page import (
     Table,
     figures_named,
 )
-from amibayes.report.statement import field, sky_of, statement_of
-from amibayes.report.words import chance, count, measured, plain, sentence
+from amibayes.report.statement import false_alarm, field, sky_of, statement_of
+from amibayes.report.words import count, measured, plain, sentence
 
 Json = dict[str, Any]
 
@@ -102,7 +102,6 @@ def _subtitle(content: Json) -> str:
 
 def _tiles(content: Json) -> tuple[Fact, ...]:
     fit, errors = content["fit"], content["fit"]["errors"]
-    probability = content["significance"]["false_alarm_probability"]
     if fit["contrast"] <= 0.0:
         place: tuple[Fact, ...] = ()
     else:
@@ -116,7 +115,7 @@ def _tiles(content: Json) -> tuple[Fact, ...]:
         )
         if not content["significance"]["detected"]:
             place = tuple(Fact(f"{f.name} (best fit)", f.value) for f in place)
-    told = "not computed" if probability is None else chance(probability)
+    told = false_alarm(content["significance"])
     return (*place, Fact("False-alarm probability", told, "by noise, anywhere in the field"))
 
 

@@ -67,15 +67,32 @@ def _chance(content: Json) -> str:
             "alone would look like this."
         )
     low, high = significance["false_alarm_interval"]
-    asked = f"a detection is claimed below {plain(significance['alpha'], 2)}"
+    alpha = plain(significance["alpha"], 2)
+    asked = f"a detection is claimed below {alpha}"
     if significance["detected"] is None:
-        asked = f"too few to tell anything below {plain(significance['alpha'], 2)}"
+        asked = f"too few to tell anything below {alpha}"
+    if low == 0.0:
+        return (
+            f"Not one of {count(draws, 'data set')} simulated without a companion has anything as "
+            f"good anywhere in the field ({field(content)}): the chance of this by noise is "
+            f"below {chance(high)}, with 95 % confidence; {asked}."
+        )
     return (
         "The chance that noise alone gives something as good anywhere in the field "
         f"({field(content)}) is {chance(probability)}, and with 95 % confidence between "
         f"{chance(low)} and {chance(high)}: from the same search in {count(draws, 'data set')} "
         f"simulated without a companion; {asked}."
     )
+
+
+def false_alarm(significance: Json) -> str:
+    """The global false-alarm probability, or what it is below where no draw reaches the data."""
+    if significance["false_alarm_probability"] is None:
+        return "not computed"
+    low, high = significance["false_alarm_interval"]
+    if low == 0.0:
+        return f"<\u00a0{chance(high)}"
+    return chance(significance["false_alarm_probability"])
 
 
 def _others(content: Json) -> str:
