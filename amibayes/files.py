@@ -11,6 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+try:
+    import fcntl
+except ImportError:  # Windows has other locks
+    fcntl = None  # type: ignore[assignment]
+
 from amibayes.errors import RunError, UsageError
 
 
@@ -82,14 +87,56 @@ def sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
-    """Make ``folder`` ready for files called ``names``.
+_held: dict[Path, int] = {}
+"""Folders that this process writes into, each with the handle that locks it."""
+
+
+@contextmanager
+def folders_held() -> Iterator[None]:
+    """Let go, at the end, of the folders that `output_folder` has taken meanwhile."""
+    before = set(_held)
+    try:
+        yield
+    finally:
+        for folder in set(_held) - before:
+            os.close(_held.pop(folder))
+
+
+def _hold(folder: Path) -> None:
+    """Keep other runs out of a folder; the lock ends with this process, however it ends.
 
     Raises
     ------
     UsageError
-        Where one of the files is there already and ``overwrite`` is false, or
-        where ``folder`` is a file or cannot be made.
+        Where another run has it.
+    """
+    key = folder.resolve()
+    if fcntl is None or key in _held:
+        return
+    handle = os.open(key, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise UsageError(
+            "another run is writing here", source=folder, remedy="wait for it, or choose --out"
+        ) from None
+    except OSError:  # a file system without locks: nothing can be known, and work goes on
+        os.close(handle)
+    else:
+        _held[key] = handle
+
+
+def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
+    """Make ``folder`` ready for files called ``names``, and keep other runs out of it.
+
+    The lock is released by `folders_held`, or with the process.
+
+    Raises
+    ------
+    UsageError
+        Where one of the files is there already and ``overwrite`` is false, where another
+        run has the folder, or where it is a file, cannot be made or not be written into.
     """
     path = Path(folder)
     try:
@@ -98,6 +145,9 @@ def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> P
         raise UsageError(
             f"cannot be made a folder: {error.strerror}", source=path, remedy="choose another --out"
         ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError("cannot be written into", source=path, remedy="choose another --out")
+    _hold(path)
     present = [name for name in names if (path / name).exists()]
     if present and not overwrite:
         raise UsageError(

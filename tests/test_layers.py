@@ -48,6 +48,7 @@ LAYERS = [
     "pictures",
     "report",
     "vetting_report",
+    "checkup",
     "survey",
     "validation_report",
     "cli",

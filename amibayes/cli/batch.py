@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from amibayes.cli import common
 from amibayes.errors import AmibayesError, DataError, UsageError
+from amibayes.files import folders_held
 
 if TYPE_CHECKING:
     from amibayes.survey import Outcome, SurveyTarget
@@ -268,7 +269,8 @@ def _one(command: str, job: Job) -> str:
         return job.error
     common.configure_logging(job.arguments)
     try:
-        importlib.import_module(f"amibayes.cli.{command}").perform(job.arguments)
+        with folders_held():
+            importlib.import_module(f"amibayes.cli.{command}").perform(job.arguments)
     except AmibayesError as error:
         return str(error)
     except MemoryError as error:

@@ -36,6 +36,11 @@ def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
     group.add_argument(
         "--overwrite", action="store_true", help="replace results that are there already"
     )
+    add_speech_options(group)
+
+
+def add_speech_options(group: argparse._ActionsContainer) -> None:
+    """Add ``--json`` and how much is said."""
     group.add_argument(
         "--json",
         action="store_true",

@@ -6,8 +6,11 @@ import argparse
 import difflib
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 from amibayes import __version__
@@ -24,8 +27,17 @@ COMMANDS = {
     "simulate": "make the images that the telescope would record of a scene",
     "validate": "check on simulated exposures that the numbers mean what they say",
     "plan": "groups, integrations and time of an exposure, and what it lets one see",
+    "demo": "simulate, extract, calibrate and search in under a minute, with a report to open",
+    "doctor": "say what this installation has: versions, libraries, cores, speed",
+    "completion": "print what makes a shell complete commands and options",
 }
 """Command name → one line of help; the module of the same name holds the command."""
+
+EXAMPLES = """examples:
+  amibayes demo
+  amibayes search target.oifits --cal cal*.oifits
+  amibayes search --help
+"""
 
 
 class Parser(argparse.ArgumentParser):
@@ -37,9 +49,8 @@ class Parser(argparse.ArgumentParser):
 
     def _suggestion(self, message: str) -> str:
         known = [*self._option_string_actions, *COMMANDS]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                known += [o for p in action.choices.values() for o in p._option_string_actions]
+        for child in command_parsers(self).values():
+            known += list(child._option_string_actions)
         doubtful = ("unrecognized arguments", "argument COMMAND")
         words = message.split() if message.startswith(doubtful) else []
         for word in (w.strip("'\"").split("=")[0] for w in words[2:]):
@@ -50,7 +61,12 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser(command: str | None) -> Parser:
     """Build the parser of all commands; only the arguments of ``command`` are filled in."""
-    parser = Parser(prog="amibayes", description="Bayesian inference for aperture masking.")
+    parser = Parser(
+        prog="amibayes",
+        description="Bayesian inference for aperture masking interferometry.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"amibayes {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, summary in COMMANDS.items():
@@ -67,26 +83,98 @@ def build_parser(command: str | None) -> Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status (0, 2, 3 or 4)."""
+    """Run the command line and return its exit status (0, 2, 3 or 4; audit's 1)."""
     words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with _stopped_politely():
+            status = run_command(words)
+            sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        _abandon_output()
+        return 0
+    except KeyboardInterrupt:
+        print(f"amibayes: interrupted{_way_on(words)}", file=sys.stderr)
+        return 4
+    except Exception as error:
+        if "--debug" in words:
+            raise
+        return _report(error)
+
+
+def run_command(words: list[str]) -> int:
+    """Run one command and give its exit status; its errors are the caller's.
+
+    Parameters
+    ----------
+    words : list of str
+        The command and its arguments.
+    """
+    from amibayes.files import folders_held
+
     command = next((word for word in words if word in COMMANDS), None)
     arguments = build_parser(command).parse_args(words, argparse.Namespace(words=words))
-    try:
-        run = importlib.import_module(f"amibayes.cli.{arguments.command}").run
+    run = importlib.import_module(f"amibayes.cli.{arguments.command}").run
+    with folders_held():
         return int(run(arguments))
-    except AmibayesError as error:
-        if getattr(arguments, "debug", False):
-            raise
-        print(f"amibayes: {error}", file=sys.stderr)
-        return error.exit_status
-    except MemoryError as error:
-        if getattr(arguments, "debug", False):
-            raise
-        print(f"amibayes: not enough memory: {error} (ask for less)", file=sys.stderr)
-        return 4
-    except KeyboardInterrupt:
-        print("amibayes: interrupted (run again with --resume to go on)", file=sys.stderr)
-        return 4
-    except BrokenPipeError:
+
+
+def _report(error: Exception) -> int:
+    """Say in one line what went wrong; give the exit status."""
+    status = 4
+    if isinstance(error, AmibayesError):
+        text, status = str(error), error.exit_status
+    elif isinstance(error, MemoryError):
+        text = f"not enough memory: {error} (ask for less)"
+    elif isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"{where}{error.strerror or error} (--debug shows where)"
+        _abandon_output()
+    else:
+        text = (
+            f"unexpected {type(error).__name__}: {error} (a fault of amibayes: please report it "
+            "with what --debug shows)"
+        )
+    print(f"amibayes: {' '.join(text.split())}", file=sys.stderr)
+    return status
+
+
+@contextmanager
+def _stopped_politely() -> Iterator[None]:
+    """Make a request to end (SIGTERM) as gentle as Ctrl-C: half-written files are removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+def _way_on(words: list[str]) -> str:
+    """Say how to go on, where the command knows how."""
+    command = next((word for word in words if word in COMMANDS), None)
+    if command is None or "--resume" not in _options_of(build_parser(command), command):
+        return ""
+    return " (run again with --resume to go on)"
+
+
+def _options_of(parser: argparse.ArgumentParser, command: str) -> list[str]:
+    return list(command_parsers(parser)[command]._option_string_actions)
+
+
+def command_parsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Give the parser of every command by its name."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return dict(action.choices)
+    return {}
+
+
+def _abandon_output() -> None:
+    """Forget what cannot be printed, or Python would fail over it once more at the end."""
+    try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except (OSError, ValueError):  # standard output is no file, and has no such fault
+        return
