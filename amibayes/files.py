@@ -56,10 +56,15 @@ def _umask() -> int:
 def cannot_write(path: Path, error: OSError) -> RunError:
     """Describe in one line an output that could not be written."""
     return RunError(
-        f"cannot be written: {error.strerror or error}",
+        f"cannot be written: {_reason(error)}",
         source=path,
         remedy="choose a writable folder with space left",
     )
+
+
+def _reason(error: OSError) -> str:
+    """What the system said, without what a library wraps around it."""
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 def write_text(path: str | Path, text: str) -> None:
