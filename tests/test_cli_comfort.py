@@ -56,6 +56,7 @@ def test_the_program_itself_has_help_with_examples(capsys) -> None:
         (["serch", "x"], "search"),
         (["calibarte", "x"], "calibrate"),
         (["demmo"], "demo"),
+        (["search", "x", "--calibration", "wieghted"], "weighted"),
         (["search", "x", "--null-drwas", "3"], "--null-draws"),
         (["search", "x", "--null-drwas=3"], "--null-draws"),
         (["search", "x", "--no-posteriors"], "--no-posterior"),

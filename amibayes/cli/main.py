@@ -6,6 +6,7 @@ import argparse
 import difflib
 import importlib
 import os
+import re
 import signal
 import sys
 import threading
@@ -51,9 +52,13 @@ class Parser(argparse.ArgumentParser):
         known = [*self._option_string_actions, *COMMANDS]
         for child in command_parsers(self).values():
             known += list(child._option_string_actions)
-        doubtful = ("unrecognized arguments", "argument COMMAND")
-        words = message.split() if message.startswith(doubtful) else []
-        for word in (w.strip("'\"").split("=")[0] for w in words[2:]):
+        if choice := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            wrong = [choice[1]]
+            known = [word.strip("' ") for word in choice[2].split(",")]
+        else:
+            wrong = message.removeprefix("unrecognized arguments: ").split()
+            wrong = wrong if message.startswith("unrecognized arguments: ") else []
+        for word in (w.split("=")[0] for w in wrong):
             if word not in known and (close := difflib.get_close_matches(word, known, n=1)):
                 return f" (did you mean {close[0]}?)"
         return " (see --help)"
