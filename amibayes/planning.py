@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import dense_covariance
+from amibayes.errors import UsageError
 from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
@@ -30,6 +31,9 @@ __all__ = ["PAPER", "ContrastCurve", "Expectation", "Plan", "PlanOptions", "expe
 
 DELTA_CHI2 = 9.0
 """3σ of the contrast at a known position."""
+
+MOST_UNCERTAIN_RAD = 1.0
+"""Past this a closure phase may have any value, and linear predictions are void."""
 
 STEP_MAS = 10.0
 """Step of the curve, and of the grid under it; λ/8B is 19 mas or more."""
@@ -95,9 +99,20 @@ def expect(
     Returns
     -------
     Expectation
+
+    Raises
+    ------
+    UsageError
+        Where the light is too faint for closure phases.
     """
-    observables = _observables(plan, detector or PRESETS["paper"])
+    observables = expected_observables(plan, detector or PRESETS["paper"])
     sigma_vis2, sigma_closure = observables.errors
+    if np.median(sigma_closure) > MOST_UNCERTAIN_RAD:
+        raise UsageError(
+            f"closure phases would be uncertain by {np.degrees(np.median(sigma_closure)):.3g} deg: "
+            "read noise drowns the star",
+            remedy="a brighter star or more photons",
+        )
     photons = np.sqrt(1.5) * plan.instrument.mask.n_holes / np.sqrt(plan.total_photons)
     return Expectation(
         float(np.median(sigma_closure)),
@@ -129,7 +144,7 @@ def visibility_covariance(plan: Plan, detector: Detector) -> FloatArray:
     return np.asarray(inverse[:-1, :-1])
 
 
-def _observables(plan: Plan, detector: Detector) -> Observables:
+def expected_observables(plan: Plan, detector: Detector) -> Observables:
     """Give a point source's V² and closure phases with their joint covariance."""
     mask, bandpass = plan.instrument.mask, plan.instrument.bandpass
     closures, _ = closure_matrix(mask.triangles)

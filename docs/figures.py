@@ -5,6 +5,7 @@ python docs/figures.py [FOLDER]
 
 from __future__ import annotations
 
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -124,8 +125,16 @@ def aliases(path: Path) -> None:
     save(detection_map(search(ab.Likelihood(seen), (50.0, 1100.0))), path)
 
 
+def paper_limits(path: Path) -> None:
+    """Contrast curves beside Table 2 of the paper, as the example draws them."""
+    example = Path(__file__).resolve().parent.parent / "examples" / "paper_table2.py"
+    script = runpy.run_path(str(example))
+    script["draw"](script["limits"](), str(path))
+
+
 def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
+    paper_limits(folder / "paper_limits.png")
     closure_correlation(folder / "closure_correlation.png")
     look_elsewhere(folder / "look_elsewhere.png")
     aliases(folder / "aliases.png")
