@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from amibayes.inference.bank import TemplateBank
     from amibayes.inference.evidence import Evidence, weigh_models
     from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
+    from amibayes.inference.injection import Criterion, MeasuredStar, make_criterion, measure_star
     from amibayes.inference.likelihood import Likelihood
     from amibayes.inference.limits import DetectionLimit, detection_limit
     from amibayes.inference.model import BinaryModel
@@ -59,6 +60,7 @@ _HOME = {
     "Calibration": "amibayes.calibration",
     "Companion": "amibayes.inference.results",
     "Cube": "amibayes.cube",
+    "Criterion": "amibayes.inference.injection",
     "DataError": "amibayes.errors",
     "DetectionLimit": "amibayes.inference.limits",
     "Detector": "amibayes.simulation",
@@ -70,6 +72,7 @@ _HOME = {
     "Likelihood": "amibayes.inference.likelihood",
     "LimitsOptions": "amibayes.limits_job",
     "LimitsReport": "amibayes.limits_job",
+    "MeasuredStar": "amibayes.inference.injection",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
     "Observables": "amibayes.observables",
@@ -100,7 +103,9 @@ _HOME = {
     "join": "amibayes.observables",
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
+    "make_criterion": "amibayes.inference.injection",
     "make_plan": "amibayes.planning",
+    "measure_star": "amibayes.inference.injection",
     "measure_limits": "amibayes.limits_job",
     "observables_of": "amibayes.oifits",
     "open_cube": "amibayes.cube",
@@ -129,6 +134,7 @@ __all__ = [
     "BinaryModel",
     "Calibration",
     "Companion",
+    "Criterion",
     "Cube",
     "DataError",
     "DetectionLimit",
@@ -141,6 +147,7 @@ __all__ = [
     "Likelihood",
     "LimitsOptions",
     "LimitsReport",
+    "MeasuredStar",
     "OIFits",
     "OITable",
     "Observables",
@@ -172,8 +179,10 @@ __all__ = [
     "join",
     "load_instrument",
     "load_scene",
+    "make_criterion",
     "make_plan",
     "measure_limits",
+    "measure_star",
     "observables_of",
     "open_cube",
     "open_executor",

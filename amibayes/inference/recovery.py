@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -118,21 +119,66 @@ def _recover_piece(
     theta, nearer, seed = piece
     signal = injected_signal(likelihood, single, theta)
     noise = np.random.default_rng(seed).standard_normal(signal.shape)
-    data = bank.project(signal + noise)
+    found = judge(
+        bank,
+        resolution_mas(likelihood),
+        theta[:, :2],
+        signal + noise,
+        threshold,
+        free_scale=free_scale,
+        nearer=nearer,
+    )
+    return {name: found[name] for name in ("detected", "located")}
+
+
+def judge(
+    bank: TemplateBank,
+    fringe_mas: float,
+    places: FloatArray,
+    white: FloatArray,
+    threshold: float,
+    *,
+    free_scale: bool = False,
+    nearer: FloatArray | None = None,
+) -> dict[str, Any]:
+    """Search data sets that hold a companion each.
+
+    Parameters
+    ----------
+    bank : TemplateBank
+    fringe_mas : float
+        λ/B_max.
+    places : (n, 2) float array
+        east_mas, north_mas of the companions.
+    white : (n_data, n) float array
+        Whitened residuals of the fit without a companion.
+    threshold : float
+        Statistic that counts as a detection.
+    free_scale : bool
+        The statistic is `profiled`, else the gain in χ².
+    nearer : (n,) float array, optional
+        From `nearer_alias` for the places, if it is known already.
+
+    Returns
+    -------
+    dict of (n,) arrays
+        ``detected`` and ``located`` as in `Recovery`, and the ``statistic``.
+    """
+    data = bank.project(white)
     gain, position = bank.largest_gain(data.astype(np.float32))
     statistic = gain
     if free_scale:
         statistic = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
     detected = statistic > threshold
-    fringe = resolution_mas(likelihood)
     found = np.column_stack([bank.grid.east_mas[position], bank.grid.north_mas[position]])
-    right = np.hypot(*(found - theta[:, :2]).T) < 0.5 * fringe
+    right = np.hypot(*(found - places).T) < 0.5 * fringe_mas
     doubtful = np.flatnonzero(detected & ~right)
-    right[doubtful] = _correlation(bank, found[doubtful], theta[doubtful, :2]) > ALIAS
+    right[doubtful] = _correlation(bank, found[doubtful], places[doubtful]) > ALIAS
     if nearer is None:
-        places, which = np.unique(theta[:, :2], axis=0, return_inverse=True)
-        nearer = nearer_alias(bank, fringe, places)[which.ravel()]
-    return {"detected": detected, "located": detected & right & ~ambiguous(nearer, gain)}
+        distinct, which = np.unique(places, axis=0, return_inverse=True)
+        nearer = nearer_alias(bank, fringe_mas, distinct)[which.ravel()]
+    located = detected & right & ~ambiguous(nearer, gain)
+    return {"detected": detected, "located": located, "statistic": statistic}
 
 
 def _correlation(bank: TemplateBank, there: FloatArray, here: FloatArray) -> FloatArray:
