@@ -103,6 +103,11 @@ def test_warnings_say_what_is_in_the_way() -> None:
         ({"magnitude": 6.0, "photons": -1.0}, "photons -1 is not a positive number"),
         ({"magnitude": 99.0, "photons": 1e7}, "not one of a star"),
         ({"magnitude": 0.0, "photons": 1e7}, "the star saturates: "),
+        ({"magnitude": 6.0, "photons": 1e30}, "takes 9.6.*e\\+18 days"),
+        ({"magnitude": 6.0, "time_s": 1e12}, "days"),
+        ({"magnitude": 6.0, "time_s": 1e-3}, "do not hold one integration"),
+        ({"magnitude": 6.0, "photons": 1.0}, "carry no closure phase"),
+        ({"magnitude": 35.0, "photons": 1e8}, "days"),
     ],
 )
 def test_plans_that_cannot_be(request_: dict[str, float], message: str) -> None:
@@ -192,6 +197,8 @@ def test_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFix
         (["--filter", "F430M", "--photons", "1e8", "--mag", "-3"], "the star saturates"),
         (["--filter", "F430M", "--photons", "0", "--mag", "6"], "not a positive number"),
         (["--filter", "F430M", "--mag", "6"], "required"),
+        (["--filter", "F430M", "--mag", "6", "--photons", "1e30"], "days"),
+        (["--filter", "F430M", "--mag", "27", "--time", "1e5"], "read noise drowns the star"),
     ],
 )
 def test_command_refuses_in_one_line(

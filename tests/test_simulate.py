@@ -21,6 +21,7 @@ from amibayes.optics import psf, scene_image
 from amibayes.orientation import Orientation
 from amibayes.scene import Point, Scene
 from amibayes.simulation import Detector, Exposure, simulate
+from amibayes.simulation.exposure import Recorder
 from amibayes.simulation.program import example, read_program
 from amibayes.units import DEGREE, MAS
 
@@ -231,6 +232,37 @@ def test_simulate_in_memory() -> None:
     )
 
 
+def test_run_that_is_cut_off_goes_on_to_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = write(tmp_path)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert main(["simulate", scene, "--out", str(whole), "--quiet"]) == 0
+    calls: list[int] = []
+    real = Recorder.__call__
+
+    def failing(self: Recorder, piece: object) -> object:
+        calls.append(1)
+        if len(calls) == 4:
+            raise MemoryError("as good as a kill")
+        return real(self, piece)
+
+    monkeypatch.setattr(Recorder, "__call__", failing)
+    words = ["simulate", scene, "--out", str(cut), "--quiet"]
+    assert main(words) == 4
+    assert 0 < len(list(cut.glob("*_calints.fits"))) < len(list(whole.glob("*_calints.fits")))
+    begun = len(calls)
+    assert main([*words, "--resume"]) == 0
+    resumed = len(calls) - begun
+    monkeypatch.undo()
+    assert [p.name for p in sorted(cut.iterdir())] == [p.name for p in sorted(whole.iterdir())]
+    for path in whole.iterdir():
+        assert path.read_bytes() == (cut / path.name).read_bytes()
+    # Each integration was simulated once: three pieces before, the rest after.
+    pieces = sum(-(-read_cube(p).n_integrations // 32) for p in whole.glob("*_calints.fits"))
+    assert resumed == pieces - 3
+
+
 def edited(old: str, new: str) -> str:
     assert old in SMALL
     return SMALL.replace(old, new)
@@ -239,17 +271,19 @@ def edited(old: str, new: str) -> str:
 FAULTS = {
     "negative contrast": (edited("contrast = 0.05", "contrast = -0.1"), 3, "contrast"),
     "outside": (edited("= 300.0", "= 3000.0"), 3, "outside the image"),
-    "filter": (edited('filter = "F430M"', 'filter = "F999M"'), 2, "has no filter 'F999M'"),
-    "groups": (edited("n_groups = 4", "n_groups = 1"), 2, "n_groups is 1; a slope needs 2"),
+    "filter": (edited('filter = "F430M"', 'filter = "F999M"'), 3, "niriss has no filter 'F999M'"),
+    "groups": (edited("n_groups = 4", "n_groups = 1"), 3, "n_groups is 1; a slope needs 2"),
     "fraction": (edited("n_groups = 4", "n_groups = 2.5"), 3, "not a whole number"),
-    "saturated": (edited("magnitude = 6.0", "magnitude = -2.0"), 2, "saturates"),
+    "saturated": (edited("magnitude = 6.0", "magnitude = -2.0"), 3, "saturates"),
     "misspelt": (edited("n_groups", "n_gruops"), 3, "did you mean"),
     "unknown table": (edited("[wavefront]", "[wavefonrt]"), 3, "is not known"),
     "no star": (edited("[star]\nmagnitude = 6.0\n", "[sun]\n"), 3, "key 'star' is missing"),
     "no magnitude": (edited("magnitude = 6.0\n", ""), 3, "magnitude' is missing"),
     "not a number": (edited("n_pixels = 32", 'n_pixels = "many"'), 3, "not a whole number"),
-    "detector": (edited("[wavefront]", "[detector]\nread_noise_e = -3.0\n[wavefront]"), 2, "is -3"),
-    "preset": (edited("[wavefront]", '[detector]\npreset = "x"\n[wavefront]'), 2, "no detector"),
+    "detector": (edited("[wavefront]", "[detector]\nread_noise_e = -3.0\n[wavefront]"), 3, "is -3"),
+    "preset": (edited("[wavefront]", '[detector]\npreset = "x"\n[wavefront]'), 3, "no detector"),
+    "no groups": (edited("n_groups = 4", "n_groups = 0"), 3, "n_groups' is 0"),
+    "endless": (edited("n_integrations = 40", "n_integrations = 40000000"), 3, "at most 1000000"),
     "same name": (edited('"HD 1"', '"AB Dor"'), 3, "two stars are called 'AB_Dor_1'"),
     "not TOML": ("[star", 3, "is not valid TOML"),
 }
@@ -266,6 +300,7 @@ def test_fault_of_the_file_is_one_line(
     assert message in shown.err
     assert shown.err.startswith("amibayes: ")
     assert shown.err.count("\n") == 1
+    assert "scene.toml" in shown.err or fault == "same name"
     assert list((tmp_path / "out").glob("*")) == []
 
 
@@ -317,7 +352,8 @@ def test_full_disk_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
     assert ended.returncode == 4
     assert "cannot be written: File too large" in ended.stderr
     assert ended.stderr.count("\n") == 1
-    assert list(out.iterdir()) == []
+    # No part of a file; what is finished is kept for --resume.
+    assert [p.name for p in out.iterdir()] == ["simulate.journal"]
 
 
 MEMORY = """

@@ -20,8 +20,11 @@ from amibayes.cli.common import (
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
+    from amibayes.parallel import Executor, Journals, Progress
     from amibayes.simulation.observe import Shutter
     from amibayes.simulation.program import Program, Shot
+
+JOURNAL = "simulate.journal"
 
 EPILOG = """examples:
   amibayes simulate --example > scene.toml
@@ -41,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--photons", type=positive_float, metavar="N", help="in place of the file's photons"
     )
+    parser.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
     parser.add_argument("--ramps", action="store_true", help="write the reads too (*_ramp.fits)")
     add_seed_option(parser)
     add_parallel_options(parser)
@@ -68,21 +72,47 @@ def run(arguments: argparse.Namespace) -> int:
 def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, Any]]:
     """Take and write the exposures; say what each one is."""
     from amibayes.files import output_folder
-    from amibayes.simulation.observe import ramp_path, write_exposure
+    from amibayes.parallel import Journals, digest
+    from amibayes.simulation.observe import ramp_path
     from amibayes.simulation.program import blaming
 
     names = [shot.file_name for shot in program.shots]
     names += [ramp_path(Path(n)).name for n in names if program.keeps_ramps]
-    folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)
+    overwrite = arguments.overwrite or arguments.resume
+    folder = output_folder(arguments.out, names, overwrite=overwrite)
+    key = digest(program, arguments.seed)
+    journals = Journals(folder / JOURNAL, key, resume=arguments.resume)
     done = []
     with executor_of(arguments) as executor, blaming(arguments.scene):
         for shot, shutter in program.shutters(arguments.seed):
+            path = folder / shot.file_name
             with progress_of(arguments, shot.name, unit="integration") as told:
-                path = folder / shot.file_name
-                history = program.history
-                write_exposure(path, shutter, executor, history=history, progress=told)
+                take(path, shutter, executor, program.history, told, journals)
             done.append(described(shot, shutter, path))
+    journals.remove()
+    if not any((folder / JOURNAL).iterdir()):
+        (folder / JOURNAL).rmdir()
     return done
+
+
+def take(
+    path: Path,
+    shutter: Shutter,
+    executor: Executor,
+    history: tuple[str, ...],
+    told: Progress,
+    journals: Journals,
+) -> None:
+    """Take and write an exposure, unless a run that was cut off has finished it."""
+    from amibayes.simulation.observe import write_exposure
+
+    finished = journals.of(f"{path.stem}-finished")
+    if finished.read(0) is not None and path.is_file():
+        return
+    pieces = journals.of(path.stem)
+    write_exposure(path, shutter, executor, history=history, progress=told, journal=pieces)
+    finished.write(0, {"finished": True})
+    pieces.remove()
 
 
 def described(shot: Shot, shutter: Shutter, path: Path) -> dict[str, Any]:

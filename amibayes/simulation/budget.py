@@ -30,6 +30,12 @@ PAPER_TEMPERATURE_K = 5450.0
 MOST_GROUPS = 800
 """More groups than this are not allowed in a NISRAPID ramp."""
 
+FEWEST_PHOTONS = 100.0
+"""With fewer the error of a closure phase, √1.5·N_holes/√N, is near a radian."""
+
+LONGEST_S = 1e7
+"""Clock time (four months) past which a plan is a slip of the pen."""
+
 MIGRATION_E = PRESETS["realistic"].migration_threshold_e
 """Charge above which new electrons start to go to the neighbours."""
 
@@ -195,7 +201,8 @@ def make_plan(
     Raises
     ------
     UsageError
-        Where a number makes no sense, or two groups saturate.
+        Where a number makes no sense, two groups saturate, or no exposure would be so long
+        or so short.
     """
     rules = options or PlanOptions()
     rate = _rate(instrument, magnitude, count_rate_e_s)
@@ -215,11 +222,31 @@ def _integrations(
 ) -> int:
     if (photons is None) == (time_s is None):
         raise UsageError("give either the photons or the time")
-    if photons is not None:
-        return integrations_for(positive("photons", photons), rate, n_groups, rules.frame_time_s)
-    assert time_s is not None
     clock = (n_groups + 1) * rules.frame_time_s
-    return max(1, math.floor(positive("time", time_s) / clock))
+    if photons is not None:
+        _refuse_dark(positive("photons", photons))
+        n = integrations_for(photons, rate, n_groups, rules.frame_time_s)
+    else:
+        assert time_s is not None
+        n = math.floor(positive("time", time_s) / clock)
+    if n == 0:
+        raise UsageError(
+            f"{time_s:g} s do not hold one integration: a ramp of {n_groups} groups and its reset "
+            f"take {clock:.3g} s"
+        )
+    if n * clock > LONGEST_S:
+        raise UsageError(
+            f"that exposure takes {n * clock / 86400.0:.3g} days",
+            remedy=f"a brighter star, fewer photons, or less than {LONGEST_S:.0e} s",
+        )
+    return n
+
+
+def _refuse_dark(photons: float) -> None:
+    if photons < FEWEST_PHOTONS:
+        raise UsageError(
+            f"{photons:g} photons carry no closure phase", remedy=f"at least {FEWEST_PHOTONS:g}"
+        )
 
 
 def integrations_for(photons: float, rate: float, n_groups: int, frame_time_s: float) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amibayes.errors import UsageError
 from amibayes.optics import ShiftedImage
-from amibayes.parallel import Executor, Progress, child_seeds, run_job, slices
+from amibayes.parallel import Executor, Journal, Progress, child_seeds, run_job, slices
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import read_ramps
 from amibayes.simulation.slopes import SlopeFit
@@ -23,6 +23,10 @@ PIECE = 32
 
 MOST_INTEGRATIONS = 10000
 """More than this does not fit in one JWST exposure."""
+
+
+MOST_SIMULATED = 1_000_000
+"""Integrations of the largest file that is simulated, a hundred full exposures."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,12 @@ class Exposure:
             )
         if self.n_integrations < 1:
             raise UsageError(f"n_integrations is {self.n_integrations}; it must be 1 or more")
+        if self.n_integrations > MOST_SIMULATED:
+            raise UsageError(
+                f"n_integrations is {self.n_integrations:.4g}; at most {MOST_SIMULATED} are "
+                "simulated",
+                remedy="fewer photons or a brighter star",
+            )
         if self.n_pixels < 8:
             raise UsageError(f"n_pixels is {self.n_pixels}; it must be 8 or more")
         for name in ("jitter_rad", "dither_rad"):
@@ -192,6 +202,7 @@ def record(
     seed: np.random.SeedSequence,
     executor: Executor,
     progress: Progress | None = None,
+    journal: Journal | None = None,
 ) -> Iterator[Chunk]:
     """Take the exposure, a few integrations at a time, in order.
 
@@ -207,6 +218,8 @@ def record(
         Where pieces are computed; it changes nothing in the result.
     progress : Progress, optional
         Told, in integrations, after each piece.
+    journal : Journal, optional
+        Keeps finished pieces.
 
     Yields
     ------
@@ -217,7 +230,7 @@ def record(
     children = child_seeds(seed, len(parts))
     pieces = [(jitter[part], child) for part, child in zip(parts, children, strict=True)]
     told = None if progress is None else _counting(progress, recorder.exposure.n_integrations)
-    results = run_job(recorder, pieces, executor, progress=told)
+    results = run_job(recorder, pieces, executor, journal=journal, progress=told)
     for part, result in zip(parts, results, strict=True):
         yield Chunk(
             part.start, result["images"], result["error"], result["dq"], result.get("ramps")

@@ -16,7 +16,7 @@ from amibayes.errors import DataError
 from amibayes.instrument import Instrument, instrument_names, load_instrument
 from amibayes.optics import Wavefront, scene_image
 from amibayes.orientation import Orientation
-from amibayes.parallel import Executor, Progress, SerialExecutor, child_seeds, spawn
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, child_seeds, spawn
 from amibayes.scene import Scene
 from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
 from amibayes.simulation.exposure import (
@@ -141,9 +141,14 @@ class Shutter:
     recorder: Recorder
     noise: np.random.SeedSequence
 
-    def take(self, executor: Executor, progress: Progress | None = None) -> Iterator[Chunk]:
-        """Give the integrations, some at a time, in order."""
-        return record(self.recorder, self.pointings, self.noise, executor, progress)
+    def take(
+        self,
+        executor: Executor,
+        progress: Progress | None = None,
+        journal: Journal | None = None,
+    ) -> Iterator[Chunk]:
+        """Give the integrations, some at a time, in order; a journal keeps what is finished."""
+        return record(self.recorder, self.pointings, self.noise, executor, progress, journal)
 
 
 def open_shutter(
@@ -256,6 +261,7 @@ def write_exposure(
     *,
     history: tuple[str, ...] = (),
     progress: Progress | None = None,
+    journal: Journal | None = None,
 ) -> None:
     """Take an exposure straight into a ``calints`` file, a few integrations at a time.
 
@@ -275,6 +281,8 @@ def write_exposure(
         Lines for the header.
     progress : Progress, optional
         Told how far it is.
+    journal : Journal, optional
+        Keeps finished integrations, for a run that is cut off.
 
     Raises
     ------
@@ -282,7 +290,7 @@ def write_exposure(
         Where a file cannot be written.
     """
     with _files(path, shutter, history) as (cube, ramps):
-        for chunk in shutter.take(executor, progress):
+        for chunk in shutter.take(executor, progress, journal):
             cube.write(chunk.start, chunk.images, chunk.error, chunk.dq)
             if ramps is not None and chunk.ramps is not None:
                 ramps.write("SCI", chunk.start, chunk.ramps)

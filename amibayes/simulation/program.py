@@ -154,7 +154,7 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
     DataError
         Where the file is wrong: it names the key and the fault.
     UsageError
-        Where its numbers cannot be observed.
+        Where the overrides ask for a filter that there is not.
     """
     top = read_toml(path)
     with blaming(str(path)):
@@ -169,13 +169,13 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
 
 @contextmanager
 def blaming(source: str) -> Iterator[None]:
-    """Name the file in errors that do not know it."""
+    """Name the file in errors that do not know it: whatever it asks for, the fault is its own."""
     try:
         yield
     except (DataError, UsageError) as error:
         if error.source is not None:
             raise
-        raise type(error)(error.what, source=source, remedy=error.remedy) from error
+        raise DataError(error.what, source=source, remedy=error.remedy) from error
 
 
 class _Reader:
@@ -194,10 +194,20 @@ class _Reader:
         beside = Path(top.source).parent / self.instrument_name
         source = str(beside) if beside.is_file() else self.instrument_name
         self.source = source
-        self.instrument: Instrument = load_instrument(source, self.filter or None)
+        self.instrument = self._loaded()
         self.preset = self.detector_table.text("preset", "paper")
         self.detector = _detector(self.detector_table, self.preset)
         self.errors = _errors(self.wavefront_table, self.preset)
+
+    def _loaded(self) -> Instrument:
+        """Load the instrument; who named an unknown filter is told so."""
+        try:
+            return load_instrument(self.source, self.filter or None)
+        except UsageError as error:
+            what = f"{self.instrument_name} {error.what}" if self.filter else error.what
+            if self.overrides.filter:
+                raise UsageError(what, source="--filter", remedy=error.remedy) from error
+            raise DataError(what, source=self.top.source, remedy=error.remedy) from error
 
     def star(self, section: Section, *, is_calibrator: bool, number: int = 0) -> list[Shot]:
         """Give the exposures of the target or of a calibrator."""
