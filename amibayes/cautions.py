@@ -11,6 +11,9 @@ from amibayes.inference.significance import Significance
 from amibayes.observables import Observables
 from amibayes.vetting import Vetting, doubts
 
+MOST_NAMED = 3
+"""Outliers that a warning names."""
+
 
 def vetting_cautions(vetting: Vetting | None) -> list[str]:
     """Name the calibrators that vetting dropped, and what it doubts of the kept ones."""
@@ -23,6 +26,23 @@ def vetting_cautions(vetting: Vetting | None) -> list[str]:
         f"calibrator {v.path} {doubt}"
         for v in vetting.calibrators
         for doubt in doubts(v, vetting.alpha)
+    ]
+
+
+def _outliers(result: SearchResult) -> list[str]:
+    """Name the data that a robust search hardly used."""
+    if result.robustness is None or not (outliers := result.robustness.outliers):
+        return []
+    kinds = {"vis2": "V2", "closure_phase": "closure phase"}
+    names = [
+        f"{kinds[o.kind]} {'-'.join(o.stations)} at {o.wavelength_m * 1e6:.3g} um, MJD {o.mjd:.4f} "
+        f"({o.residual:+.1f} sigma, weight {o.weight:.2f})"
+        for o in outliers[:MOST_NAMED]
+    ]
+    more = f" and {len(outliers) - MOST_NAMED} more" if len(outliers) > MOST_NAMED else ""
+    return [
+        f"{len(outliers)} of {len(result.robustness.weights)} data are outliers that lost more "
+        f"than three quarters of their weight: {', '.join(names)}{more}"
     ]
 
 
@@ -52,6 +72,7 @@ def search_cautions(
             f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
             f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
         )
+    found += _outliers(result)
     if posterior is not None and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:

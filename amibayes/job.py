@@ -52,6 +52,8 @@ class SearchOptions:
         False-alarm probability of a detection.
     extra_noise : bool
         Add noise per kind of observable where the residuals ask for it.
+    robust : bool
+        Student-t residuals: data that fit nothing lose their weight.
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
@@ -81,6 +83,7 @@ class SearchOptions:
     null_draws: int = 10_000
     alpha: float = ALPHA
     extra_noise: bool = True
+    robust: bool = False
     posterior: bool = True
     limits: bool = True
     companions: tuple[int, ...] | None = None

@@ -27,6 +27,9 @@ from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
+from amibayes.inference.robust import frame_of
+from amibayes.inference.robust_noise import student_likelihood
+from amibayes.inference.robust_search import search_robust
 from amibayes.inference.search import look_outside, resolves_stars, search
 from amibayes.inference.significance import (
     Significance,
@@ -155,12 +158,17 @@ def noise_averaged(
     options : SearchOptions
         Without ``extra_noise`` the stated errors are believed, and nothing changes.
     """
-    if not options.extra_noise:
+    if not (options.extra_noise or options.robust):
         return result, two
     profile = result.likelihood
     fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
     fits += [(two.likelihood, two.theta)] if two else []
-    averaged = marginal_likelihood(profile, observables.only(options.observables), fits)
+    if result.robustness is not None:
+        averaged = student_likelihood(
+            profile, result.robustness, fits, free_scale=options.extra_noise
+        )
+    else:
+        averaged = marginal_likelihood(profile, observables.only(options.observables), fits)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two
@@ -211,7 +219,9 @@ def search_field(
     likelihood = likelihood.with_model(_model(likelihood, options))
     field, said = options.separation_mas, []
     for _ in range(MOST_FIELDS):
-        if options.extra_noise:
+        if options.robust:
+            result, noise = search_robust(likelihood, field, free_scale=options.extra_noise)
+        elif options.extra_noise:
             result, noise = search_with_noise(likelihood, field)
         else:
             result, noise = search(likelihood, field), ExtraNoise()
@@ -294,19 +304,23 @@ def weigh(
     Whether noise was added depends on the data, and a false companion can hide that it
     should have been: a statistic that does not know the scale needs no such decision.
     """
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
-    free_scale = options.extra_noise
+    likelihood, frame, free_scale = result.likelihood, None, options.extra_noise
+    if result.robustness is not None:
+        # Weights were found with a companion; no companion may be judged by them.
+        base = result.robustness.base
+        likelihood, frame, free_scale = Likelihood(base, likelihood.model), frame_of(base), True
+    bank = TemplateBank(likelihood, result.grid, result.single_theta)
+    residuals = single_likelihood(likelihood).residuals(result.single_theta)
     weight = significance(
         bank,
-        float(bank_statistic(bank, residuals, free_scale=free_scale)[0]),
+        float(bank_statistic(bank, residuals, free_scale=free_scale, frame=frame)[0]),
         options.null_draws,
         rng,
         options.alpha,
         free_scale=free_scale,
+        frame=frame,
         executor=executor,
         progress=progress,
-        journal=journal,
     )
-    field = statistic_field(bank, residuals[:, 0], free_scale=free_scale)
+    field = statistic_field(bank, residuals[:, 0], free_scale=free_scale, frame=frame)
     return replace(weight, field=field)

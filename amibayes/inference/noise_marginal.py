@@ -124,8 +124,9 @@ class NoisePosterior:
 
     def interval(self, level: float = 0.68) -> tuple[float, float, float]:
         """(median, lower, upper) of the extra noise."""
-        rest = 0.5 * (1.0 - level)
-        low, mid, high = self.amount.quantile([rest, 0.5, 1.0 - rest])
+        wanted = np.array([0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level])
+        none = wanted <= self.probability_none
+        low, mid, high = np.where(none, 0.0, self.amount.quantile(wanted))
         return float(mid), float(low), float(high)
 
 
@@ -204,12 +205,13 @@ def marginal_likelihood(
     With probability `RIGHT` the stated errors are right; else the total error has Jeffreys'
     prior of a scale, from the stated error to `MOST_INFLATION` times that.
     """
-    differences = [_residual(likelihood, theta) for likelihood, theta in fits]
-    terms = [_with_nodes(t, differences) for t in _terms(stated.unflagged())]
+    differences = [residual_of(likelihood, theta) for likelihood, theta in fits]
+    terms = [with_nodes(t, differences) for t in _terms(stated.unflagged())]
     return MarginalLikelihood(profile, terms)
 
 
-def _residual(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+def residual_of(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Data minus model (n_data,) at one parameter set (n_dim,), closure phases wrapped."""
     difference = likelihood.observables.data - likelihood.predict(theta[None])[:, 0]
     closure = difference[likelihood.observables.n_vis2 :]
     closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
@@ -217,7 +219,14 @@ def _residual(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
 
 
 def _terms(stated: Observables) -> list[NoiseTerm]:
-    """One term per kind of observable, or one for both where the file correlates them."""
+    return [_term(stated, *parts) for parts in kinds_of(stated)]
+
+
+def kinds_of(stated: Observables) -> list[tuple[str, BoolArray, dict[str, float]]]:
+    """Name, mask (n_data,) and typical errors of data that share their noise.
+
+    One entry for each kind of observable, or one for both where the file correlates them.
+    """
     n = stated.n_vis2
     vis2 = np.arange(stated.covariance.size) < n
     kinds = {"vis2": vis2, "closure_phase_rad": ~vis2}
@@ -227,8 +236,8 @@ def _terms(stated: Observables) -> list[NoiseTerm]:
         if which.any()
     }
     if len(typical) == 2 and not _separate(stated, n):
-        return [_term(stated, vis2 | ~vis2, BOTH, typical)]
-    return [_term(stated, kinds[name], name, {name: typical[name]}) for name in typical]
+        return [(BOTH, vis2 | ~vis2, typical)]
+    return [(name, kinds[name], {name: typical[name]}) for name in typical]
 
 
 def _separate(stated: Observables, n_vis2: int) -> bool:
@@ -238,7 +247,7 @@ def _separate(stated: Observables, n_vis2: int) -> bool:
     return not any(s.any() and not s.all() for s in sides)
 
 
-def _term(stated: Observables, which: BoolArray, kind: str, typical: dict[str, float]) -> NoiseTerm:
+def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, float]) -> NoiseTerm:
     """Whiten some of the data and make their extra noise diagonal, block by block."""
     n = stated.n_vis2
     part = stated.select(which[:n], which[n:])
@@ -282,7 +291,7 @@ def _diagonal(matrix: csr_array) -> tuple[csr_array, FloatArray]:
     return turn, share
 
 
-def _with_nodes(term: NoiseTerm, differences: Sequence[FloatArray]) -> NoiseTerm:
+def with_nodes(term: NoiseTerm, differences: Sequence[FloatArray]) -> NoiseTerm:
     """Gauss–Legendre nodes over what the fits say of the noise."""
     best = [term.best(d) for d in differences]
     error = 1.0 / np.sqrt(2.0 * term.n_independent)

@@ -9,6 +9,7 @@ import numpy as np
 from amibayes.inference.bank import Grid
 from amibayes.inference.detection import candid_n_sigma
 from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.robust import Robustness
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -94,6 +95,9 @@ class SearchResult:
         Best linear contrast and its error at every position.
     global_check : Mode
         What the independent global optimiser found.
+    warnings : tuple of str
+    robustness : Robustness, optional
+        How a robust search treated the data; ``likelihood`` has outliers' errors stretched.
     """
 
     likelihood: Likelihood
@@ -110,6 +114,7 @@ class SearchResult:
     bank_sigma: FloatArray
     global_check: Mode
     warnings: tuple[str, ...] = ()
+    robustness: Robustness | None = None
 
     @property
     def delta_chi2(self) -> float:

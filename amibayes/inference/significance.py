@@ -17,6 +17,7 @@ from scipy import stats
 from scipy.special import gamma, gammaln
 
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.robust import Frame, scores
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
 
@@ -170,20 +171,33 @@ def profiled(gain: FloatArray, chi2: FloatArray, n_data: int) -> FloatArray:
     return np.asarray(-n_data * np.log1p(-np.minimum(gain / chi2, 1.0 - 1e-15)))
 
 
-def bank_statistic(bank: TemplateBank, white: FloatArray, *, free_scale: bool) -> FloatArray:
-    """Statistic of whitened data sets (n_data, n), the observed one as well as null ones."""
-    data = bank.project(white)
+def bank_statistic(
+    bank: TemplateBank, white: FloatArray, *, free_scale: bool, frame: Frame | None = None
+) -> FloatArray:
+    """Statistic of whitened data sets (n_data, n), the observed one as well as null ones.
+
+    With a ``frame`` that of `amibayes.inference.robust.scores`: outliers count no more than
+    their bounded score, in the data and in the null sets.
+    """
+    data = bank.project(_bounded(bank, white, frame))
     gain, _ = bank.largest_gain(data.astype(np.float32))
     if not free_scale:
         return gain
     return profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
 
 
-def statistic_field(bank: TemplateBank, white: FloatArray, *, free_scale: bool) -> FloatArray:
+def _bounded(bank: TemplateBank, white: FloatArray, frame: Frame | None) -> FloatArray:
+    return white if frame is None else scores(frame, bank.project(white))
+
+
+def statistic_field(
+    bank: TemplateBank, white: FloatArray, *, free_scale: bool, frame: Frame | None = None
+) -> FloatArray:
     """Statistic of one whitened data set (n_data,) at every position, (n_grid,).
 
     Its maximum is that of `bank_statistic`.
     """
+    white = _bounded(bank, white[:, None], frame)[:, 0]
     contrast, sigma = bank.scan(white)
     gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
     if not free_scale:
@@ -198,6 +212,7 @@ def null_maxima(
     rng: np.random.Generator,
     *,
     free_scale: bool = False,
+    frame: Frame | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     journal: Journal | None = None,
@@ -211,6 +226,8 @@ def null_maxima(
     rng : numpy.random.Generator
     free_scale : bool
         Use the statistic of `profiled`, for noise whose size was fitted.
+    frame : Frame, optional
+        Use the robust statistic; see `bank_statistic`.
     executor : Executor, optional
         Where it is computed; the result does not depend on it.
     progress : callable, optional
@@ -225,18 +242,23 @@ def null_maxima(
     """
     sizes = [len(range(n_draws)[part]) for part in slices(n_draws, DRAWS_AT_ONCE)]
     pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
-    work = partial(_null_piece, bank, free_scale)
+    work = partial(_null_piece, bank, free_scale, frame)
     executor = executor or SerialExecutor()
     done = run_job(work, pieces, executor, journal=journal, progress=progress)
     return np.concatenate([piece["statistic"] for piece in done])
 
 
 def _null_piece(
-    bank: TemplateBank, free_scale: bool, piece: tuple[np.random.SeedSequence, int]
+    bank: TemplateBank,
+    free_scale: bool,
+    frame: Frame | None,
+    piece: tuple[np.random.SeedSequence, int],
 ) -> dict[str, FloatArray]:
     seed, size = piece
     noise = np.random.default_rng(seed).standard_normal((bank.n_data, size), dtype=np.float32)
-    return {"statistic": bank_statistic(bank, noise.astype(float), free_scale=free_scale)}
+    return {
+        "statistic": bank_statistic(bank, noise.astype(float), free_scale=free_scale, frame=frame)
+    }
 
 
 def significance(
@@ -247,6 +269,7 @@ def significance(
     alpha: float = ALPHA,
     *,
     free_scale: bool = False,
+    frame: Frame | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     journal: Journal | None = None,
@@ -265,7 +288,7 @@ def significance(
     alpha : float
     free_scale : bool
         The size of the noise was fitted: see `profiled`; the statistic has to be so too.
-    executor, progress, journal
+    frame, executor, progress, journal
         As in `null_maxima`.
     """
     null = np.sort(
@@ -274,6 +297,7 @@ def significance(
             n_draws,
             rng,
             free_scale=free_scale,
+            frame=frame,
             executor=executor,
             progress=progress,
             journal=journal,

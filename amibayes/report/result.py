@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
+from amibayes.inference.robust import DEGREES, normal_moments
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchReport, calibrator_verdicts
 from amibayes.report.common import Json, data_json, inputs_json, number
@@ -50,6 +52,7 @@ def result_json(report: SearchReport) -> Json:
         "calibration": _calibration(report),
         "limits": None if report.limits is None else limits_json(report.limits),
         "noise": _noise(report),
+        "robust": _robust(report.result),
         "evidence": None if report.evidence is None else evidence_json(report.evidence),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
@@ -69,6 +72,19 @@ def _noise(report: SearchReport) -> Json:
             for name, (key, unit) in NOISE_KEYS.items()
             if name in found
         },
+    }
+
+
+def _robust(result: SearchResult) -> Json | None:
+    """What Student-t residuals made of the data; null where it was not asked for."""
+    found = result.robustness
+    if found is None:
+        return None
+    return {
+        "degrees_of_freedom": DEGREES,
+        "mean_weight": float(found.weights.mean()),
+        "mean_weight_of_normal_residuals": normal_moments().weight * DEGREES / (DEGREES + 1.0),
+        "outliers": [asdict(outlier) for outlier in found.outliers],
     }
 
 
