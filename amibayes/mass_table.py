@@ -101,14 +101,10 @@ def _read(path: str | Path) -> Table:
     except (OSError, UnicodeDecodeError) as error:
         what = getattr(error, "strerror", None) or "is no text"
         raise DataError(f"cannot be read: {what}", source=path) from error
-    form = "ecsv" if text.startswith("# %ECSV") else "csv"
+    form, options = ("ecsv", {}) if text.startswith("# %ECSV") else ("csv", {"comment": "#"})
     try:
-        return (
-            tables.read(text, format=form, comment="#")
-            if form == "csv"
-            else tables.read(text, format=form)
-        )
-    except (ValueError, KeyError, TypeError) as error:
+        return tables.read([*text.splitlines(), ""], format=form, **options)
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError("is neither an ECSV nor a CSV table", source=path) from error
 
 

@@ -9,9 +9,16 @@ from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.limits import detection_limit, recover
+from amibayes.inference.limits import detection_limit
+from amibayes.inference.logistic import fit_logistic
+from amibayes.inference.recovery import recover
+from amibayes.inference.refine import single_likelihood
 from amibayes.inference.search import search
-from amibayes.inference.significance import null_maxima, significance
+from amibayes.inference.significance import bank_statistic, significance
+from amibayes.job import SearchOptions
+from amibayes.limits_job import LimitsOptions, measure_limits
+from amibayes.oifits import write_oifits
+from amibayes.pipeline import search_field
 from amibayes.units import offset
 
 
@@ -26,38 +33,113 @@ def setting():
     return result, bank, weight, limit
 
 
+def found_by_a_full_search(theta: list[float], rng, threshold: float) -> bool:
+    """Fresh data, a new search of them, its best statistic and the position it reports."""
+    again = search(Likelihood(simulated(niriss(), theta, rng)), (50.0, 400.0))
+    away = np.hypot(again.companion.east_mas - theta[0], again.companion.north_mas - theta[1])
+    return bool(again.bank_delta_chi2.max() > threshold and away < 94.0)
+
+
 def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
-    """1000 fresh companions at c50 and at c95, each found by an independent full search.
+    """Fresh companions at c50 and at c95, each found by an independent full search.
 
     The bounds add the binomial error of the count to what the fit's own error of c50 moves
     (its slope is near 6 per unit of ln c); 4.5 sigma.
     """
     _, _, weight, limit = setting
     rng = np.random.default_rng(3)
-    n = 60
-    k = 3
+    n, k = 60, 3
     for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
-        found = 0
-        for angle in rng.uniform(0, 360, n):
-            east, north = offset(limit.separation_mas[k], angle)
-            data = simulated(niriss(), [float(east), float(north), contrast], rng)
-            again = search(Likelihood(data), (50.0, 400.0))
-            position = int(again.bank_delta_chi2.argmax())
-            away = np.hypot(
-                again.grid.east_mas[position] - east, again.grid.north_mas[position] - north
-            )
-            found += again.bank_delta_chi2.max() > weight.threshold() and away < 94.0
+        places = zip(*offset(limit.separation_mas[k], rng.uniform(0, 360, n)), strict=True)
+        found = sum(
+            found_by_a_full_search([float(e), float(m), contrast], rng, weight.threshold())
+            for e, m in places
+        )
         spread = np.sqrt(n * expected * (1 - expected)) + 6 * 0.25 * limit.log_error_50[k] * n
         assert abs(found - n * expected) < 4.5 * spread
 
 
+@pytest.mark.slow
+def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) -> None:
+    """c50 and c95 of `measure_limits` against the search job's own verdict on 1000 new data sets.
+
+    Each is simulated in the space of the data, read by nothing of the limits, searched as
+    `search_companion` does (extra noise and all), weighed by the statistic without scale, and
+    located by the position that it reports. 4.5 sigma of count and fit together.
+    """
+    write_oifits(tmp_path / "t.oifits", simulated(niriss(), [0.0] * 3, np.random.default_rng(1)))
+    asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=100_000)
+    options = LimitsOptions(asked, observables=("vis2", "cp"), n_separations=8)
+    limit = measure_limits([tmp_path / "t.oifits"], options=options).main.limit
+    rng, k, n = np.random.default_rng(21), 4, 1000
+    for contrast, expected, error in (
+        (limit.contrast_50[k], 0.5, limit.log_error_50[k]),
+        (limit.contrast[k], 0.95, limit.log_error[k]),
+    ):
+        found = 0
+        for angle in rng.uniform(0, 360, n):
+            east, north = (float(x) for x in offset(limit.separation_mas[k], angle))
+            data = simulated(niriss(), [east, north, contrast], rng)
+            result, _, _ = search_field(data, asked)
+            bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+            white = single_likelihood(result.likelihood).residuals(result.single_theta)
+            seen = bank_statistic(bank, white, free_scale=True)[0] > limit.threshold
+            c = result.companion
+            found += bool(seen and np.hypot(c.east_mas - east, c.north_mas - north) < 94.0)
+        slope = 7.0 * expected * (1.0 - expected)
+        spread = np.hypot(np.sqrt(n * expected * (1 - expected)), n * slope * error)
+        assert abs(found - n * expected) < 4.5 * spread
+
+
 def test_false_positive_rate_is_alpha(setting) -> None:
-    _, bank, weight, limit = setting
-    n = 40_000
-    rate = (null_maxima(bank, n, np.random.default_rng(9)) > weight.threshold()).mean()
-    # Both the threshold (20 000 draws) and the count (40 000) scatter.
+    """Noise in the space of the data, templates by finite differences, generalised χ²: no bank.
+
+    Both the threshold (20 000 draws) and the count (20 000) scatter; 4.5 sigma.
+    """
+    result, bank, weight, limit = setting
+    likelihood = result.likelihood
+    covariance, n = likelihood.observables.covariance, 20_000
+    step = 1e-6
+    places = np.column_stack([bank.grid.east_mas, bank.grid.north_mas, np.full(len(bank), step)])
+    alone = likelihood.predict([[100.0, 0.0, 0.0]])
+    templates = (likelihood.predict(places) - alone) / step
+    weighted = covariance.solve(templates)
+    norm = (templates * weighted).sum(axis=0)
+    noise = covariance.draw(np.random.default_rng(9), n)
+    gain = np.maximum(weighted.T @ noise, 0.0) ** 2 / norm[:, None]
+    rate = (gain.max(axis=0) > weight.threshold()).mean()
     sigma = np.sqrt(0.01 * 0.99 * (1 / n + 1 / 20_000))
     assert abs(rate - limit.false_positive_rate) < 4.5 * sigma
+    exceeding, drawn = limit.false_positives
+    assert abs(exceeding / drawn - rate) < 4.5 * sigma
+    low, high = limit.false_positive_interval
+    assert low < exceeding / drawn < high
+
+
+def test_rounds_change_nothing_but_where_trials_go(setting) -> None:
+    *_, limit = setting
+    assert limit.trials.sum() == 6 * 14 * 200
+    middle = np.abs(limit.share - 0.5) < 0.3
+    assert limit.trials[middle].mean() > 1.5 * limit.trials[~middle].mean()
+
+
+def test_spread_over_angles_is_what_injections_at_single_angles_find(setting) -> None:
+    """Limits at single position angles, by many injections at each: their median and 68 %."""
+    result, bank, weight, limit = setting
+    k, rng = 2, np.random.default_rng(12)
+    each = []
+    for angle in np.arange(0.0, 360.0, 15.0) + 3.0:
+        east, north = offset(limit.separation_mas[k], angle)
+        level = np.repeat(limit.contrast_50[k] * np.geomspace(0.6, 2.2, 8), 250)
+        theta = np.column_stack([np.full(2000, east), np.full(2000, north), level])
+        found = recover(result.likelihood, bank, np.empty(0), theta, weight.threshold(), rng)
+        share = found.located.reshape(8, 250).sum(axis=1).astype(float)
+        fit = fit_logistic(np.log(level[::250]), share, np.full(8, 250.0))
+        each.append(np.exp(fit.crossing(0.95)[0]))
+    low, middle, high = np.log(np.quantile(each, (0.16, 0.5, 0.84)))
+    stated = np.log(limit.spread[k])
+    # 24 angles sample the quantiles to 0.03, each limit has an error of 0.03.
+    np.testing.assert_allclose(stated, [low, middle, high], atol=0.12)
 
 
 def test_completeness_rises_with_contrast(setting) -> None:

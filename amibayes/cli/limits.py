@@ -12,7 +12,7 @@ from amibayes.errors import UsageError
 if TYPE_CHECKING:
     from amibayes.limits_job import LimitsOptions, LimitsReport
 
-RESULT, TABLE, JOURNAL = "limits.json", "limits.ecsv", "limits.journal"
+RESULT, TABLE, MAP, JOURNAL = "limits.json", "limits.ecsv", "completeness.png", "limits.journal"
 
 METHODS = ("injection", "absil", "candid", "posterior", "closure-phase")
 
@@ -114,8 +114,10 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     content = _finished(folder, names, request) if arguments.resume else None
     if content is None:
         if arguments.resume and not arguments.overwrite:
-            _refuse_other_request(folder / RESULT, request)
+            _refuse_other_request(folder, request)
         content = _measure(arguments, options, folder, request)
+        for stale in {MAP} - set(names):
+            (folder / stale).unlink(missing_ok=True)
     return content, folder
 
 
@@ -157,9 +159,11 @@ def _read(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _refuse_other_request(path: Path, request: str) -> None:
-    """Refuse to go on in a folder that holds the answer to something else."""
-    if path.is_file() and _read(path).get("request") != request:
+def _refuse_other_request(folder: Path, request: str) -> None:
+    """Refuse to go on in a folder that holds the answer to something else, and no work on this."""
+    path = folder / RESULT
+    begun = (folder / JOURNAL / request).is_dir()
+    if path.is_file() and not begun and _read(path).get("request") != request:
         raise UsageError(
             "is the result of other data or options",
             source=path,

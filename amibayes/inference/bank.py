@@ -128,6 +128,11 @@ class TemplateBank:
         """Number of nuisance directions."""
         return int(self._basis.shape[1])
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether a position and its opposite predict the same: without closure phases."""
+        return not len(self._odd.rows)
+
     def project(self, data: FloatArray) -> FloatArray:
         """Take the nuisance directions out of whitened data (n_data, …)."""
         return data - self._basis @ (self._basis.T @ data) if self._basis.size else data

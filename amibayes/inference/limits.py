@@ -266,10 +266,14 @@ def _crossing(
 ) -> tuple[float, float]:
     """Contrast of a given completeness, and the error of its logarithm; NaN outside the levels."""
     fit = fit_logistic(np.log(level), recovered.astype(float), trials.astype(float))
-    x, error = fit.crossing(probability)
-    if not np.log(level[0]) <= x <= np.log(level[-1]) or not recovered.any():
+    return _bracketed(*fit.crossing(probability))
+
+
+def _bracketed(log_contrast: float, error: float) -> tuple[float, float]:
+    """Give a contrast and the error of its logarithm; NaN where the injections end before it."""
+    if not np.isfinite(log_contrast):
         return np.nan, np.nan
-    return float(np.exp(x)), error
+    return float(np.exp(log_contrast)), error
 
 
 def _spread(setting: Setting, trials: Trials, sigma: FloatArray) -> FloatArray:
@@ -284,9 +288,7 @@ def _spread(setting: Setting, trials: Trials, sigma: FloatArray) -> FloatArray:
         at = np.flatnonzero(trials.ring == k)
         strength = setting.level[k, trials.level[at]] / sigma[k, trials.angle[at]]
         fit = fit_logistic(np.log(strength), found[at].astype(float), np.ones(len(at)))
-        x, _ = fit.crossing(COMPLETENESS)
-        if np.log(strength.min()) <= x <= np.log(strength.max()) and found[at].any():
-            out[k] = np.quantile(sigma[k], SPREAD) * np.exp(x)
+        out[k] = np.quantile(sigma[k], SPREAD) * _bracketed(*fit.crossing(COMPLETENESS))[0]
     return np.where(out <= 1.0, out, np.nan)
 
 

@@ -5,69 +5,85 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+from scipy import optimize, special
 
 from amibayes.units import FloatArray
 
 MOST_STEPS, SETTLED = 100, 1e-10
 
-TYPICAL = np.array([0.0, 6.0, 0.0])
-LOOSENESS = np.array([1e3, 6.0, 3.0])
+TYPICAL = np.array([0.0, 6.0, 0.0, 0.0])
+LOOSENESS = np.array([1e3, 20.0, 20.0, 20.0])
 """A wide Gaussian prior of the coefficients, which keeps all-or-nothing data finite."""
+
+NODES = 401
+"""Between which a crossing is bracketed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Logistic:
-    """logit P = β₀ + β₁ (x − x₀) + β₂ (x − x₀)², fitted.
+    """logit P = Σ βₖ (x − x₀)ᵏ, k = 0 to 3, fitted.
 
     Parameters
     ----------
-    centre : float
-        x₀.
-    beta : (3,) float array
-    covariance : (3, 3) float array
+    low, high : float
+        Range of x that was fitted; x₀ is its middle.
+    beta : (4,) float array
+    covariance : (4, 4) float array
     """
 
-    centre: float
+    low: float
+    high: float
     beta: FloatArray
     covariance: FloatArray
 
+    @property
+    def centre(self) -> float:
+        """x₀."""
+        return 0.5 * (self.low + self.high)
+
     def __call__(self, x: FloatArray) -> FloatArray:
         """Probability at x."""
-        return np.asarray(special.expit(_design(x - self.centre) @ self.beta))
+        return np.asarray(special.expit(self._logit(x)))
+
+    def _logit(self, x: FloatArray | float) -> FloatArray:
+        return np.asarray(_design(x - self.centre) @ self.beta)
 
     def crossing(self, probability: float) -> tuple[float, float]:
-        """Find x at which the probability is reached on the rising side, and its 1σ error.
+        """Find x above which the probability is exceeded, and its 1σ error.
 
-        Infinite, with NaN for its error, where it never is.
+        Infinite, with NaN for its error, where that is outside the fitted range.
         """
-        a, b, c = self.beta
-        rest = a - special.logit(probability)
-        inside = b * b - 4.0 * c * rest
-        if inside <= 0.0 or b + np.sqrt(inside) <= 0.0:
+        goal = special.logit(probability)
+        nodes = np.linspace(self.low, self.high, NODES)
+        below = np.flatnonzero(self._logit(nodes) < goal)
+        if not len(below):
+            return -np.inf, np.nan
+        if below[-1] == NODES - 1:
             return np.inf, np.nan
-        x = -2.0 * rest / (b + np.sqrt(inside))
-        slope = b + 2.0 * c * x
-        row = np.array([1.0, x, x * x])
-        error = np.sqrt(row @ self.covariance @ row) / slope
-        return float(self.centre + x), float(error)
+        between = nodes[below[-1]], nodes[below[-1] + 1]
+        x = float(optimize.brentq(lambda at: float(self._logit(at)) - goal, *between))
+        row = _design(x - self.centre)
+        powers = np.arange(1, len(row))
+        slope = (powers * self.beta[1:]) @ row[:-1]
+        return x, float(np.sqrt(row @ self.covariance @ row) / slope)
 
 
 def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Logistic:
     """Fit binomial counts by Newton's method.
 
-    The square in x is what a probit, or the mean over directions of unequal sensitivity,
-    needs beyond a straight line.
+    A statistic that scatters normally about the contrast, averaged over directions of unequal
+    sensitivity, is no straight line in ln contrast: with the square and the cube the
+    fit follows it to 0.3 % of probability, without them to 4 %.
 
     Parameters
     ----------
     x, successes, trials : (n,) float array
     """
-    centre = float(np.mean(x))
-    design = _design(x - centre)
+    low, high = float(np.min(x)), float(np.max(x))
+    design = _design(x - 0.5 * (low + high))
     precision = np.diag(LOOSENESS**-2.0)
     share = np.clip(successes.sum() / trials.sum(), 0.01, 0.99)
-    beta = np.array([special.logit(share), TYPICAL[1], 0.0])
+    beta = TYPICAL + np.array([special.logit(share), 0.0, 0.0, 0.0])
     for _ in range(MOST_STEPS):
         p = special.expit(design @ beta)
         information = (design.T * (trials * p * (1.0 - p))) @ design + precision
@@ -78,8 +94,8 @@ def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Lo
         beta = beta + step
         if np.abs(step).max() < SETTLED:
             break
-    return Logistic(centre, beta, np.linalg.inv(information))
+    return Logistic(low, high, beta, np.linalg.inv(information))
 
 
-def _design(x: FloatArray) -> FloatArray:
-    return np.stack([np.ones_like(x), x, x * x], axis=-1)
+def _design(x: FloatArray | float) -> FloatArray:
+    return np.stack([np.ones_like(x), x, np.square(x), np.power(x, 3)], axis=-1)

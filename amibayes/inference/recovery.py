@@ -8,11 +8,13 @@ whitened data a trial costs no more than a null search, a column of a matrix pro
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
@@ -22,6 +24,8 @@ from amibayes.inference.significance import profiled
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
 
 TRIALS_AT_ONCE = 2048
 
@@ -232,8 +236,8 @@ def nearer_alias(bank: TemplateBank, fringe_mas: float, places: FloatArray) -> F
     ----------
     bank : TemplateBank
     fringe_mas : float
-        Positions within it are the same; so are those around the opposite place, which data
-        without closure phases cannot tell and no rule prefers.
+        Positions within it are the same. Without closure phases so are those within half of
+        it about the opposite place, which no data tell and no rule prefers.
     places : (n, 2) float array
         east_mas, north_mas.
 
@@ -242,40 +246,82 @@ def nearer_alias(bank: TemplateBank, fringe_mas: float, places: FloatArray) -> F
     (n,) float array
         0 where there is none.
     """
+    clear, marginal = _best_inward(bank, fringe_mas, places)
+    radius = np.hypot(*places.T)
+    found = np.zeros(len(places))
+    for most, where in (clear, marginal):
+        most, at = _between_lattice_points(bank, places, most, where)
+        found = np.maximum(found, np.where(np.hypot(*at.T) < radius, most, 0.0))
+    return found
+
+
+def _best_inward(
+    bank: TemplateBank, fringe_mas: float, places: FloatArray
+) -> list[tuple[FloatArray, IntArray]]:
+    """Largest correlations on the lattice and where they are, (n,) each.
+
+    First among positions nearer to the star by a step of the lattice or more, then among
+    those at the same separation within a step, of which the lattice cannot tell.
+    """
     own = bank.templates_at(*places.T)
-    radius, grid = np.hypot(*places.T), bank.grid
-    most, where = np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)
+    radius, grid = np.hypot(*places.T)[:, None], bank.grid
+    best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
     each = np.arange(len(places))
     for index, templates in bank.chunks():
         match = own.T @ templates
         east, north = grid.east_mas[index], grid.north_mas[index]
-        across = np.abs(np.outer(places[:, 0], east) + np.outer(places[:, 1], north))
-        square = (east**2 + north**2)[None] + (radius**2)[:, None]
-        same = square - 2.0 * across < fringe_mas**2  # to it, or to its opposite
-        match[same | (np.hypot(east, north)[None] >= radius[:, None])] = 0.0
-        top = match.argmax(axis=1)
-        better = match[each, top] > most
-        most[better], where[better] = match[each, top][better], index[top[better]]
-    return _between_lattice_points(bank, places, most, where)
+        match[_same_place(bank, fringe_mas, places, east, north)] = 0.0
+        inward = (radius - np.hypot(east, north)) / grid.step_mas
+        for (most, where), zone in zip(best, (inward > 1.0, np.abs(inward) <= 1.0), strict=True):
+            here = np.where(zone, match, 0.0)
+            top = here.argmax(axis=1)
+            better = here[each, top] > most
+            most[better], where[better] = here[each, top][better], index[top[better]]
+    return best
+
+
+def _same_place(
+    bank: TemplateBank,
+    fringe_mas: float,
+    places: FloatArray,
+    east: FloatArray,
+    north: FloatArray,
+) -> BoolArray:
+    """Which positions (m,) count as the same as a place (n, 2), or as its opposite; (n, m)."""
+    along = np.outer(places[:, 0], east) + np.outer(places[:, 1], north)
+    square = (east**2 + north**2)[None] + (places**2).sum(axis=1)[:, None]
+    same = square - 2.0 * along < fringe_mas**2
+    if bank.symmetric:
+        same |= square + 2.0 * along < (0.5 * fringe_mas) ** 2
+    return np.asarray(same)
 
 
 def _between_lattice_points(
-    bank: TemplateBank, places: FloatArray, most: FloatArray, where: np.ndarray
-) -> FloatArray:
-    """Look around the best lattice points: near 1 a correlation must be known well."""
+    bank: TemplateBank, places: FloatArray, most: FloatArray, where: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Look around the best lattice points: near 1 a correlation must be known well.
+
+    Returns
+    -------
+    best : (n,) float array
+    at : (n, 2) float array
+        Where it is.
+    """
+    grid = bank.grid
+    at = np.column_stack([grid.east_mas[where], grid.north_mas[where]])
     likely = np.flatnonzero(most**2 > 0.8 * ALIKE)
     if not len(likely):
-        return most
+        return most, at
     own = bank.templates_at(*places[likely].T)
-    best = most.copy()
-    for across in SUBSTEPS * bank.grid.step_mas:
-        for along in SUBSTEPS * bank.grid.step_mas:
-            at = where[likely]
-            there = bank.templates_at(
-                bank.grid.east_mas[at] + across, bank.grid.north_mas[at] + along
-            )
-            best[likely] = np.maximum(best[likely], (own * there).sum(axis=0))
-    return best
+    best, middle = most[likely], at[likely]
+    for shift in itertools.product(SUBSTEPS * grid.step_mas, repeat=2):
+        there = middle + shift
+        match = (own * bank.templates_at(*there.T)).sum(axis=0)
+        better = match > best
+        best[better], at[likely[better]] = match[better], there[better]
+    out = most.copy()
+    out[likely] = best
+    return out, at
 
 
 def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
