@@ -51,7 +51,7 @@ def test_differences_need_no_magnitude_of_the_star_and_units_are_kept(tmp_path: 
         ("mass,delta_mag\nheavy,14\n1,12\n", "no number"),
         ("mass,delta_mag\n,14\n1,12\n", "no number"),
         ("# %ECSV 1.0\nnothing\n", "neither an ECSV nor a CSV"),
-        ("", "neither an ECSV nor a CSV"),
+        ("", "no column mass"),
         ("\x00\xff", "is no text"),
     ],
 )

@@ -26,6 +26,7 @@ from amibayes.inference.model import BinaryModel
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.search import search
 from amibayes.inference.significance import Significance
+from amibayes.mass_table import MassTable
 from amibayes.observables import Observables
 from amibayes.plots.calibration import _keys, calibrator_plot
 from amibayes.plots.chains import trace_plot
@@ -145,6 +146,12 @@ PICTURES: dict[str, Callable[[SearchResult], Figure]] = {
     "calibrators of many": lambda r: calibrator_plot([niriss(channels=9)], [True], ["HD 1"]),
     "limits": lambda r: limits_plot(
         SEPARATION, {"a": Curve(LIMIT, LIMIT - 0.2, LIMIT + 0.2), "b": Curve(LIMIT)}, r.companion
+    ),
+    "limits, ambiguous places, masses": lambda r: limits_plot(
+        SEPARATION,
+        {"a": Curve(LIMIT, by_detection=SEPARATION > 200.0), "b": Curve(LIMIT - 0.5)},
+        fringe_mas=140.0,
+        masses=MassTable(np.array([2.0, 6.0, 12.0]), np.array([60.0, 20.0, 3.0]), "M_Jup"),
     ),
     "completeness": lambda r: completeness_map(
         SEPARATION, np.linspace(3.0, 9.0, 13), fraction(), LIMIT, LIMIT - 0.9

@@ -68,7 +68,13 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="injections per separation and contrast, on average (default: %(default)s)",
     )
-    data_options.add_null_draws(group, 100_000)
+    group.add_argument(
+        "--null-draws",
+        type=common.non_negative_integer,
+        metavar="N",
+        help="null searches for the false-alarm probability; 0: none (default: 100000 for "
+        "injection, else 10000, which only say whether a companion is to be taken out first)",
+    )
     group.add_argument(
         "--mass-table",
         metavar="FILE",
@@ -234,7 +240,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
         insname=arguments.insname,
         target=arguments.target,
         extra_noise=arguments.extra_noise,
-        null_draws=arguments.null_draws,
+        null_draws=_null_draws(arguments),
         seed=arguments.seed,
         images=common.image_options_of(arguments),
     )
@@ -246,6 +252,14 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
         trials_per_cell=arguments.trials,
         masses=_masses(arguments),
     )
+
+
+def _null_draws(arguments: argparse.Namespace) -> int:
+    from amibayes.limits_job import NULL_DRAWS
+
+    if arguments.null_draws is not None:
+        return int(arguments.null_draws)
+    return NULL_DRAWS if arguments.method == "injection" else NULL_DRAWS // 10
 
 
 def _masses(arguments: argparse.Namespace) -> Any:

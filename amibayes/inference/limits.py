@@ -43,6 +43,9 @@ LEVELS = (0.4, 4.0)
 
 COMPLETENESS = 0.95
 
+MOST_AMBIGUOUS = 0.5 * (1.0 - COMPLETENESS)
+"""Share of directions with an alias nearer in, above which detection alone is counted."""
+
 SPREAD = (0.16, 0.5, 0.84)
 """Quantiles over the position angle."""
 
@@ -67,8 +70,8 @@ class DetectionLimit:
         and 84 % points over all of them.
     by_detection : (n,) bool array
         Where the data cannot tell a position from one nearer to the star in more than
-        1 − ``completeness`` of the directions, no contrast can be found at its place that
-        often: there a companion counts as recovered wherever it is seen.
+        `MOST_AMBIGUOUS` of the directions, hardly any contrast can be found at its place
+        with probability ``completeness``: there a companion counts wherever it is seen.
     ambiguous : (n,) float array
         Share of the directions in which that is so.
     threshold : float
@@ -182,7 +185,7 @@ def detection_limit(
         rings,
         nearer,
         level,
-        lost > 1.0 - COMPLETENESS,
+        lost > MOST_AMBIGUOUS,
         significance.threshold(),
         significance.free_scale,
         executor,
