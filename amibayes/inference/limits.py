@@ -41,6 +41,9 @@ TRIALS_PER_CELL = 40
 LEVELS = (0.4, 4.0)
 """Injected contrasts, in units of the one that linear theory detects half of the time."""
 
+BEYOND = 2.0
+"""Highest level in units of what the blindest direction that counts sees half of the time."""
+
 COMPLETENESS = 0.95
 
 MOST_AMBIGUOUS = 0.5 * (1.0 - COMPLETENESS)
@@ -174,8 +177,7 @@ def detection_limit(
     rings = make_rings(result, n_separations, separation_mas)
     gain = _gain_at(significance, bank)
     sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
-    half = np.sqrt(gain) * np.median(sigma, axis=1)
-    level = np.minimum(half[:, None] * np.geomspace(*LEVELS, N_LEVELS), 1.0)
+    level = _levels(gain, sigma)
     nearer = _nearer(bank, rings, result, executor, journals)
     seen_at = np.full(nearer.shape, (np.sqrt(gain) + stats.norm.ppf(COMPLETENESS)) ** 2)
     lost = ambiguous(nearer, seen_at).mean(axis=1)
@@ -194,6 +196,17 @@ def detection_limit(
     trials = inject(setting, trials_per_cell, rng, progress)
     false = _false_positives(setting, significance, rng)
     return _summarised(setting, trials, sigma, lost, significance.alpha, false)
+
+
+def _levels(gain: float, sigma: FloatArray) -> FloatArray:
+    """Contrasts to inject at every ring, (n, N_LEVELS), from its errors (n, n_angles).
+
+    Where some directions are nearly blind the levels reach on to what these see.
+    """
+    middle, blind = np.quantile(sigma, (0.5, COMPLETENESS + 0.02), axis=1)
+    highest = np.maximum(LEVELS[1], BEYOND * blind / middle)
+    steps = np.geomspace(LEVELS[0], highest, N_LEVELS, axis=1)
+    return np.asarray(np.minimum(np.sqrt(gain) * middle[:, None] * steps, 1.0))
 
 
 def _nearer(
