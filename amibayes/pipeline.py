@@ -321,6 +321,7 @@ def weigh(
         frame=frame,
         executor=executor,
         progress=progress,
+        journal=journal,
     )
     field = statistic_field(bank, residuals[:, 0], free_scale=free_scale, frame=frame)
     return replace(weight, field=field)
