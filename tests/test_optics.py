@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 
 from amibayes.errors import UsageError
 from amibayes.instrument import Channels, Instrument, Mask, load_instrument
-from amibayes.optics import PupilMap, Wavefront, fringe_basis, psf
+from amibayes.optics import PupilMap, Wavefront, fringe_basis, fringe_field, psf
 from amibayes.optics.holes import coverage, hole_transform
 from amibayes.optics.psf import intensity
 from amibayes.spectrum import Blackbody, g2v
@@ -318,3 +318,21 @@ def test_fringe_model_of_another_scale_and_an_oblong_image() -> None:
     basis = fringe_basis(instrument, MONO, (30, 44), pixel_scale_rad=scale)
     image = psf(replace(instrument, pixel_scale_rad=scale), MONO, 44)
     np.testing.assert_allclose(basis.image(), image[7:37], atol=1e-12 * image.max())
+
+
+@pytest.mark.parametrize(
+    ("name", "filter_name"), [("niriss", "F277W"), ("niriss", "F480M"), ("gpi", "K1")]
+)
+def test_fringe_field_is_the_fringe_model_anywhere(name: str, filter_name: str) -> None:
+    instrument = load_instrument(name, filter=filter_name)
+    channels = instrument.bandpass.channels()
+    field = fringe_field(instrument, channels, 50, rotation_rad=0.01)
+    for shape, centre in (((40, 33), (0.37, -1.62)), ((20, 20), (-4.0, 3.5))):
+        exact = fringe_basis(
+            instrument, channels, shape, centre_px=centre, rotation_rad=0.01
+        ).matrix
+        quick = field.basis(shape, centre).matrix
+        # The interpolation is good to 1e-8.
+        assert np.abs(quick - exact).max() < 2e-8 * exact.max()
+    again = fringe_field(load_instrument(name, filter=filter_name), channels, 49, rotation_rad=0.01)
+    assert again is field

@@ -15,6 +15,7 @@ from amibayes.optics.sampling import (
     pixel_operator,
     pixel_transform,
     pixel_weights,
+    shifted_images,
 )
 from amibayes.scene import GaussianDisc, Point, Scene
 from amibayes.units import MAS
@@ -89,3 +90,12 @@ def test_transform_of_a_pixel_is_a_sinc_where_its_response_is_even() -> None:
     frequency = np.linspace(-0.7, 0.7, 15)
     np.testing.assert_allclose(pixel_transform(frequency), np.sinc(frequency), atol=1e-12)
     assert pixel_weights(0.3)[1].sum() == pytest.approx(1.0)
+
+
+def test_shifted_images_are_what_the_operators_make() -> None:
+    fine = np.random.default_rng(1).random((120, 132))
+    shifts = np.array([[0.3, -2.4], [-3.0, 1.7], [0.0, 0.0]])
+    images = shifted_images(fine, 3, (22, 26), shifts)
+    for image, (x, y) in zip(images, shifts, strict=True):
+        expected = pixel_operator(22, 120, 3, y) @ fine @ pixel_operator(26, 132, 3, x).T
+        np.testing.assert_allclose(image, expected, atol=1e-13)

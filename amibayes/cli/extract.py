@@ -49,6 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="shrunk",
         help="scatter weighed with photon noise, or one of them alone (default: %(default)s)",
     )
+    group.add_argument(
+        "--geometry",
+        choices=("fitted", "stated"),
+        default="fitted",
+        help="pixel scale and rotation of the mask (default: %(default)s, where the image tells)",
+    )
     group.add_argument("--per-integration", action="store_true", help="write every integration too")
     common.add_output_options(parser, "extract")
 
@@ -69,6 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep_all=arguments.keep_all,
         window_px=arguments.window,
         covariance=arguments.covariance,
+        geometry=arguments.geometry,
     )
     stems = _stems(arguments.cubes)
     names = [SUMMARY, *(n for stem in stems for n in _names(stem, arguments))]
@@ -136,6 +143,8 @@ def _summary(content: list[dict[str, Any]]) -> list[str]:
             f"  star           x {entry['centre_px'][0][0]:+.3f}, "
             f"y {entry['centre_px'][0][1]:+.3f} pixels from the middle, "
             f"pointing {entry['jitter_px']:.3f} pixels rms",
+            f"  geometry       pixel {entry['geometry'][0]['scale']:.4f} of the stated, mask "
+            f"turned {entry['geometry'][0]['rotation_deg']:+.3f} deg",
             f"  bad pixels     {entry['bad_pixels'][0]} always, {entry['outliers']:.1f} more in "
             "an integration",
             f"  V²             σ {entry['sigma_vis2']:.2g}, photon and read noise "

@@ -8,6 +8,8 @@ import numpy as np
 
 from amibayes.extraction.cleaning import TO_SIGMA, BoolArray
 from amibayes.extraction.frames import Frames, look_elsewhere
+from amibayes.extraction.sampling import IntArray
+from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
 
@@ -30,22 +32,27 @@ class Average:
     deviation: FloatArray
 
 
-def average(frames: Frames, attenuation: FloatArray) -> Average:
+def average(frames: Frames, pointed: ComplexArray, triangles: IntArray) -> Average:
     """Average power and bispectrum, not their ratios and phases.
 
     Parameters
     ----------
     frames : Frames
         The integrations to be used.
-    attenuation : (n, n_baselines) array
-        Loss of V² at each integration's pointing.
+    pointed : (n, n_baselines) complex array
+        What each integration's pointing makes of a visibility of 1.
+    triangles : (n_triangles, 3) int array
+        Baselines ij, jk, ik of every triangle.
     """
-    power = frames.power / attenuation
+    power = frames.power / np.abs(pointed) ** 2
+    turn = pointed / np.abs(pointed)
+    ij, jk, ik = (turn[:, index] for index in triangles.T)
+    bispectrum = frames.bispectrum * (ij * jk).conj() * ik
     square = frames.square.mean()
     vis2 = power.mean(axis=0) / square
     by_vis2 = (power - frames.square[:, None] * vis2) / square
-    total = frames.bispectrum.mean(axis=0)
-    by_closure = (frames.bispectrum / total).imag
+    total = bispectrum.mean(axis=0)
+    by_closure = (bispectrum / total).imag
     return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))
 
 

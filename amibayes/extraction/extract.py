@@ -16,6 +16,7 @@ from amibayes.extraction.averaging import Average, average, standing_off
 from amibayes.extraction.cleaning import TO_SIGMA, BoolArray, Reference, reference_of
 from amibayes.extraction.fourier import fourier_sampling
 from amibayes.extraction.frames import Bench, Frames, Residual, concatenated, measure, select
+from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
 from amibayes.extraction.noise import (
     NoiseModel,
@@ -25,14 +26,14 @@ from amibayes.extraction.noise import (
     scatter_about_pointing,
 )
 from amibayes.extraction.options import ExtractOptions, Method
-from amibayes.extraction.response import off_axis_response
+from amibayes.extraction.response import off_axis_response, pointing_response
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import Source, opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View, look_at
 from amibayes.observables import Observables, join
 from amibayes.optics import FringeBasis
-from amibayes.response import powers_at
+from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
 MOST_LEFT = 0.25
@@ -157,7 +158,7 @@ class _Part:
     frames: Frames
     physical: FloatArray
     response: FloatArray
-    attenuation: FloatArray
+    pointed: ComplexArray
 
 
 def _measured(
@@ -179,7 +180,7 @@ def _measured(
         frames,
         jacobian @ bench.noise @ jacobian.T,
         response,
-        _attenuation(bench.view, template, response, frames.shift_px),
+        pointing_response(bench.view, bench.sampling, frames.shift_px),
     )
 
 
@@ -192,13 +193,21 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     image, good = reference.image[part], reference.good[part]
     view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
     noise, level, expected = _noise_and_misfit(view, basis, reference)
+    geometry = Geometry()
+    if options.geometry == "fitted":
+        mean = np.pi / 2.0 / len(reference.sample)  # variance of a median
+        fit = fringe_fit(basis, noise.variance * mean + level, good)
+        view, geometry = fit_geometry(view, image, fit)
+    if not geometry.stated:
+        view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
+        noise, level, expected = _noise_and_misfit(view, basis, reference)
     fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
     covariance = sampling.noise(np.where(good, noise.variance, 0.0))
-    return Bench(view, reference, fit, expected, sampling, covariance, options)
+    return Bench(view, geometry, reference, fit, expected, sampling, covariance, options)
 
 
 def _fit_variance(
@@ -284,21 +293,12 @@ def _refuse_another(
         )
 
 
-def _attenuation(
-    view: View, template: Cube, response: FloatArray, shift_px: FloatArray
-) -> FloatArray:
-    """Loss of V² (n, n_baselines) of the star itself where it is off the centre."""
-    place = shift_px * view.instrument.pixel_scale_rad
-    log = (response @ powers_at(*template.orientation.to_sky(place).T)).real
-    return np.asarray(np.exp(2.0 * (log[1:] - log[0])).T)
-
-
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     """One exposure out of its files: average, covariance, table."""
     view = parts[0].bench.view
-    frames, attenuation, physical = _together(parts, options)
+    frames, pointed, physical = _together(parts, options)
     used = frames.used
-    mean = average(frames.select(used), attenuation[used])
+    mean = average(frames.select(used), pointed[used], view.instrument.mask.triangle_baselines)
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
@@ -308,20 +308,23 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
 
 
-def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, FloatArray, FloatArray]:
+def _together(
+    parts: list[_Part], options: ExtractOptions
+) -> tuple[Frames, ComplexArray, FloatArray]:
     """Integrations of all files, those that stand off marked, and what they share."""
     frames = concatenated([p.frames for p in parts])
-    attenuation = np.concatenate([p.attenuation for p in parts])
+    pointed = np.concatenate([p.pointed for p in parts])
     count = np.array([p.frames.used.sum() for p in parts], dtype=float)
     physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
     if not options.keep_all:
-        found = average(frames.select(frames.used), attenuation[frames.used])
+        triangles = parts[0].bench.view.instrument.mask.triangle_baselines
+        found = average(frames.select(frames.used), pointed[frames.used], triangles)
         sigma = np.sqrt(np.diag(physical))
         off = np.zeros(len(frames), dtype=bool)
         off[frames.used] = standing_off(found.deviation, sigma, options.clip)
         reason = np.where(off, "observables stand off the others'", frames.reason)
         frames = replace(frames, reason=reason)
-    return frames, attenuation, np.asarray(physical)
+    return frames, pointed, np.asarray(physical)
 
 
 def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:

@@ -30,13 +30,14 @@ SQUARE, GAUSS = 1, 2
 GAUSS_SIGMA = 1.2
 """Cells."""
 
-FAINTEST = 0.2
-"""Cells where the modelled splodge is below this fraction of its peak are not sampled."""
+FAINTEST, BRIGHT = 0.3, 0.6
+"""Cells below the first fraction of the modelled splodge's peak are not sampled, and those
+above the second in full. Farther out the feet of neighbouring splodges overlap."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Samples on a lattice: baseline, offset from its reference point, frequency."""
+    """Samples: baseline, offset from its frequency in whole cells, frequency."""
 
     baseline: IntArray
     offset: IntArray
@@ -63,8 +64,8 @@ def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) 
         away = cells.frequency_px - view.frequency_px[cells.baseline]
         gain = np.exp(-0.25 * np.sum((away * max(view.shape) / GAUSS_SIGMA) ** 2, axis=1))
     if options.method == "fft":
-        keep = _bright(cells.baseline, _own(view, cells, level, fringes.matrix), FAINTEST)
-        cells, gain = cells.select(keep), gain[keep]
+        gain = _brightness(cells, _own(view, cells, level, fringes.matrix))
+        cells, gain = cells.select(gain > 0.0), gain[gain > 0.0]
     closing, triangle = closing_products(mask.triangle_baselines, cells.offset, cells.baseline)
     return _assembled(view, cells, level, star, gain, closing, triangle)
 
@@ -79,26 +80,34 @@ def _half_width(view: View, method: str) -> int:
 
 
 def _lattice(view: View, half_width: int) -> _Cells:
-    """Cells about every splodge, of the lattice that an FFT of the image would have."""
+    """Cells about every splodge, as far apart as those of an FFT of the image.
+
+    Each baseline has them about its own frequency. Frequencies close, hence offsets that
+    close are closing products, and a patch has no side on which it sees more of its
+    splodge than on the other: the phase of a companion's fringe is that of its baseline.
+    """
     step = 1.0 / max(view.shape)
-    mask = view.instrument.mask.rotated(view.rotation_rad)
-    holes = mask.holes_m * (view.instrument.pixel_scale_rad / view.wavelength_m / step)
-    holes = np.rint(holes)
-    reference = holes[mask.pairs[:, 1]] - holes[mask.pairs[:, 0]]
-    nearest = np.rint(view.frequency_px / step - reference)
+    n = view.instrument.mask.n_baselines
     side = np.arange(-half_width, half_width + 1)
     patch = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    offset = nearest[:, None, :] + patch
-    baseline = np.repeat(np.arange(mask.n_baselines), len(patch))
-    frequency = (reference[:, None, :] + offset) * step
-    return _Cells(baseline, offset.reshape(-1, 2).astype(np.intp), frequency.reshape(-1, 2))
+    frequency = view.frequency_px[:, None, :] + patch * step
+    return _Cells(
+        np.repeat(np.arange(n), len(patch)), np.tile(patch, (n, 1)), frequency.reshape(-1, 2)
+    )
 
 
-def _bright(baseline: IntArray, model: ComplexArray, faintest: float) -> BoolArray:
-    """Cells of the splodges themselves."""
-    peak = np.zeros(int(baseline.max()) + 1)
-    np.maximum.at(peak, baseline, np.abs(model))
-    return np.asarray(np.abs(model) > faintest * peak[baseline])
+def _brightness(cells: _Cells, model: ComplexArray) -> FloatArray:
+    """Share of the splodge at every cell: 0 outside it, 1 well inside.
+
+    It is the same for all baselines, and rises evenly towards the middle: what a target
+    and its calibrator are sampled with does not hang on a cell that just is or is not
+    bright enough.
+    """
+    n = int(cells.baseline.max()) + 1
+    mean = np.abs(model).reshape(n, -1).mean(axis=0)
+    mean = 0.5 * (mean + mean[::-1])
+    share = np.clip((mean / mean.max() - FAINTEST) / (BRIGHT - FAINTEST), 0.0, 1.0)
+    return np.asarray(np.tile(share, n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +152,8 @@ def _matched(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Sa
     mask = view.instrument.mask
     n = mask.n_baselines
     own = _own(view, cells, level, basis)
-    keep = _bright(cells.baseline, own, FAINTEST)
-    cells, own = cells.select(keep), own[keep]
+    own *= _brightness(cells, own)
+    cells, own = cells.select(own != 0.0), own[own != 0.0]
     share = np.zeros((len(own), n), dtype=complex)
     share[np.arange(len(own)), cells.baseline] = own.conj()
     operator = level.transform(view, cells.frequency_px) @ share
@@ -185,7 +194,10 @@ def _assembled(
     """Samples as they are, normalised so that a point source has V² = 1."""
     operator = level.transform(view, cells.frequency_px) * np.sqrt(gain)
     reference = star @ operator
-    total = np.bincount(cells.baseline, np.abs(reference) ** 2)
+    # Feet of other splodges turn a sample: a point source is to have phase 0.
+    operator *= reference.conj() / np.abs(reference)
+    reference = np.abs(reference).astype(complex)
+    total = np.bincount(cells.baseline, reference.real**2)
     return Sampling(
         np.column_stack([level.flux, operator.real, operator.imag]),
         cells.baseline,

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from amibayes.cube import Cube
 from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
+from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.sampling import IntArray, Sampling
@@ -90,6 +91,7 @@ class Bench:
     Parameters
     ----------
     view : View
+    geometry : Geometry
     reference : Reference
     fit : FringeFit
         Also of the Fourier methods, for which it fills bad pixels.
@@ -103,6 +105,7 @@ class Bench:
     """
 
     view: View
+    geometry: Geometry
     reference: Reference
     fit: FringeFit
     expected: Residual

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
 from amibayes.extraction.sampling import BoolArray, IntArray, Sampling
@@ -85,14 +86,26 @@ class FringeFit:
 
 
 def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> FringeFit:
-    """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only."""
+    """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only.
+
+    Raises
+    ------
+    DataError
+        Where the good pixels do not determine it.
+    """
     design = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
     weight = np.where(good, 1.0 / variance, 0.0).ravel()
-    # Columns of like size keep the factorisation well conditioned.
-    scale = np.sqrt(weight @ design**2)
-    q, r = np.linalg.qr(design * np.sqrt(weight)[:, None] / scale)
-    inverse = np.linalg.solve(r, q.T).T * np.sqrt(weight)[:, None] / scale
-    return FringeFit(design, inverse, weight)
+    weighted = design * weight[:, None]
+    normal = design.T @ weighted
+    # Fringes of different frequency are nearly orthogonal: columns of like size keep the
+    # normal equations well conditioned.
+    scale = np.sqrt(np.diag(normal))
+    try:
+        factor = cho_factor(normal / np.outer(scale, scale))
+    except (LinAlgError, ValueError):
+        raise DataError("too few good pixels to tell the fringes apart") from None
+    inverse = cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None]
+    return FringeFit(design, weighted @ inverse, weight)
 
 
 def fringe_sampling(fit: FringeFit, view: View) -> Sampling:

@@ -33,6 +33,9 @@ class ExtractOptions:
     temperature_k : float, optional
         Blackbody that stands for the star's spectrum; as many photons at every wavelength
         unless given.
+    geometry : {"fitted", "stated"}
+        Pixel scale and rotation of the mask: fitted once for a cube where its image tells
+        them, or as the header and the options say.
     keep_all : bool
         Leave no integration out that can be measured at all.
 
@@ -48,6 +51,7 @@ class ExtractOptions:
     window_px: float | None = None
     covariance: Literal["shrunk", "scatter", "physical"] = "shrunk"
     temperature_k: float | None = None
+    geometry: Literal["fitted", "stated"] = "fitted"
     keep_all: bool = False
 
     def __post_init__(self) -> None:

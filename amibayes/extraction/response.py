@@ -14,13 +14,16 @@ from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import View
 from amibayes.optics import psf
 from amibayes.optics.psf import ComplexArray
-from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
+from amibayes.optics.sampling import fine_sampling, fine_size, shifted_images
 from amibayes.orientation import Orientation
 from amibayes.response import EXPONENTS, IS_PHASE, powers_at
 from amibayes.units import FloatArray
 
 RADII = 7
 ANGLES = 7
+
+REACH_PX = (0.3, 1.5)
+"""Pointing errors that the response to the star itself is measured for, at least and most."""
 
 SMALLEST = 1e-3
 """Responses are not followed below this."""
@@ -42,7 +45,8 @@ def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) 
         Of ln(response) in `amibayes.response.powers_at` of east and north in radians,
         beyond the smearing over the filter's width (`relative_band`).
     """
-    place = _places(view)
+    radius = view.instrument.field_rad * np.linspace(0.12, 0.95, RADII)
+    place = _places(radius, np.pi * np.arange(ANGLES) / ANGLES)
     flux, samples = _measured(view, sampling, place)
     turns = view.uv_m @ place.T / view.wavelength_m
     expected = np.exp(-2j * np.pi * turns) * np.sinc(relative_band(view) * turns)
@@ -58,15 +62,36 @@ def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) 
     return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
 
 
+def pointing_response(view: View, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
+    """Visibility (n, n_baselines) that is measured of the star itself at shifts (n, 2).
+
+    An image that has moved under an envelope that has not loses V², and its fringes turn.
+    Near the axis that is a low polynomial of the shift, of no symmetry: pixels and weights
+    have none.
+    """
+    reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
+    angle = 2.0 * np.pi * np.arange(2 * ANGLES) / (2 * ANGLES)
+    place = _places(reach * np.array([0.35, 0.75, 1.4]), angle)
+    flux, samples = _measured(view, sampling, place * view.instrument.pixel_scale_rad)
+    turn = np.exp(2j * np.pi * place @ view.frequency_px.T)
+    seen = sampling.fringes(samples) * turn / flux[:, None]
+    found = np.linalg.lstsq(_monomials(place / reach), seen, rcond=None)[0]
+    return np.asarray(_monomials(shift_px / reach) @ found)
+
+
+def _monomials(place: FloatArray) -> FloatArray:
+    """Products (n, 15) of powers of x and y, up to degree 4."""
+    x, y = place.T
+    return np.stack([x ** (d - k) * y**k for d in range(5) for k in range(d + 1)], axis=1)
+
+
 def relative_band(view: View) -> float:
     """Δλ/λ of the box that a model is smeared with."""
     return view.instrument.bandpass.effective_width_m / view.wavelength_m
 
 
-def _places(view: View) -> FloatArray:
-    """Points (n, 2) over a half plane, out to where the mask's field ends, radians."""
-    radius = view.instrument.field_rad * np.linspace(0.12, 0.95, RADII)
-    angle = np.pi * np.arange(ANGLES) / ANGLES
+def _places(radius: FloatArray, angle: FloatArray) -> FloatArray:
+    """Points (n, 2) at all of these distances and angles."""
     r, a = (grid.ravel() for grid in np.meshgrid(radius, angle))
     return np.stack([r * np.cos(a), r * np.sin(a)], axis=1)
 
@@ -81,9 +106,5 @@ def _measured(view: View, sampling: Sampling, place: FloatArray) -> tuple[FloatA
     instrument = view.instrument.with_mask(mask)
     fine = psf(instrument, view.channels, size, oversample=over, integrate=False)
     shifts = place / pixel + np.array(view.centre_px)
-    rows, columns = (
-        [pixel_operator(n, len(fine), over, float(s)) for s in shifts[:, axis]]
-        for n, axis in zip(view.shape, (1, 0), strict=True)
-    )
-    images = np.stack([(r @ fine @ c.T).ravel() for r, c in zip(rows, columns, strict=True)])
-    return sampling.apply(images)
+    images = shifted_images(fine, over, view.shape, shifts)
+    return sampling.apply(images.reshape(len(images), -1))

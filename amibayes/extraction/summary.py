@@ -9,6 +9,8 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.extraction.extract import Extraction
+from amibayes.extraction.geometry import Geometry
+from amibayes.units import DEGREE
 
 
 def described(extraction: Extraction) -> dict[str, Any]:
@@ -33,6 +35,7 @@ def described(extraction: Extraction) -> dict[str, Any]:
             for path, number, reason in extraction.rejected
         ],
         "centre_px": [list(b.view.centre_px) for b in extraction.benches],
+        "geometry": [_geometry(b.geometry) for b in extraction.benches],
         "jitter_px": float(np.sqrt(frames.shift_px[used].var(axis=0).mean())),
         "flux": float(frames.flux[used].mean()),
         "bad_pixels": [b.reference.n_bad for b in extraction.benches],
@@ -51,6 +54,16 @@ def described(extraction: Extraction) -> dict[str, Any]:
     }
 
 
+def _geometry(found: Geometry) -> dict[str, float | None]:
+    """Scale of the stated pixel and rotation of the mask, errors where the image told them."""
+    return {
+        "scale": found.scale,
+        "rotation_deg": found.rotation_rad / DEGREE,
+        "scale_error": found.scale_error if found.told else None,
+        "rotation_error_deg": found.rotation_error_rad / DEGREE if found.told else None,
+    }
+
+
 def header_of(extraction: Extraction) -> dict[str, str | int | float | bool]:
     """Primary header keywords: version, method and options, enough to run it again."""
     header: dict[str, str | int | float | bool] = {
@@ -65,5 +78,7 @@ def header_of(extraction: Extraction) -> dict[str, str | int | float | bool]:
     ):
         header[f"HIERARCH AMIBAYES SOURCE{k}"] = Path(source).name
         header[f"HIERARCH AMIBAYES PIXEL{k}"] = bench.view.instrument.pixel_scale_rad
+        header[f"HIERARCH AMIBAYES SCALE{k}"] = bench.geometry.scale
+        header[f"HIERARCH AMIBAYES ROTATION{k}"] = bench.geometry.rotation_rad / DEGREE
     header["HIERARCH AMIBAYES CHARGE"] = float(extraction.benches[0].reference.image.max())
     return header

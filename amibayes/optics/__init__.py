@@ -1,5 +1,6 @@
 """Light through the mask: one model, used by simulation and by extraction."""
 
+from amibayes.optics.fringe_field import FringeField, fringe_field
 from amibayes.optics.fringes import FringeBasis, fringe_basis
 from amibayes.optics.image import ShiftedImage, scene_image
 from amibayes.optics.psf import Wavefront, psf
@@ -7,10 +8,12 @@ from amibayes.optics.pupil import PupilMap
 
 __all__ = [
     "FringeBasis",
+    "FringeField",
     "PupilMap",
     "ShiftedImage",
     "Wavefront",
     "fringe_basis",
+    "fringe_field",
     "psf",
     "scene_image",
 ]

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from amibayes.units import FloatArray
@@ -66,11 +67,42 @@ def pixel_operator(
     nodes, response = pixel_weights(pixel_response)
     pixel = np.arange(n_pixels) - 0.5 * (n_pixels - 1)
     place = (pixel[:, None] + nodes - shift_px) * oversample + 0.5 * (n_fine - 1)
-    sample, weight = _interpolator(place)
+    sample, weight = interpolator(place)
     operator = np.zeros((n_pixels, n_fine))
     row = np.arange(n_pixels)[:, None, None]
     np.add.at(operator, (row, sample), oversample * response[:, None] * weight)
     return operator
+
+
+def shifted_images(
+    fine: FloatArray, oversample: int, shape: tuple[int, int], shift_px: FloatArray
+) -> FloatArray:
+    """Images (n, n_y, n_x) of fine cells displaced by (x, y), pixels.
+
+    As `pixel_operator` along both axes. Pixels are whole numbers of cells apart, so that
+    one short kernel along an axis serves all of them.
+    """
+    out = np.empty((len(shift_px), *shape))
+    for image, (x, y) in zip(out, shift_px, strict=True):
+        (first, up), (left, across) = (
+            _kernel(n, size, oversample, s)
+            for n, size, s in zip(shape, fine.shape, (y, x), strict=True)
+        )
+        rows = sliding_window_view(fine, len(up), axis=0)[first::oversample][: shape[0]] @ up
+        columns = sliding_window_view(rows, len(across), axis=1)[:, left::oversample]
+        image[:] = columns[:, : shape[1]] @ across
+    return out
+
+
+def _kernel(n_pixels: int, n_fine: int, oversample: int, shift_px: float) -> tuple[int, FloatArray]:
+    """First cell of the first pixel along an axis, and the weights from there on."""
+    nodes, response = pixel_weights()
+    first = -0.5 * (n_pixels - 1) - shift_px
+    sample, weight = interpolator((first + nodes) * oversample + 0.5 * (n_fine - 1))
+    start = int(sample.min())
+    kernel = np.zeros(int(sample.max()) - start + 1)
+    np.add.at(kernel, sample - start, oversample * response[:, None] * weight)
+    return start, kernel
 
 
 def pixel_transform(frequency_per_px: FloatArray, pixel_response: float = 0.0) -> FloatArray:
@@ -86,7 +118,7 @@ def pixel_weights(pixel_response: float = 0.0) -> tuple[FloatArray, FloatArray]:
     return 0.5 * nodes, np.asarray(response / response.sum())
 
 
-def _interpolator(place: FloatArray) -> tuple[IntArray, FloatArray]:
+def interpolator(place: FloatArray) -> tuple[IntArray, FloatArray]:
     """Samples, and their weights, that give the values at ``place``; both (…, n_taps)."""
     sample = np.ceil(place - HALF_WIDTH).astype(np.intp)[..., None] + np.arange(2 * HALF_WIDTH)
     distance = place[..., None] - sample

@@ -1,0 +1,155 @@
+"""Pixel scale and rotation of the mask, fitted once for a cube.
+
+A pixel that is 0.2 % larger than the file says, or a mask turned by 0.1°, moves every
+splodge; extracted where they are not, amplitudes fall and phases turn with the star's
+place. The image itself says where they are: its residual under the fringe fit is projected
+on what either error would do to the fitted image, every coefficient of the fit left free
+(Gauss–Newton).
+
+What matters most is that a target and its calibrator are seen through the same geometry:
+what is left of an error then divides out, whereas noise, or a companion's light, in a
+geometry of its own does not. Small differences from what the file says are therefore not
+believed, and others are rounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amibayes.extraction.image_plane import FringeFit
+from amibayes.extraction.view import View
+from amibayes.units import FloatArray
+
+PARAMETERS = ("scale", "rotation", "x", "y")
+
+STEP = 1e-3
+"""Relative scale and angle (radians) whose effect is taken for the derivatives."""
+
+LARGEST = 0.02
+"""Beyond this the header is not a little wrong: nothing is fitted."""
+
+CONSTRAINED = 3e-3
+"""A fit with larger errors says less than the header does."""
+
+ENOUGH = 0.05
+"""Steps below this many standard deviations change nothing."""
+
+MOST_STEPS = 4
+
+BELIEVED, SIGNIFICANT = 2.5e-4, 4.0
+"""Differences from the stated geometry below this, or so many standard deviations, are left."""
+
+ROUNDED = 1e-4
+"""Others are multiples of this."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Pixel scale in units of the stated one and rotation of the mask, with 1σ errors.
+
+    ``told`` is False where the image does not tell them, or was not asked.
+    """
+
+    scale: float = 1.0
+    rotation_rad: float = 0.0
+    scale_error: float = np.inf
+    rotation_error_rad: float = np.inf
+    told: bool = False
+
+    @property
+    def stated(self) -> bool:
+        """Whether it is what the file says."""
+        return self.scale == 1.0 and self.rotation_rad == 0.0
+
+
+def fit_geometry(view: View, image: FloatArray, fit: FringeFit) -> tuple[View, Geometry]:
+    """Find pixel scale and rotation in an image (n_y, n_x).
+
+    Parameters
+    ----------
+    view : View
+        With the stated geometry, centred.
+    image : (n_y, n_x) array
+        Bad pixels filled.
+    fit : FringeFit
+        Of that view; its weights are the inverse variances of the image, what the optics
+        add to noise included.
+
+    Returns
+    -------
+    View
+        With the geometry that was found, or as it was.
+    Geometry
+    """
+    solved = solve_geometry(view, image, fit)
+    if solved is None:
+        return view, Geometry()
+    value, error = solved
+    scale, turn = (_believed(float(v), float(e)) for v, e in zip(value, error, strict=True))
+    found = _moved(view, np.array([scale, turn, 0.0, 0.0])) if scale or turn else view
+    return found, Geometry(1.0 + scale, turn, float(error[0]), float(error[1]), True)
+
+
+def solve_geometry(
+    view: View, image: FloatArray, fit: FringeFit
+) -> tuple[FloatArray, FloatArray] | None:
+    """Relative error of the pixel scale and rotation (2,), and their standard deviations.
+
+    None where the image does not tell them.
+    """
+    pixels = image.reshape(1, -1)
+    start = fit.solve(pixels)[0]
+    # The place of the envelope is fitted too, but the fringes say where the star is.
+    slopes = np.stack([_slope(view, fit, start, name) for name in PARAMETERS])
+    slopes -= fit.solve(slopes) @ fit.design.T
+    covariance = np.linalg.pinv((slopes * fit.weight) @ slopes.T)
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if not 0.0 < error[:2].min() <= error[:2].max() < CONSTRAINED:
+        return None
+    total, residual = np.zeros(4), _residual(fit.design, fit, pixels)
+    for _ in range(MOST_STEPS):
+        step = covariance @ (slopes * fit.weight) @ residual
+        total = total + step
+        if np.abs(total[:2]).max() > LARGEST:
+            return None
+        if np.all(np.abs(step) < np.maximum(ENOUGH * error, 1e-7)):
+            break
+        design = np.column_stack([_moved(view, total).basis().matrix, np.ones(image.size)])
+        residual = _residual(design, fit, pixels)
+    return total[:2], error[:2]
+
+
+def _believed(found: float, error: float) -> float:
+    if abs(found) < max(BELIEVED, SIGNIFICANT * error):
+        return 0.0
+    return ROUNDED * round(found / ROUNDED)
+
+
+def _residual(design: FloatArray, fit: FringeFit, pixels: FloatArray) -> FloatArray:
+    """What the best sum of the columns of a design leaves of one image, (n_pixels,)."""
+    weighted = design * fit.weight[:, None]
+    best = np.linalg.solve(design.T @ weighted, weighted.T @ pixels[0])
+    return np.asarray(pixels[0] - design @ best)
+
+
+def _slope(view: View, fit: FringeFit, coefficients: FloatArray, name: str) -> FloatArray:
+    """Derivative (n_pixels,) of the fitted image by one of the parameters."""
+    step = np.zeros(4)
+    step[PARAMETERS.index(name)] = STEP
+    moved = _moved(view, step).basis().matrix @ coefficients[:-1]
+    return np.asarray((moved - fit.design[:, :-1] @ coefficients[:-1]) / STEP)
+
+
+def _moved(view: View, by: FloatArray) -> View:
+    """A view with another scale (relative), rotation, and centre."""
+    scale, turn, x, y = (float(b) for b in by)
+    instrument = view.instrument
+    pixel = instrument.pixel_scale_rad * (1.0 + scale)
+    return replace(
+        view,
+        instrument=replace(instrument, pixel_scale_rad=pixel),
+        rotation_rad=view.rotation_rad + turn,
+        centre_px=(view.centre_px[0] + x, view.centre_px[1] + y),
+    )
