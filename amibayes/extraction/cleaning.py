@@ -72,11 +72,13 @@ class Reference:
         usable = self.good & ~bad
         # A single hot pixel must not decide what the flux is.
         most = 2.0 * np.abs(self.image) + limit * self.scatter
-        flux = np.einsum("nyx,yx->n", usable * np.clip(images, -most, most), self.image)
-        own = np.einsum("nyx,yx->n", usable, self.image**2)
-        scale = flux / np.maximum(own, 1e-300)
-        off = np.abs(images - scale[:, None, None] * self.image) > limit * self.scatter
-        return np.asarray(off & usable)
+        believed = np.clip(images, -most, most)
+        believed *= usable
+        flux = believed.reshape(len(images), -1) @ self.image.ravel()
+        own = usable.reshape(len(images), -1) @ self.image.ravel() ** 2
+        off = images - (flux / np.maximum(own, 1e-300))[:, None, None] * self.image
+        np.abs(off, out=off)
+        return np.asarray((off > limit * self.scatter) & usable)
 
 
 def reference_of(file: Source) -> Reference:
@@ -100,8 +102,10 @@ def reference_of(file: Source) -> Reference:
     with np.errstate(invalid="ignore"):
         scaled = images * (np.median(flux) / flux)[:, None, None]
     scaled = np.where(good, scaled, 0.0)
-    image = np.nanmedian(scaled, axis=0)
-    spread = TO_SIGMA * np.nanmedian(np.abs(scaled - image), axis=0)
+    # With nothing missing the plain median is five times quicker.
+    median = np.nanmedian if np.isnan(scaled).any() else np.median
+    image = median(scaled, axis=0)
+    spread = TO_SIGMA * median(np.abs(scaled - image), axis=0)
     good &= ~_hot(image, good)
     image = _filled(image, good)
     measured = _measured_variance(cube, keep, lit, spread, len(images))

@@ -26,7 +26,7 @@ from amibayes.extraction.noise import (
     scatter_about_pointing,
 )
 from amibayes.extraction.options import ExtractOptions, Method
-from amibayes.extraction.response import off_axis_response, pointing_response
+from amibayes.extraction.response import off_axis_response, pointing_response, star_image
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import Source, opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
@@ -173,14 +173,15 @@ def _measured(
     if not frames.used.any():
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
     jacobian = bench.sampling.jacobian(flux, samples)
-    response = off_axis_response(bench.view, bench.sampling, template.orientation)
+    star = star_image(bench.view)
+    response = off_axis_response(star, bench.sampling, template.orientation)
     return _Part(
         template,
         bench,
         frames,
-        jacobian @ bench.noise @ jacobian.T,
+        bench.sampling.propagated(jacobian, bench.variance),
         response,
-        pointing_response(bench.view, bench.sampling, frames.shift_px),
+        pointing_response(star, bench.sampling, frames.shift_px),
     )
 
 
@@ -206,8 +207,8 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
-    covariance = sampling.noise(np.where(good, noise.variance, 0.0))
-    return Bench(view, geometry, reference, fit, expected, sampling, covariance, options)
+    variance = np.where(good, noise.variance, 0.0).ravel()
+    return Bench(view, geometry, reference, fit, expected, sampling, variance, options)
 
 
 def _fit_variance(
@@ -265,7 +266,8 @@ def _expected(residual: FloatArray, image: FloatArray, noise: NoiseModel) -> Res
     # A scatter of few integrations may be small by chance: its surroundings have a say.
     around = np.sqrt(uniform_filter(spread.reshape(image.shape) ** 2, 5)).ravel()
     slack = JITTER_SLACK * maximum_filter(np.abs(image), 3).ravel()
-    return Residual(middle, np.maximum(spread, around) + np.sqrt(noise.variance).ravel() + slack)
+    scatter = np.maximum(spread, around) + np.sqrt(noise.variance).ravel() + slack
+    return Residual(middle.astype(np.float32), scatter.astype(np.float32))
 
 
 def _refuse_another(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy.stats import norm
 from amibayes.cube import Cube
 from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
 from amibayes.extraction.geometry import Geometry
-from amibayes.extraction.image_plane import FringeFit, shift_of
+from amibayes.extraction.image_plane import FringeFit, SingleArray, shift_of
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.sampling import IntArray, Sampling
 from amibayes.extraction.source import Source
@@ -80,8 +81,8 @@ class Frames:
 class Residual:
     """What the fit of a good integration leaves in each pixel, and how that varies."""
 
-    mean: FloatArray
-    scatter: FloatArray
+    mean: SingleArray
+    scatter: SingleArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +100,8 @@ class Bench:
         Of that fit.
     sampling : Sampling
         What is measured.
-    noise : array
-        Covariance of the sampling's numbers in one integration.
+    variance : (n_pixels,) array
+        Of the noise of one integration; 0 where a pixel is never used.
     options : ExtractOptions
     """
 
@@ -110,8 +111,18 @@ class Bench:
     fit: FringeFit
     expected: Residual
     sampling: Sampling
-    noise: FloatArray
+    variance: FloatArray
     options: ExtractOptions
+
+    @cached_property
+    def bias(self) -> tuple[float, FloatArray]:
+        """What noise adds to flux² and to the power of every baseline."""
+        return self.sampling.bias(self.variance)
+
+    @property
+    def fits(self) -> bool:
+        """Whether what is measured is the fit itself."""
+        return self.options.method == "fringes"
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
@@ -167,10 +178,11 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     count = missing[:, ~never].sum(axis=1)
     hopeless = count > MOST_BAD * missing.shape[1]
     missing = (missing | never) & ~hopeless[:, None]
-    filled, residual, extra_bad = _filled(bench, pixels, missing)
-    flux, samples = bench.sampling.apply(filled)
+    filled, coefficients, residual, extra_bad = _filled(bench, pixels, missing)
+    numbers = coefficients[:, :-1] if bench.fits else filled @ bench.sampling.matrix
+    flux, samples = bench.sampling.split(numbers)
     shift = _shift(bench, samples)
-    own, extra = bench.sampling.bias(bench.noise)
+    own, extra = bench.bias
     mjd = np.full(n, np.nan) if cube.mjd is None else cube.mjd
     reason = np.where(hopeless, "too many bad pixels", np.where(flux > 0.0, "", "no light"))
     return (
@@ -191,7 +203,7 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
-def _share(residual: FloatArray, pixels: FloatArray) -> FloatArray:
+def _share(residual: SingleArray, pixels: FloatArray) -> FloatArray:
     """Root of the ratio of the sums of squares, (n,)."""
     left, whole = (np.einsum("np,np->n", a, a) for a in (residual, pixels))
     return np.asarray(np.sqrt(left / np.maximum(whole, 1e-300)))
@@ -199,25 +211,29 @@ def _share(residual: FloatArray, pixels: FloatArray) -> FloatArray:
 
 def _filled(
     bench: Bench, pixels: FloatArray, missing: BoolArray
-) -> tuple[FloatArray, FloatArray, IntArray]:
+) -> tuple[FloatArray, FloatArray, SingleArray, IntArray]:
     """Fill missing pixels, and those that the fit then shows to be wrong.
 
     Returns
     -------
-    filled, residual : (n, n_pixels) array
+    filled : (n, n_pixels) array
+    coefficients : (n, n_coefficients) array
+    residual : (n, n_pixels) array
     count : (n,) int array
         Pixels found wrong.
     """
     fit, expected = bench.fit, bench.expected
     filled = fit.fill(pixels, missing)
-    residual = filled - fit.solve(filled) @ fit.design.T
+    coefficients = fit.solve(filled)
+    residual = fit.residual(filled, coefficients)
     wrong = np.abs(residual - expected.mean) > bench.options.outlier * expected.scatter
     wrong &= ~missing
     hit = np.flatnonzero(wrong.any(axis=1))
     if len(hit):
         filled[hit] = fit.fill(pixels[hit], missing[hit] | wrong[hit])
-        residual[hit] = filled[hit] - fit.solve(filled[hit]) @ fit.design.T
-    return filled, residual, wrong.sum(axis=1)
+        coefficients[hit] = fit.solve(filled[hit])
+        residual[hit] = fit.residual(filled[hit], coefficients[hit])
+    return filled, coefficients, residual, wrong.sum(axis=1)
 
 
 def _shift(bench: Bench, samples: ComplexArray) -> FloatArray:

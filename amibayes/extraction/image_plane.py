@@ -8,8 +8,10 @@ it is given the value that the fit then predicts, for which a small system is so
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
@@ -20,6 +22,8 @@ from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray, read_only
 
 MOST_STEPS = 12
+
+SingleArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +55,16 @@ class FringeFit:
     def solve(self, pixels: FloatArray) -> FloatArray:
         """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
         return np.asarray(pixels @ self.inverse)
+
+    @cached_property
+    def _model(self) -> SingleArray:
+        return np.ascontiguousarray(self.design.T, dtype=np.float32)
+
+    def residual(self, pixels: FloatArray, coefficients: FloatArray) -> SingleArray:
+        """What the fit leaves of images, in single precision: it is looked at, not measured."""
+        model = coefficients.astype(np.float32) @ self._model
+        np.subtract(pixels, model, out=model, dtype=np.float32, casting="same_kind")
+        return np.asarray(model)
 
     def fill(self, pixels: FloatArray, missing: BoolArray) -> FloatArray:
         """Give missing pixels the values that a fit without them predicts.

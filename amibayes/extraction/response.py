@@ -8,6 +8,8 @@ baseline; the logarithm of that is an even polynomial in the place.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from amibayes.extraction.sampling import Sampling
@@ -19,7 +21,7 @@ from amibayes.orientation import Orientation
 from amibayes.response import EXPONENTS, IS_PHASE, powers_at
 from amibayes.units import FloatArray
 
-RADII = 7
+RADII, FARTHEST = 7, 0.95
 ANGLES = 7
 
 REACH_PX = (0.3, 1.5)
@@ -29,12 +31,40 @@ SMALLEST = 1e-3
 """Responses are not followed below this."""
 
 
-def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) -> FloatArray:
+@dataclass(frozen=True, eq=False)
+class StarImage:
+    """A star's image on cells finer than the pixels, and the view it is of."""
+
+    view: View
+    fine: FloatArray
+    oversample: int
+
+    def measured(self, sampling: Sampling, place_px: FloatArray) -> tuple[FloatArray, ComplexArray]:
+        """Flux and samples of a point of unit flux at places (n, 2) from the centre."""
+        shifts = place_px + np.array(self.view.centre_px)
+        images = shifted_images(self.fine, self.oversample, self.view.shape, shifts)
+        return sampling.apply(images.reshape(len(images), -1))
+
+
+def star_image(view: View) -> StarImage:
+    """Make the image that both responses are measured with."""
+    instrument = view.instrument
+    mask = instrument.mask.rotated(view.rotation_rad)
+    shortest = float(view.channels.wavelength_m.min())
+    over = fine_sampling(instrument.pixel_scale_rad * mask.extent_m / shortest)
+    reach = FARTHEST * instrument.field_rad / instrument.pixel_scale_rad
+    size = fine_size(max(view.shape), over, reach + max(abs(c) for c in view.centre_px))
+    turned = instrument.with_mask(mask)
+    fine = psf(turned, view.channels, size, oversample=over, integrate=False)
+    return StarImage(view, fine, over)
+
+
+def off_axis_response(star: StarImage, sampling: Sampling, orientation: Orientation) -> FloatArray:
     """Measure the response of flux and of every baseline.
 
     Parameters
     ----------
-    view : View
+    star : StarImage
     sampling : Sampling
     orientation : Orientation
         How the image lies on the sky.
@@ -45,9 +75,10 @@ def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) 
         Of ln(response) in `amibayes.response.powers_at` of east and north in radians,
         beyond the smearing over the filter's width (`relative_band`).
     """
-    radius = view.instrument.field_rad * np.linspace(0.12, 0.95, RADII)
+    view = star.view
+    radius = view.instrument.field_rad * np.linspace(0.12, FARTHEST, RADII)
     place = _places(radius, np.pi * np.arange(ANGLES) / ANGLES)
-    flux, samples = _measured(view, sampling, place)
+    flux, samples = star.measured(sampling, place / view.instrument.pixel_scale_rad)
     turns = view.uv_m @ place.T / view.wavelength_m
     expected = np.exp(-2j * np.pi * turns) * np.sinc(relative_band(view) * turns)
     ratio = np.vstack([flux, sampling.fringes(samples).T / expected])
@@ -62,7 +93,7 @@ def off_axis_response(view: View, sampling: Sampling, orientation: Orientation) 
     return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
 
 
-def pointing_response(view: View, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
+def pointing_response(star: StarImage, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
     """Visibility (n, n_baselines) that is measured of the star itself at shifts (n, 2).
 
     An image that has moved under an envelope that has not loses V², and its fringes turn.
@@ -72,8 +103,8 @@ def pointing_response(view: View, sampling: Sampling, shift_px: FloatArray) -> C
     reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
     angle = 2.0 * np.pi * np.arange(2 * ANGLES) / (2 * ANGLES)
     place = _places(reach * np.array([0.35, 0.75, 1.4]), angle)
-    flux, samples = _measured(view, sampling, place * view.instrument.pixel_scale_rad)
-    turn = np.exp(2j * np.pi * place @ view.frequency_px.T)
+    flux, samples = star.measured(sampling, place)
+    turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)
     seen = sampling.fringes(samples) * turn / flux[:, None]
     found = np.linalg.lstsq(_monomials(place / reach), seen, rcond=None)[0]
     return np.asarray(_monomials(shift_px / reach) @ found)
@@ -94,17 +125,3 @@ def _places(radius: FloatArray, angle: FloatArray) -> FloatArray:
     """Points (n, 2) at all of these distances and angles."""
     r, a = (grid.ravel() for grid in np.meshgrid(radius, angle))
     return np.stack([r * np.cos(a), r * np.sin(a)], axis=1)
-
-
-def _measured(view: View, sampling: Sampling, place: FloatArray) -> tuple[FloatArray, ComplexArray]:
-    """Flux and samples of a point of unit flux at places (n, 2)."""
-    pixel, mask = view.instrument.pixel_scale_rad, view.instrument.mask.rotated(view.rotation_rad)
-    reach = float(np.abs(place).max() / pixel)
-    over = fine_sampling(pixel * mask.extent_m / float(view.channels.wavelength_m.min()))
-    side = max(view.shape)
-    size = fine_size(side, over, reach + max(np.abs(view.centre_px)))
-    instrument = view.instrument.with_mask(mask)
-    fine = psf(instrument, view.channels, size, oversample=over, integrate=False)
-    shifts = place / pixel + np.array(view.centre_px)
-    images = shifted_images(fine, over, view.shape, shifts)
-    return sampling.apply(images.reshape(len(images), -1))

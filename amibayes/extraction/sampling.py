@@ -103,14 +103,14 @@ class Sampling:
         share[np.arange(self.n_samples), self.baseline] = self.weight
         return share
 
-    def noise(self, variance: FloatArray) -> FloatArray:
-        """Covariance of the operator's numbers for independent pixels of a variance."""
-        weighted = self.matrix * variance.reshape(-1, 1)
-        return np.asarray(self.matrix.T @ weighted)
+    def propagated(self, jacobian: FloatArray, variance: FloatArray) -> FloatArray:
+        """Covariance of what has a jacobian by the operator's numbers, from the pixels'."""
+        by_pixel = self.matrix @ jacobian.T
+        return np.asarray(by_pixel.T @ (by_pixel * variance[:, None]))
 
-    def bias(self, noise: FloatArray) -> tuple[float, FloatArray]:
-        """What noise adds to flux² and to the power, from the numbers' covariance."""
-        n, diagonal = self.n_samples, np.diag(noise)
+    def bias(self, variance: FloatArray) -> tuple[float, FloatArray]:
+        """What noise of independent pixels (n_pixels,) adds to flux² and to the power."""
+        n, diagonal = self.n_samples, variance @ self.matrix**2
         return float(diagonal[0]), (diagonal[1 : 1 + n] + diagonal[1 + n :]) @ self._by_baseline
 
     def jacobian(self, flux: float, samples: ComplexArray) -> FloatArray:

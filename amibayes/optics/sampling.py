@@ -10,6 +10,7 @@ another such matrix.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -111,6 +112,7 @@ def pixel_transform(frequency_per_px: FloatArray, pixel_response: float = 0.0) -
     return np.asarray(np.cos(2.0 * np.pi * np.multiply.outer(frequency_per_px, nodes)) @ response)
 
 
+@lru_cache(maxsize=16)
 def pixel_weights(pixel_response: float = 0.0) -> tuple[FloatArray, FloatArray]:
     """Quadrature nodes across a pixel, −½ to ½, and weights that sum to 1."""
     nodes, weight = np.polynomial.legendre.leggauss(_NODES)
