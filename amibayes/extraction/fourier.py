@@ -56,15 +56,17 @@ def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) 
         cells = _Cells(np.arange(mask.n_baselines), np.zeros((0, 2), np.intp), view.frequency_px)
         closing, triangle = mask.triangle_baselines, np.arange(len(mask.triangles))
         return _assembled(view, cells, level, star, np.ones(len(cells.baseline)), closing, triangle)
-    cells = _lattice(view, _half_width(view, options.method))
+    half_width = _half_width(view, options.method)
     if options.method == "matched":
-        return _matched(view, cells, level, fringes.matrix)
+        return _matched(view, _Patches.of(view, half_width), level, fringes.matrix)
+    cells = _lattice(view, half_width)
     gain = np.ones(len(cells.baseline))
     if options.method == "gauss":
         away = cells.frequency_px - view.frequency_px[cells.baseline]
         gain = np.exp(-0.25 * np.sum((away * max(view.shape) / GAUSS_SIGMA) ** 2, axis=1))
     if options.method == "fft":
-        gain = _brightness(cells, _own(view, cells, level, fringes.matrix))
+        own = _own(_Patches.of(view, half_width), level, fringes.matrix)
+        gain = np.tile(_brightness(own).ravel(), mask.n_baselines)
         cells, gain = cells.select(gain > 0.0), gain[gain > 0.0]
     closing, triangle = closing_products(mask.triangle_baselines, cells.offset, cells.baseline)
     return _assembled(view, cells, level, star, gain, closing, triangle)
@@ -96,18 +98,41 @@ def _lattice(view: View, half_width: int) -> _Cells:
     )
 
 
-def _brightness(cells: _Cells, model: ComplexArray) -> FloatArray:
-    """Share of the splodge at every cell: 0 outside it, 1 well inside.
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """Waves along either axis, (n_baselines, n_x, k) and (n_baselines, n_y, k)."""
+
+    along_x: ComplexArray
+    along_y: ComplexArray
+
+    @classmethod
+    def of(cls, view: View, half_width: int) -> _Patches:
+        side = np.arange(-half_width, half_width + 1) / max(view.shape)
+        x, y = (
+            np.exp(-2j * np.pi * axis[:, None] * (f[:, None] + side)[:, None, :])
+            for axis, f in zip(view.axes_px(), view.frequency_px.T, strict=True)
+        )
+        return cls(x, y)
+
+    def transform(self, images: ComplexArray | FloatArray) -> ComplexArray:
+        """Transform (n_baselines, k, k) of an image (…, n_y, n_x) for each baseline."""
+        return np.asarray(self.along_y.swapaxes(1, 2) @ images @ self.along_x)
+
+    def combined(self, weight: ComplexArray) -> ComplexArray:
+        """Sum (n_baselines, n_y, n_x) of the waves with weights (n_baselines, k, k)."""
+        return np.asarray(self.along_y @ weight @ self.along_x.swapaxes(1, 2))
+
+
+def _brightness(own: ComplexArray) -> FloatArray:
+    """Share (k, k) of the splodge at every cell: 0 outside it, 1 well inside.
 
     It is the same for all baselines, and rises evenly towards the middle: what a target
     and its calibrator are sampled with does not hang on a cell that just is or is not
     bright enough.
     """
-    n = int(cells.baseline.max()) + 1
-    mean = np.abs(model).reshape(n, -1).mean(axis=0)
-    mean = 0.5 * (mean + mean[::-1])
-    share = np.clip((mean / mean.max() - FAINTEST) / (BRIGHT - FAINTEST), 0.0, 1.0)
-    return np.asarray(np.tile(share, n))
+    mean = np.abs(own).mean(axis=0)
+    mean = 0.5 * (mean + mean[::-1, ::-1])
+    return np.asarray(np.clip((mean / mean.max() - FAINTEST) / (BRIGHT - FAINTEST), 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +168,7 @@ class _Levels:
         return np.asarray(wave - np.outer(self.background, wave.sum(axis=0)))
 
 
-def _matched(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Sampling:
+def _matched(view: View, patches: _Patches, level: _Levels, basis: FloatArray) -> Sampling:
     """One sample per baseline: cells weighted with the splodge that is expected there.
 
     The outskirts of neighbouring splodges overlap; what each sample sees of the others is
@@ -151,12 +176,12 @@ def _matched(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Sa
     """
     mask = view.instrument.mask
     n = mask.n_baselines
-    own = _own(view, cells, level, basis)
-    own *= _brightness(cells, own)
-    cells, own = cells.select(own != 0.0), own[own != 0.0]
-    share = np.zeros((len(own), n), dtype=complex)
-    share[np.arange(len(own)), cells.baseline] = own.conj()
-    operator = level.transform(view, cells.frequency_px) @ share
+    own = _own(patches, level, basis)
+    share = (own * _brightness(own)).conj()
+    window = level.window.reshape(view.shape)
+    level_of = np.sum(share * patches.transform(window), axis=(1, 2))
+    operator = (window * patches.combined(share)).reshape(n, -1).T
+    operator = operator - np.outer(level.background, level_of)
     matrix = np.column_stack([level.flux, operator.real, operator.imag])
     seen = basis.T @ matrix
     scale = np.abs(seen).max(axis=0)
@@ -171,15 +196,17 @@ def _matched(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> Sa
     )
 
 
-def _own(view: View, cells: _Cells, level: _Levels, basis: FloatArray) -> ComplexArray:
-    """Transform at every cell of its own baseline's fringe."""
-    out = np.empty(len(cells.baseline), dtype=complex)
-    n = view.instrument.mask.n_baselines
-    for b in range(n):
-        here = cells.baseline == b
-        fringe = basis[:, 1 + b] - 1j * basis[:, 1 + n + b]
-        out[here] = fringe @ level.transform(view, cells.frequency_px[here])
-    return out
+def _own(patches: _Patches, level: _Levels, basis: FloatArray) -> ComplexArray:
+    """Transform (n_baselines, k, k) of every baseline's own fringe, less its background."""
+    n = basis.shape[1] // 2
+    fringe = (basis[:, 1 : 1 + n] - 1j * basis[:, 1 + n :]).T
+    shape = patches.along_y.shape[1], patches.along_x.shape[1]
+    window = level.window.reshape(shape)
+    background = fringe @ level.background
+    return np.asarray(
+        patches.transform(window * fringe.reshape(n, *shape))
+        - background[:, None, None] * patches.transform(window)
+    )
 
 
 def _assembled(
