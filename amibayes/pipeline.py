@@ -30,7 +30,13 @@ from amibayes.inference.results import SearchResult
 from amibayes.inference.robust import frame_of
 from amibayes.inference.robust_noise import student_likelihood
 from amibayes.inference.robust_search import search_robust
-from amibayes.inference.search import look_outside, resolves_stars, search
+from amibayes.inference.search import (
+    SURELY_NOT_NOISE,
+    look_inside,
+    look_outside,
+    resolves_stars,
+    search,
+)
 from amibayes.inference.significance import (
     Significance,
     bank_statistic,
@@ -233,7 +239,26 @@ def search_field(
             f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
             "default one, a companion fits better than anywhere inside"
         ]
-    return result, noise, said
+    return result, noise, said + (_beyond(result) if options.separation_mas else [])
+
+
+def _beyond(result: SearchResult) -> list[str]:
+    """Say where a field that was asked for seems to leave the companion out."""
+    found, grid = [], result.grid
+    if (place := look_inside(result)) is not None:
+        found.append(
+            f"the field begins at {grid.inner_mas:.4g} mas: near {place:.1f} mas, nearer the "
+            "star, a companion fits as well or better, and this may be an alias of it"
+        )
+    rho = result.companion.separation_mas
+    if result.delta_chi2 > SURELY_NOT_NOISE and (
+        rho < grid.inner_mas + 0.25 * grid.step_mas or rho > grid.outer_mas - 0.25 * grid.step_mas
+    ):
+        found.append(
+            f"the best fit lies at {rho:.4g} mas, on the edge of the field that was asked for: "
+            "the companion may be outside it"
+        )
+    return found
 
 
 def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:

@@ -252,3 +252,38 @@ def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> N
     assert len(evidence["two_companions"]["companions"]) == 2
     assert evidence["halo"]["log_z"] < evidence["log_z"][0]
     assert sum(m["probability"] for m in result["modes"]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("field", "said"),
+    [
+        ("700:1500", "nearer the star, a companion fits as well or better"),
+        ("250:400", "nearer the star"),
+        ("60:100", "on the edge of the field that was asked for"),
+        ("50:400", None),
+    ],
+)
+def test_a_field_that_leaves_the_companion_out_is_warned_of(
+    field, said, target, tmp_path, capsys
+) -> None:
+    """The truth is at 133 mas."""
+    words = (target, *FAST, "--separation", field, "--json", "--out", tmp_path / "out")
+    assert run(*words) == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    beyond = [w for w in warnings if "nearer the star" in w or "on the edge" in w]
+    assert bool(beyond) == (said is not None)
+    assert said is None or said in beyond[0]
+    if field == "700:1500":
+        assert float(beyond[0].split("near ")[1].split(" mas")[0]) == pytest.approx(133.1, abs=15)
+
+
+def test_noise_alone_is_no_reason_to_look_elsewhere(tmp_path, capsys) -> None:
+    path = tmp_path / "none.oifits"
+    for seed in range(5):
+        write_oifits(
+            path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(seed)), overwrite=True
+        )
+        words = (path, *FAST, "--separation", "300:400", "--json", "--overwrite")
+        assert run(*words, "--out", tmp_path / "out") == 0
+        warnings = json.loads(capsys.readouterr().out)["warnings"]
+        assert not any("the field" in w for w in warnings)

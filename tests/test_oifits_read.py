@@ -542,3 +542,42 @@ def test_correlations_of_a_public_file_that_contradict_its_triangles(data: Path)
         diagonal = np.diagonal(hdus["CPCOV"].data, axis1=1, axis2=2).ravel()
     plain = read_oifits(path, closure_covariance="diagonal")
     np.testing.assert_allclose(plain.errors[1] ** 2, diagonal, rtol=1e-6)
+
+
+def test_values_that_no_calibration_error_explains_are_flagged(
+    made: HandMade, tmp_path: Path
+) -> None:
+    vis2, phase = made.vis2.copy(), made.phase_deg.copy()
+    vis2[0, 0], vis2[1, 1], vis2[2, 2] = 1e8, -2e4, 9.0
+    phase[0, 0], phase[1, 1] = 1e20, 350.0
+    made.put("OI_VIS2", "VIS2DATA", vis2)
+    made.put("OI_T3", "T3PHI", phase)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert list(np.flatnonzero(data.vis2.flag)) == [0, 4]
+    assert list(np.flatnonzero(data.closure_phase.flag)) == [0]
+    assert "OI_VIS2 (extension 4): 2 value(s) without a usable value or error flagged" in data.notes
+    assert "OI_T3 (extension 5): 1 value(s) without a usable value or error flagged" in data.notes
+
+
+@pytest.mark.parametrize(
+    ("band", "read", "said"),
+    [
+        ([-5e-8, 5e-8, 5e-8], [5e-8] * 3, "EFF_BAND is negative: its size is used"),
+        ([1e8, 5e-8, np.nan], [0.0, 5e-8, 0.0], "EFF_BAND of 2 channel(s) is no width"),
+        ([np.inf, -1.0, 0.0], [0.0] * 3, "EFF_BAND of 2 channel(s) is no width"),
+    ],
+)
+def test_widths_that_are_none(band, read, said: str, made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_WAVELENGTH", "EFF_BAND", band)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_allclose(data.setups[0].band_m, read, rtol=1e-6)
+    assert sum(said in note for note in data.notes) == 1
+
+
+def test_a_file_without_widths_says_so(made: HandMade, tmp_path: Path) -> None:
+    del made.tables["OI_WAVELENGTH"]["EFF_BAND"]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_array_equal(data.setups[0].band_m, 0.0)
+    assert data.notes == (
+        "OI_WAVELENGTH (extension 3) has no EFF_BAND: channels are taken as narrow",
+    )

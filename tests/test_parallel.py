@@ -29,6 +29,7 @@ from amibayes.parallel import (
     run_job,
     slices,
     spawn,
+    stage_bars,
 )
 
 
@@ -287,4 +288,22 @@ def test_progress_bar_draws_on_standard_error_only(
     assert "500/1000" in shown.err
     with progress_bar("injections", quiet=True) as progress:
         progress(1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def test_stages_follow_each_other(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    with stage_bars(unit="draw") as bars:
+        bars.stage("read")
+        bars.stage("search")
+        bars.update(40, 100)
+        bars.update(100, 200)
+        bars.stage("write")
+    said = capsys.readouterr()
+    assert said.out == ""
+    for part in ("read …", "search", "40/100", "100/200", "write …"):
+        assert part in said.err
+    with stage_bars(quiet=True) as bars:
+        bars.stage("read")
+        bars.update(1, 2)
     assert capsys.readouterr().err == ""

@@ -9,14 +9,14 @@ import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
     from amibayes.inference.priors import PriorSetting
-    from amibayes.parallel import Executor
+    from amibayes.parallel import Executor, StageBars
     from amibayes.parallel import Progress as Told
 
 
@@ -179,6 +179,15 @@ def progress_of(
     return progress_bar(description, unit=unit, scale=scale, quiet=arguments.quiet)
 
 
+def stages_of(
+    arguments: argparse.Namespace, *, unit: str = "piece"
+) -> AbstractContextManager[StageBars]:
+    """Open one progress bar after the other for a job of several stages, unless ``--quiet``."""
+    from amibayes.parallel import stage_bars
+
+    return stage_bars(unit=unit, quiet=arguments.quiet)
+
+
 def positive_integer(text: str) -> int:
     """Parse an integer above zero."""
     value = non_negative_integer(text)
@@ -299,42 +308,6 @@ def prior_setting(text: str) -> PriorSetting:
         return parse_setting(text)
     except UsageError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-class Progress:
-    """One progress bar per long stage, on standard error; nothing where it is no terminal."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self._off = quiet or not sys.stderr.isatty()
-        self._bar: Any = None
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def stage(self, name: str) -> None:
-        """Begin a stage."""
-        self._close()
-        if not self._off:
-            from tqdm import tqdm
-
-            self._bar = tqdm(desc=f"{name:12}", total=1, leave=False, file=sys.stderr)
-
-    def update(self, done: int, expected: int) -> None:
-        """Say how much of the stage is done."""
-        if self._bar is not None:
-            if self._bar.n == 0:  # what an earlier run left counts for nothing in the rate
-                self._bar.initial = done
-            self._bar.total = max(expected, done)
-            self._bar.n = done
-            self._bar.refresh()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
 
 
 def finish(

@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     stems = _stems(arguments.cubes)
     names = [SUMMARY, *(n for stem in stems for n in _names(stem, arguments))]
     folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)
-    with common.Progress(quiet=arguments.quiet) as progress:
+    with common.stages_of(arguments) as progress:
         progress.stage("extract")
         found = extract_all(arguments.cubes, options, **images.header)
     content = []

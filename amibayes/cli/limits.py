@@ -188,7 +188,7 @@ def _measure(
     journals = Journals(folder / JOURNAL, request, resume=arguments.resume)
     with (
         common.executor_of(arguments) as executor,
-        common.Progress(quiet=arguments.quiet) as progress,
+        common.stages_of(arguments) as progress,
     ):
         report = measure_limits(
             arguments.targets,

@@ -146,7 +146,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
 
     with (
         common.executor_of(arguments) as executor,
-        common.Progress(quiet=arguments.quiet) as progress,
+        common.stages_of(arguments) as progress,
     ):
         return search_companion(
             arguments.targets,

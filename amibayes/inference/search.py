@@ -26,6 +26,9 @@ FEWEST_SEEDS, MOST_SEEDS = 5, 24
 MODE_LIMIT = 25.0
 """Modes within this Δχ² of the best one are left standing."""
 
+SURELY_NOT_NOISE = 30.0
+"""Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
+
 MOST_LOOKED_AT = 40_000
 """Positions of the look around the field."""
 
@@ -70,15 +73,44 @@ def look_outside(result: SearchResult) -> float | None:
     around = make_grid(grid.outer_mas, farthest, step)
     if not len(around):
         return None
-    bank = TemplateBank(likelihood, around, result.single_theta)
-    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
+    gain, place = _best_on(around, result)
+    inside = float(result.bank_delta_chi2.max())
+    return place if gain >= inside + max(MODE_LIMIT, 0.1 * inside) else None
+
+
+def look_inside(result: SearchResult) -> float | None:
+    """Find where nearer the star than the field a companion would fit as well.
+
+    What was found may then be an alias of that. Only a gain that noise alone does not give
+    counts.
+
+    Returns
+    -------
+    float or None
+        Its separation in mas; None where nothing inside is as good.
+    """
+    nearest = default_separation(result.likelihood)[0]
+    if nearest >= result.grid.inner_mas:
+        return None
+    inner = result.grid.inner_mas
+    step = max(result.grid.step_mas, inner * float(np.sqrt(np.pi / MOST_LOOKED_AT)))
+    within = make_grid(nearest, inner, step)
+    if not len(within):
+        return None
+    gain, place = _best_on(within, result)
+    # A peak falls between the positions of either grid, which costs it up to 5 %.
+    as_good = 0.95 * float(result.bank_delta_chi2.max()) - MODE_LIMIT
+    return place if gain >= max(as_good, SURELY_NOT_NOISE) else None
+
+
+def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
+    """Largest gain in χ² at the positions of a grid, and the separation where it is, mas."""
+    bank = TemplateBank(result.likelihood, grid, result.single_theta)
+    residuals = single_likelihood(result.likelihood).residuals(result.single_theta)[:, 0]
     contrast, sigma = bank.scan(residuals)
     gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
-    inside = float(result.bank_delta_chi2.max())
     best = int(gain.argmax())
-    if gain[best] < inside + max(MODE_LIMIT, 0.1 * inside):
-        return None
-    return float(np.hypot(around.east_mas[best], around.north_mas[best]))
+    return float(gain[best]), float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
 
 
 def resolves_stars(likelihood: Likelihood) -> bool:

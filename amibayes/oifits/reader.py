@@ -16,6 +16,7 @@ from amibayes.oifits.setups import (
     DATA_TABLES,
     Target,
     array_table,
+    doubts_of_bands,
     integers,
     listing,
     make_setup,
@@ -157,16 +158,19 @@ def _parts(
         array = array_table(oifits, table)
         stations = stations_of(oifits, array, _stations_in_use(oifits, tables, array))
         own = table.header.get(f"{OWN_KEY} SETUP", 0)
+        doubts: tuple[str, ...] = ()
         key = (wavelengths.number, 0 if array is None else array.number, own)
         if key not in setups:
             made = make_setup(oifits, wavelengths, array, stations, targets[int(ids[chosen[0]])])
             setups[key] = with_response(oifits, made, own)
+            doubts = doubts_of_bands(oifits, wavelengths)
         setup = setups[key]
         index = integers(oifits, table, "STA_INDEX", 2 + (table.name == "OI_T3"))
         rows = read_rows(
             oifits, table, chosen, stations.position(index), (setup.wavelength_m, setup.band_m)
         )
         number, k = list(setups).index(key), 1 + (table.name == "OI_T3")
+        rows = replace(rows, notes=(*doubts, *rows.notes))
         first = rows_so_far.get((number, k), 0)
         rows_so_far[number, k] = first + len(chosen)
         parts.append(_Part(k, _numbered(rows, number, first, table)))

@@ -19,7 +19,11 @@ DAY_S = 86400.0
 
 @dataclass(frozen=True)
 class Kind:
-    """Which columns hold one kind of data, and what is too absurd to be used."""
+    """Which columns hold one kind of data, and what is too absurd to be used.
+
+    No calibration error makes a visibility of 100: a V² past ``largest_value`` is a fault. A
+    phase past it stands for "no value" (1e20, 9.97e36, …), and any other has its turns.
+    """
 
     table: str
     value: str
@@ -28,6 +32,7 @@ class Kind:
     v: tuple[str, ...]
     is_angle: bool
     largest_error: float
+    largest_value: float
 
     @property
     def index(self) -> str:
@@ -35,7 +40,7 @@ class Kind:
         return f"CORRINDX_{self.value}"
 
 
-VIS2 = Kind("OI_VIS2", "VIS2DATA", "VIS2ERR", ("UCOORD",), ("VCOORD",), False, 100.0)
+VIS2 = Kind("OI_VIS2", "VIS2DATA", "VIS2ERR", ("UCOORD",), ("VCOORD",), False, 100.0, 1e4)
 T3 = Kind(
     "OI_T3",
     "T3PHI",
@@ -44,11 +49,9 @@ T3 = Kind(
     ("V1COORD", "V2COORD"),
     True,
     np.pi,
+    1e10,
 )
 KINDS = {kind.table: kind for kind in (VIS2, T3)}
-
-LARGEST_VALUE = 1e10
-"""A number past this stands for "no value" (fill values are 1e20, 9.97e36, …)."""
 
 SMALLEST_ERROR = 1e-12
 """An error below this is none: it would outweigh everything else."""
@@ -204,7 +207,7 @@ def absurd(kind: Kind, value: FloatArray, variance: FloatArray) -> BoolArray:
     """Where a value or its error cannot be meant: not finite, not positive, or a fill value."""
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
-        usable = np.isfinite(value) & (np.abs(value) < LARGEST_VALUE)
+        usable = np.isfinite(value) & (np.abs(value) < kind.largest_value)
         usable &= (sigma >= SMALLEST_ERROR) & (sigma <= kind.largest_error)
     return np.asarray(~usable)
 

@@ -211,7 +211,7 @@ def wavelength_table(oifits: OIFits, table: OITable, n_channels: int) -> OITable
 
 
 def channels_of(oifits: OIFits, table: OITable) -> tuple[FloatArray, FloatArray]:
-    """(wavelength, width) of each channel in metres.
+    """(wavelength, width) of each channel in metres; a width that is none counts as 0.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def channels_of(oifits: OIFits, table: OITable) -> tuple[FloatArray, FloatArray]
     wavelength = _metres(oifits, table, "EFF_WAVE")
     band = np.zeros(len(table))
     if "EFF_BAND" in table.columns:
-        band = np.nan_to_num(_metres(oifits, table, "EFF_BAND"))
+        band = np.abs(_metres(oifits, table, "EFF_BAND"))
     usable = wavelength[np.isfinite(wavelength) & (wavelength > 0)]
     if not len(usable) or usable.max() > 1e-2:
         raise DataError(
@@ -229,7 +229,27 @@ def channels_of(oifits: OIFits, table: OITable) -> tuple[FloatArray, FloatArray]
             source=oifits.path,
             remedy="give the unit of EFF_WAVE in its TUNIT",
         )
-    return wavelength, np.abs(band)
+    with np.errstate(invalid="ignore"):
+        return wavelength, np.where(band <= wavelength, band, 0.0)
+
+
+def doubts_of_bands(oifits: OIFits, table: OITable) -> tuple[str, ...]:
+    """Say what was made of widths of channels that are none."""
+    if "EFF_BAND" not in table.columns:
+        return (f"{table.label} has no EFF_BAND: channels are taken as narrow",)
+    wavelength, band = (_metres(oifits, table, name) for name in ("EFF_WAVE", "EFF_BAND"))
+    with np.errstate(invalid="ignore"):
+        impossible, negative = ~(np.abs(band) <= wavelength), band < 0
+    impossible &= wavelength > 0
+    found = []
+    if impossible.any():
+        found.append(
+            f"{table.label}: EFF_BAND of {impossible.sum()} channel(s) is no width: they are "
+            "taken as narrow"
+        )
+    if (negative & ~impossible).any():
+        found.append(f"{table.label}: EFF_BAND is negative: its size is used")
+    return tuple(found)
 
 
 def _metres(oifits: OIFits, table: OITable, name: str) -> FloatArray:

@@ -17,7 +17,7 @@ from amibayes.parallel.job import (
 )
 from amibayes.parallel.journal import Journal, Journals, digest
 from amibayes.parallel.processes import ProcessExecutor
-from amibayes.parallel.progress import Progress, progress_bar
+from amibayes.parallel.progress import Progress, StageBars, progress_bar, stage_bars
 
 __all__ = [
     "DaskExecutor",
@@ -28,6 +28,7 @@ __all__ = [
     "ProcessExecutor",
     "Progress",
     "SerialExecutor",
+    "StageBars",
     "child_seeds",
     "digest",
     "open_executor",
@@ -35,4 +36,5 @@ __all__ = [
     "run_job",
     "slices",
     "spawn",
+    "stage_bars",
 ]

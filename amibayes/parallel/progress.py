@@ -34,26 +34,64 @@ def progress_bar(
         To be called with (done, total), in pieces. The rate counts only what this run
         did, not what an earlier one left in the journal.
     """
-    bar: list[tqdm[None]] = []
+    with stage_bars(unit=unit, scale=scale, quiet=quiet, leave=True) as bars:
+        bars.stage(description)
+        yield bars.update
 
-    def show(done: int, total: int) -> None:
-        if not bar:
-            bar.append(_bar(description, unit, done * scale, total * scale, quiet))
-        bar[0].update(done * scale - bar[0].n)
 
+class StageBars:
+    """One bar after the other, each for a stage; see `stage_bars`."""
+
+    def __init__(self, unit: str, scale: float, *, quiet: bool, leave: bool) -> None:
+        self._unit, self._scale, self._quiet, self._leave = unit, scale, quiet, leave
+        self._name, self._counts = "", False
+        self._bar: tqdm[None] | None = None
+
+    def stage(self, name: str) -> None:
+        """Begin a stage: its name, and a bar as soon as something is said of how far it is."""
+        self.close()
+        self._name, self._counts = name, False
+        if not self._leave:
+            self._bar = self._new(0, None, bar_format="{desc} …")
+
+    def update(self, done: int, total: int) -> None:
+        """Say how much of the stage is done; the total may grow."""
+        now, end = round(done * self._scale), round(total * self._scale)
+        if self._bar is None or not self._counts:
+            self.close()
+            self._bar, self._counts = self._new(now, end), True
+        grown = self._bar.total != end
+        self._bar.total = end
+        self._bar.update(now - self._bar.n)
+        if grown:
+            self._bar.refresh()
+
+    def close(self) -> None:
+        """End the bar."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _new(self, done: int, end: int | None, bar_format: str | None = None) -> tqdm[None]:
+        return tqdm(
+            desc=self._name,
+            unit=f" {self._unit}",
+            initial=done,
+            total=end,
+            disable=True if self._quiet else None,
+            dynamic_ncols=True,
+            leave=self._leave,
+            bar_format=bar_format,
+        )
+
+
+@contextmanager
+def stage_bars(
+    *, unit: str = "piece", scale: float = 1.0, quiet: bool = False, leave: bool = False
+) -> Iterator[StageBars]:
+    """Draw the bars of a job of several stages; ``leave`` keeps each when it is done."""
+    bars = StageBars(unit, scale, quiet=quiet, leave=leave)
     try:
-        yield show
+        yield bars
     finally:
-        for drawn in bar:
-            drawn.close()
-
-
-def _bar(description: str, unit: str, done: float, total: float, quiet: bool) -> tqdm[None]:
-    return tqdm(
-        desc=description,
-        unit=f" {unit}",
-        initial=round(done),
-        total=round(total),
-        disable=True if quiet else None,
-        dynamic_ncols=True,
-    )
+        bars.close()
