@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
+from astropy.table import QTable
 from numpy.typing import NDArray
 
 from amibayes.closure import assumed_covariance, closure_matrix, kernel_basis
@@ -19,6 +20,7 @@ from amibayes.covariance import (
     stack_covariances,
 )
 from amibayes.errors import DataError
+from amibayes.notebook import observables_html, observables_table
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
@@ -234,6 +236,13 @@ class Observables:
         if not len(chosen.data):
             raise DataError(f"holds no usable {' or '.join(kinds)}", source=self.source)
         return chosen
+
+    def to_table(self, kind: Literal["vis2", "closure_phase"] = "vis2") -> QTable:
+        """One kind of data as an astropy table with units."""
+        return observables_table(self, kind)
+
+    def _repr_html_(self) -> str:
+        return observables_html(self)
 
     def __repr__(self) -> str:
         return (

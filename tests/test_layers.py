@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "amibayes"
 LAYERS = [
     "__init__",
     "units",
+    "notebook",
     "disc",
     "orientation",
     "errors",

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from astropy.table import QTable
 from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
@@ -28,6 +29,7 @@ from amibayes.inference.rings import Rings, make_rings
 from amibayes.inference.rounds import IntArray, Setting, Trials, inject, spawned
 from amibayes.inference.search import resolution_mas
 from amibayes.inference.significance import Significance, clopper_pearson, null_maxima
+from amibayes.notebook import UNITS, html_table, quantity_table
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.units import FloatArray, contrast_to_delta_mag
@@ -107,6 +109,41 @@ class DetectionLimit:
     trials: IntArray
     detected: IntArray
     located: IntArray
+
+    def to_table(self) -> QTable:
+        """The limit at every separation as an astropy table with units."""
+        columns = {
+            "separation_mas": self.separation_mas,
+            "contrast": self.contrast,
+            "log_error": self.log_error,
+            "delta_mag": self.delta_mag,
+            "contrast_50": self.contrast_50,
+        }
+        meta = {
+            "method": self.method,
+            "false_positive_rate": self.false_positive_rate,
+            "completeness": self.completeness,
+        }
+        return quantity_table(columns, UNITS, meta)
+
+    def __repr__(self) -> str:
+        """One line for a notebook."""
+        return (
+            f"<DetectionLimit: {self.method}, {self.completeness:.0%} recovered at a "
+            f"false-positive rate of {self.false_positive_rate:.2g}, "
+            f"{len(self.separation_mas)} separations>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Show the curve in a notebook."""
+        rows = [
+            (f"{rho:.4g}", f"{mag:.2f}", f"{contrast:.3g}")
+            for rho, mag, contrast in zip(
+                self.separation_mas, self.delta_mag, self.contrast, strict=True
+            )
+        ]
+        header = ("separation (mas)", "delta mag", "contrast")
+        return html_table(repr(self).strip("<>"), header, rows)
 
     @property
     def delta_mag(self) -> FloatArray:

@@ -14,6 +14,7 @@ from typing import Any
 
 import emcee
 import numpy as np
+from astropy.table import QTable
 
 from amibayes.errors import DataError, UsageError
 from amibayes.inference.chain_file import digest_of, load_chain, save_chain
@@ -23,6 +24,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Mode, SearchResult
 from amibayes.inference.search import resolution_mas
+from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import FloatArray, contrast_to_delta_mag, position_angle_deg, separation
 
 N_WALKERS = 32
@@ -125,6 +127,22 @@ class Posterior:
         low, mid, high = np.quantile(values, [0.5 - level / 2, 0.5, 0.5 + level / 2]) + cut
         turn = 360.0 * (mid // 360.0) if name == "position_angle_deg" else 0.0
         return float(mid - turn), float(low - turn), float(high - turn)
+
+    def to_table(self) -> QTable:
+        """All samples as an astropy table with units, with separation, angle and Δmag."""
+        derived = ("separation_mas", "position_angle_deg", "delta_mag")
+        columns = {name: self.column(name) for name in (*self.names, *derived)}
+        return quantity_table(columns | {"log_prob": self.log_prob}, UNITS)
+
+    def _repr_html_(self) -> str:
+        """Show medians and intervals in a notebook."""
+        rows = []
+        for name in ("separation_mas", "position_angle_deg", "delta_mag", *self.names):
+            median, low, high = self.interval(name)
+            _, low95, high95 = self.interval(name, 0.95)
+            rows.append((pretty(name), *(f"{x:.5g}" for x in (median, low, high, low95, high95))))
+        header = ("", "median", "16 %", "84 %", "2.5 %", "97.5 %")
+        return html_table(repr(self).strip("<>"), header, rows)
 
     def convergence(self) -> dict[str, dict[str, float]]:
         """How far each parameter can be trusted: autocorrelation time, split-R̂, samples."""

@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
 
 from amibayes.inference.bank import Grid
 from amibayes.inference.detection import candid_n_sigma
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.robust import Robustness
+from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -48,6 +52,30 @@ class Companion:
     def delta_mag(self) -> float:
         """Magnitude difference to the primary."""
         return float(contrast_to_delta_mag(self.contrast))
+
+    def coordinates(self, star: SkyCoord) -> SkyCoord:
+        """Position on the sky, from that of the star (at the epoch of the data)."""
+        return star.directional_offset_by(
+            self.position_angle_deg * units.deg, self.separation_mas * units.mas
+        )
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        errors = {
+            "separation_mas": self.separation_error_mas,
+            "position_angle_deg": self.position_angle_error_deg,
+            "contrast": self.contrast_error,
+            "delta_mag": self.delta_mag_error,
+            "east_mas": self.east_error_mas,
+            "north_mas": self.north_error_mas,
+        }
+        return [
+            (pretty(name), f"{getattr(self, name):.5g}", f"{error:.2g}")
+            for name, error in errors.items()
+        ]
+
+    def _repr_html_(self) -> str:
+        """Show the companion in a notebook."""
+        return html_table("Companion", ("", "value", "1σ"), self._rows())
 
     @property
     def delta_mag_error(self) -> float:
@@ -136,6 +164,25 @@ class SearchResult:
         if name in self.likelihood.parameters:
             return float(self.theta[self.likelihood.parameters.index(name)])
         return float(getattr(self.likelihood.model, name))
+
+    def to_table(self) -> QTable:
+        """Every solution left standing, best first, as an astropy table with units."""
+        names = ("separation_mas", "position_angle_deg", "contrast", "delta_mag")
+        found = [mode.companion for mode in self.modes]
+        columns = {name: [getattr(c, name) for c in found] for name in names}
+        gains = {"delta_chi2": [mode.delta_chi2 for mode in self.modes]}
+        return quantity_table(columns | gains, UNITS)
+
+    def _repr_html_(self) -> str:
+        """Show the best fit in a notebook."""
+        more = [
+            ("Δχ²", f"{self.delta_chi2:.1f}", ""),
+            ("CANDID nσ", f"{self.candid_n_sigma:.1f}", ""),
+            ("modes", str(len(self.modes)), ""),
+            *(("warning", text, "") for text in self.warnings),
+        ]
+        rows = [*self.companion._rows(), *more]
+        return html_table("Best fit of the search", ("", "value", "1σ"), rows)
 
     def __repr__(self) -> str:
         """One line for a notebook."""
