@@ -113,6 +113,7 @@ class SearchReport:
     grid: GridPosterior | None = None
     evidence: Evidence | None = None
     noise_posterior: dict[str, NoisePosterior] | None = None
+    second_significance: Significance | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 

@@ -27,7 +27,7 @@ from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
-from amibayes.inference.robust import frame_of
+from amibayes.inference.robust import Frame, frame_of
 from amibayes.inference.robust_noise import student_likelihood
 from amibayes.inference.robust_search import search_robust
 from amibayes.inference.search import (
@@ -47,6 +47,7 @@ from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
 from amibayes.parallel import Executor, Journal, Progress
 from amibayes.preparing import Clock, Stage, prepare
+from amibayes.units import FloatArray
 
 MOST_NOISE_SAMPLES = 2000
 """Samples of the posterior that the noise is averaged over."""
@@ -93,9 +94,9 @@ def search_companion(
         Where the request makes no sense.
     """
     options = options or SearchOptions()
-    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(5)]
+    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(6)]
     clock = Clock(announce)
-    weight, posterior, limits = None, None, None
+    weight, second, posterior, limits = None, None, None, None
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
         ready = prepare(targets, calibrators, options, streams[3], clock)
@@ -112,6 +113,9 @@ def search_companion(
                 )
         prior = _prior(result, options)
         two = _second(result, options, clock)
+        if two is not None and weight is not None:
+            with clock.stage("significance of the second"):
+                second = weigh_second(result, options, streams[5], executor, progress)
         averaged, two = noise_averaged(result, two, observables, options)
         grid = _integrated(averaged, prior, options, clock)
         if options.posterior:
@@ -136,6 +140,7 @@ def search_companion(
         grid,
         evidence,
         _noise_posterior(averaged, posterior),
+        second,
         clock.seconds,
     )
 
@@ -329,24 +334,71 @@ def weigh(
     Whether noise was added depends on the data, and a false companion can hide that it
     should have been: a statistic that does not know the scale needs no such decision.
     """
-    likelihood, frame, free_scale = result.likelihood, None, options.extra_noise
-    if result.robustness is not None:
-        # Weights were found with a companion; no companion may be judged by them.
-        base = result.robustness.base
-        likelihood, frame, free_scale = Likelihood(base, likelihood.model), frame_of(base), True
+    likelihood, frame = judging(result)
     bank = TemplateBank(likelihood, result.grid, result.single_theta)
     residuals = single_likelihood(likelihood).residuals(result.single_theta)
-    weight = significance(
-        bank,
-        float(bank_statistic(bank, residuals, free_scale=free_scale, frame=frame)[0]),
-        options.null_draws,
-        rng,
-        options.alpha,
-        free_scale=free_scale,
-        frame=frame,
-        executor=executor,
-        progress=progress,
-        journal=journal,
-    )
-    field = statistic_field(bank, residuals[:, 0], free_scale=free_scale, frame=frame)
+    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, journal)
+    weight = run.judge(bank, residuals, options, rng)
+    field = statistic_field(bank, residuals[:, 0], free_scale=run.free_scale, frame=frame)
     return replace(weight, field=field)
+
+
+def weigh_second(
+    result: SearchResult,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> Significance:
+    """Weigh what the first companion leaves: the chance that noise alone gives a second one.
+
+    All that the first companion can do by moving or brightening is projected out, of the
+    data and of the null sets.
+    """
+    likelihood, frame = judging(result)
+    bank = TemplateBank(likelihood, result.grid, result.single_theta, beside=result.theta)
+    residuals = likelihood.residuals(result.theta)
+    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, None)
+    return run.judge(bank, residuals, options, rng)
+
+
+def judging(result: SearchResult) -> tuple[Likelihood, Frame | None]:
+    """Likelihood by which a search is judged, and the frame of robust residuals."""
+    if result.robustness is None:
+        return result.likelihood, None
+    # Weights were found with a companion; no companion may be judged by them.
+    base = result.robustness.base
+    return Likelihood(base, result.likelihood.model), frame_of(base)
+
+
+@dataclass(frozen=True)
+class _Nulls:
+    """How null searches are run."""
+
+    frame: Frame | None
+    free_scale: bool
+    executor: Executor | None
+    progress: Progress | None
+    journal: Journal | None
+
+    def judge(
+        self,
+        bank: TemplateBank,
+        residuals: FloatArray,
+        options: SearchOptions,
+        rng: np.random.Generator,
+    ) -> Significance:
+        """Place the statistic of residuals (n_data, 1) among null searches."""
+        statistic = bank_statistic(bank, residuals, free_scale=self.free_scale, frame=self.frame)
+        return significance(
+            bank,
+            float(statistic[0]),
+            options.null_draws,
+            rng,
+            options.alpha,
+            free_scale=self.free_scale,
+            frame=self.frame,
+            executor=self.executor,
+            progress=self.progress,
+            journal=self.journal,
+        )

@@ -186,7 +186,7 @@ def test_coverage_and_efficiency(share) -> None:
 
 @pytest.mark.parametrize("share", [0.0, SHARE])
 def test_false_alarm_probability_stays_uniform(share) -> None:
-    """1000 null data sets with and without outliers, each against one robust null.
+    """400 null data sets with and without outliers, each against one robust null.
 
     Kolmogorov-Smirnov p > 1e-4 without; P(p < 0.05) and P(p < 0.01) at most their binomial
     1e-4 bounds with outliers (which make the test a little conservative).
@@ -197,7 +197,7 @@ def test_false_alarm_probability_stays_uniform(share) -> None:
     bank = TemplateBank(likelihood, make_grid(*FIELD, 23.5), np.empty(0))
     frame = frame_of(data)
     null = np.sort(null_maxima(bank, 20_000, rng, free_scale=True, frame=frame))
-    n = 1000
+    n = 400
     sets = [spoiled(np.zeros(3), rng, share)[0] for _ in range(n)]
     blank = likelihood.predict([np.zeros(3)])[:, 0]
     white = data.covariance.whiten(np.array([s.data - blank for s in sets]).T)

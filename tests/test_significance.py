@@ -10,6 +10,7 @@ from scipy import stats
 from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
+from amibayes.inference.refine import Box, refine
 from amibayes.inference.search import search
 from amibayes.inference.significance import (
     Significance,
@@ -135,16 +136,16 @@ def test_both_tails_find_laws_they_did_not_make(law, far) -> None:
 
 @pytest.mark.parametrize("free_scale", [True, False])
 def test_local_probability_is_uniform_at_a_fixed_position(free_scale) -> None:
-    """4000 null data sets; half of them gain nothing there. Binomial chance 1e-5 per level."""
+    """1500 null data sets; half of them gain nothing there. Binomial chance 1e-5 per level."""
     model = BinaryModel(background="free")
     bank = TemplateBank(Likelihood(niriss(), model), make_grid(100.0, 110.0, 47.0), np.array([0.0]))
-    white = np.random.default_rng(10).standard_normal((bank.n_data, 4000))
+    white = np.random.default_rng(10).standard_normal((bank.n_data, 1500))
     field = np.array([statistic_field(bank, w, free_scale=free_scale)[3] for w in white.T])
     n_free = bank.n_data - bank.n_nuisance
     weight = Significance(1.0, field, 1.0, (0, 1), None, 0.1, free_scale, None, n_free)
     p = weight.local_survival(field)
     for level in (0.3, 0.1, 0.02):
-        assert stats.binomtest(int((p < level).sum()), 4000, level).pvalue > 1e-5
+        assert stats.binomtest(int((p < level).sum()), 1500, level).pvalue > 1e-5
 
 
 def test_field_peaks_at_the_statistic_of_the_search(rng) -> None:
@@ -160,3 +161,25 @@ def test_field_peaks_at_the_statistic_of_the_search(rng) -> None:
         assert field.max() == pytest.approx(
             bank_statistic(bank, white[:, None], free_scale=free)[0], rel=1e-5
         )
+
+
+def test_second_companion_is_judged_fairly_beside_the_first() -> None:
+    """300 data sets of one companion of 2 %: the probability of a second one is uniform.
+
+    Kolmogorov-Smirnov p > 1e-4, rates below 0.1 and 0.02 within binomial chance 1e-4.
+    """
+    rng, truth = np.random.default_rng(14), np.array([150.0, -80.0, 0.02])
+    sheet = niriss()
+    grid, box = make_grid(50.0, 400.0, 23.5), Box(50.0, 400.0, 188.0)
+    bank = TemplateBank(Likelihood(sheet), grid, np.empty(0), beside=truth)
+    null = np.sort(null_maxima(bank, 10_000, rng, free_scale=True))
+    statistic = []
+    for _ in range(300):
+        likelihood = Likelihood(simulated(sheet, truth, rng))
+        theta = np.array(refine(likelihood, truth, box, 0.0).theta)
+        own = TemplateBank(likelihood, grid, np.empty(0), beside=theta)
+        statistic.append(bank_statistic(own, likelihood.residuals(theta), free_scale=True)[0])
+    p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
+    assert stats.kstest(p, "uniform").pvalue > 1e-4
+    for level in (0.1, 0.02):
+        assert stats.binomtest(int((p < level).sum()), 300, level).pvalue > 1e-4

@@ -109,16 +109,29 @@ class TemplateBank:
     grid : Grid
     nuisance : (n_nuisance,) float array
         Values of the free parameters that are not a companion's (diameter, background).
+    beside : (n_dim,) float array, optional
+        Parameters of the likelihood's model whose companion is there already: what it and the
+        nuisance parameters can do is projected out.
     """
 
-    def __init__(self, likelihood: Likelihood, grid: Grid, nuisance: FloatArray) -> None:
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        grid: Grid,
+        nuisance: FloatArray,
+        *,
+        beside: FloatArray | None = None,
+    ) -> None:
         self.grid = grid
         self.n_data = likelihood.n_independent
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
         self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
         self._offset = np.asarray(self._even.matrix @ self._primary)
-        self._basis = _nuisance_basis(likelihood, nuisance)
+        if beside is None:
+            self._basis = _nuisance_basis(likelihood, nuisance)
+        else:
+            self._basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
 
     def __len__(self) -> int:
         return len(self.grid)

@@ -53,7 +53,9 @@ def result_json(report: SearchReport) -> Json:
         "limits": None if report.limits is None else limits_json(report.limits),
         "noise": _noise(report),
         "robust": _robust(report.result),
-        "evidence": None if report.evidence is None else evidence_json(report.evidence),
+        "evidence": None
+        if report.evidence is None
+        else evidence_json(report.evidence, report.second_significance),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
     }
@@ -248,7 +250,7 @@ def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
     }
 
 
-def evidence_json(evidence: Evidence) -> Json:
+def evidence_json(evidence: Evidence, second: Significance | None = None) -> Json:
     """Build the content of ``evidence`` in ``result.json``."""
     names = evidence.nuisance_names
     return {
@@ -263,14 +265,16 @@ def evidence_json(evidence: Evidence) -> Json:
             "log_z": number(evidence.halo_log_z),
             "background": [0.0, HALO_BACKGROUND],
         },
-        "two_companions": None if evidence.two is None else _two(evidence.two),
+        "two_companions": None if evidence.two is None else _two(evidence.two, second),
     }
 
 
-def _two(two: TwoCompanions) -> Json:
+def _two(two: TwoCompanions, second: Significance | None) -> Json:
     """The joint fit of two companions, the brighter one first."""
     return {
         "chi2": two.chi2,
+        "false_alarm_probability": None if second is None else second.probability,
+        "false_alarm_interval": None if second is None else list(second.interval),
         "ndof": two.likelihood.n_independent - len(two.theta),
         "companions": [
             {name: number(getattr(c, name)) for name in QUANTITIES}

@@ -48,6 +48,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     lines += _upper_limit_lines(report)
     if report.evidence is not None:
         lines += _evidence_lines(report.evidence)
+        lines += _second_lines(report, report.evidence)
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     room = 19 - len(lines)
@@ -143,6 +144,26 @@ def _evidence_lines(evidence: Evidence) -> list[str]:
     shares = zip(evidence.companions, evidence.log_z, evidence.probability, strict=True)
     parts = [f"{k}: ln Z {z:.1f} ({p:.2g})" for k, z, p in shares]
     return [f"evidence    companions (probability) {', '.join(parts)}"]
+
+
+def _second_lines(report: SearchReport, evidence: Evidence) -> list[str]:
+    """The second companion, with what it is worth."""
+    if evidence.two is None:
+        return []
+    first = report.result.companion
+    other = max(
+        evidence.two.companions,
+        key=lambda c: np.hypot(c.east_mas - first.east_mas, c.north_mas - first.north_mas),
+    )
+    gain = report.result.chi2_binary - evidence.two.chi2
+    line = (
+        f"second      {other.separation_mas:.2f} mas, PA {other.position_angle_deg:.2f} deg, "
+        f"contrast {other.contrast:.5f}: delta chi2 {gain:.1f}"
+    )
+    if report.second_significance is not None:
+        weight = report.second_significance
+        line += f" ({'detected' if weight.detected else 'NOT detected'}; {_chance(weight)})"
+    return [line]
 
 
 def _posterior_lines(posterior: Posterior) -> list[str]:
