@@ -178,10 +178,15 @@ def judge(
     right = np.hypot(*(found - places).T) < 0.5 * fringe_mas
     doubtful = np.flatnonzero(detected & ~right)
     right[doubtful] = _correlation(bank, found[doubtful], places[doubtful]) > ALIAS
+    # Aliases are the dearest part: only those are asked for that decide something.
+    sure = np.flatnonzero(detected & right)
     if nearer is None:
-        distinct, which = np.unique(places, axis=0, return_inverse=True)
-        nearer = nearer_alias(bank, fringe_mas, distinct)[which.ravel()]
-    located = detected & right & ~ambiguous(nearer, gain)
+        distinct, which = np.unique(places[sure], axis=0, return_inverse=True)
+        closer = nearer_alias(bank, fringe_mas, distinct)[which.ravel()]
+    else:
+        closer = nearer[sure]
+    located = np.zeros(len(places), dtype=bool)
+    located[sure] = ~ambiguous(closer, gain[sure])
     return {"detected": detected, "located": located, "statistic": statistic}
 
 
