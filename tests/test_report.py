@@ -202,6 +202,30 @@ def test_nothing_is_claimed_without_null_draws_and_absent_stages_are_absent(cont
     assert "improves the fit" in statement_of(bare).headline
 
 
+def test_noise_and_outliers_are_told(content) -> None:
+    noisy = copy.deepcopy(content)
+    interval = {"median": 0.01, "lower": 0.005, "upper": 0.02, "lower_95": 0.0, "upper_95": 0.03}
+    noisy["noise"] = {
+        "extra_vis2": 0.012, "extra_closure_phase_deg": 0.0,
+        "posterior": {"extra_vis2": interval | {"probability_errors_right": 0.02}},
+    }  # fmt: skip
+    outlier = {
+        "kind": "closure_phase", "stations": ["A1", "B2", "C3"], "wavelength_m": 4.3e-6,
+        "mjd": 60000.5, "source": "x/night.fits", "weight": 0.04, "residual": -7.25,
+    }  # fmt: skip
+    noisy["robust"] = {"degrees_of_freedom": 4.0, "outliers": [outlier] * 25}
+    said = Reader(page_html(search_page(noisy))).said
+    assert "noise of 0.012 in V² and 0° in closure phase was added" in said
+    assert "0.005 to 0.02" in said
+    assert "25 data lost most of it" in said
+    assert said.count("A1-B2-C3") == 20
+    assert "5 more in result.json" in said
+    assert "night.fits" in said
+    assert "−7.2" in said
+    quiet = copy.deepcopy(content) | {"robust": None}
+    assert "no noise was added" in Reader(page_html(search_page(quiet))).said
+
+
 def test_any_command_can_make_a_page() -> None:
     table = Table("<i>t</i>", (Column("a", "text"), Column("b")), (("<u>x</u>", "1"),))
     page = Page("amibayes validate", "Validation", "", Statement("open", "l", "<b>h</b>"),

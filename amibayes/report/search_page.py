@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from amibayes.report import fit_sections
+from amibayes.report.noise_section import noise
 from amibayes.report.page import (
     Column,
     Fact,
@@ -64,6 +65,7 @@ def search_page(content: Json, figures: Sequence[Figure] = (), command: str = ""
     sections = [
         _data(content, _placed(figures, "data")),
         fit_sections.search(content, _placed(figures, "search")),
+        noise(content),
         fit_sections.significance(content, _placed(figures, "significance")),
         fit_sections.posterior(content, _placed(figures, "posterior")),
         fit_sections.evidence(content),
@@ -136,7 +138,7 @@ def _data(content: Json, figures: tuple[Figure, ...]) -> Section:
         tables.append(_calibrators(calibration))
     return Section(
         "Data and calibration",
-        (*text, _noise(content["noise"])),
+        tuple(text),
         tables=tuple(tables),
         figures=figures,
     )
@@ -189,17 +191,6 @@ def _calibrators(calibration: Json) -> Table:
         "differ from them at least as much"
     )
     return Table(caption, columns, rows)
-
-
-def _noise(noise: Json) -> str:
-    vis2, closure = noise["extra_vis2"], noise["extra_closure_phase_deg"]
-    if not vis2 and not closure:
-        return "The stated errors explain the residuals: no noise was added."
-    return (
-        f"The stated errors do not explain the residuals: noise of {plain(vis2, 2)} in V² and "
-        f"{plain(closure, 2)}° in closure phase was added in quadrature, and every χ² and error "
-        "on this page includes it."
-    )
 
 
 def _again(content: Json, command: str) -> Section:

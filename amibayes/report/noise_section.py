@@ -1,0 +1,101 @@
+"""The section of ``report.html`` on the noise: what was added to the errors, and outliers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from amibayes.report.page import Column, Section, Table
+from amibayes.report.words import chance, count, fixed, plain
+
+Json = dict[str, Any]
+
+KINDS = {"extra_vis2": "V²", "extra_closure_phase_deg": "closure phase (°)"}
+
+MOST_OUTLIERS = 20
+"""Rows of the table; the rest stands in result.json."""
+
+
+def noise(content: Json) -> Section:
+    """Say whether the stated errors explain the residuals, and what was made of them."""
+    found = content["noise"]
+    tables = (*_posterior(found.get("posterior")), *_outliers(content.get("robust")))
+    text = (_added(found), *_robust(content.get("robust")))
+    return Section("Noise", text, tables=tables)
+
+
+def _added(found: Json) -> str:
+    vis2, closure = found["extra_vis2"], found["extra_closure_phase_deg"]
+    if not vis2 and not closure:
+        return "The stated errors explain the residuals: no noise was added."
+    return (
+        f"The stated errors do not explain the residuals: noise of {plain(vis2, 2)} in V² and "
+        f"{plain(closure, 2)}° in closure phase was added in quadrature, and every χ² and error "
+        "on this page includes it."
+    )
+
+
+def _posterior(found: Json | None) -> tuple[Table, ...]:
+    if not found:
+        return ()
+    rows = tuple(
+        (
+            KINDS[key],
+            plain(q["median"]),
+            f"{plain(q['lower'])} to {plain(q['upper'])}",
+            f"{plain(q['lower_95'])} to {plain(q['upper_95'])}",
+            chance(q["probability_errors_right"]),
+        )
+        for key, q in found.items()
+    )
+    columns = (
+        Column("Extra noise in", "text"),
+        Column("Median"),
+        Column("68 %"),
+        Column("95 %"),
+        Column("Errors right"),
+    )
+    caption = (
+        "Posterior of the extra noise, over which posterior and evidences are averaged; the last "
+        "column is the probability that the stated errors are right"
+    )
+    return (Table(caption, columns, rows),)
+
+
+def _robust(found: Json | None) -> tuple[str, ...]:
+    if not found:
+        return ()
+    return (
+        "Residuals were taken to follow Student's law with "
+        f"{plain(found['degrees_of_freedom'])} degrees of freedom, by which outliers lose their "
+        f"weight: {count(len(found['outliers']), 'datum', 'data')} lost most of it.",
+    )
+
+
+def _outliers(found: Json | None) -> tuple[Table, ...]:
+    if not found or not found["outliers"]:
+        return ()
+    rows = tuple(
+        (
+            KINDS[f"extra_{o['kind']}{'_deg' * (o['kind'] != 'vis2')}"].split(" (")[0],
+            "-".join(o["stations"]),
+            fixed(o["wavelength_m"] * 1e6, 3),
+            fixed(o["mjd"], 4),
+            fixed(o["residual"], 1),
+            plain(o["weight"], 2),
+            Path(o["source"]).name,
+        )
+        for o in found["outliers"][:MOST_OUTLIERS]
+    )
+    columns = (
+        Column("Outlier", "text"),
+        Column("Stations", "text"),
+        Column("λ (µm)"),
+        Column("MJD"),
+        Column("Residual (σ)"),
+        Column("Weight kept"),
+        Column("File", "code"),
+    )
+    left = len(found["outliers"]) - len(rows)
+    more = f"; {left} more in result.json" if left else ""
+    return (Table(f"Data that lost most of their weight{more}", columns, rows),)
