@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from astropy.io import fits
 from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.cli.common import METHODS as CLI_METHODS
-from amibayes.cube import Cube, read_cube, write_cube
+from amibayes.cube import Cube, cube_stream, read_cube, write_cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
 from amibayes.extraction.extract import make_bench
@@ -354,6 +355,80 @@ def test_faults_are_named(niriss: Instrument, tmp_path: Path) -> None:
         extract([])
     with pytest.raises(UsageError, match="method"):
         extract(good, "magic")  # type: ignore[arg-type]
+
+
+WRONG_MASK = """
+name = "Other"
+pixel_scale_mas = 65.6
+[mask]
+name = "three holes"
+holes_m = [[0.0, 2.0], [-1.9, -1.1], [1.3, -1.7]]
+shape = "circle"
+size_m = 0.6
+[filters.F430M]
+wavelength_um = [4.1, 4.2, 4.4, 4.5]
+throughput = [0.0, 0.9, 0.9, 0.0]
+"""
+
+
+def test_another_mask_is_refused(niriss: Instrument, tmp_path: Path) -> None:
+    (tmp_path / "other.toml").write_text(WRONG_MASK)
+    images = binary_images(niriss, jittered(3, 27), (0.0, 0.0), 0.0)
+    cube = replace(cube_of(images, niriss), instrument=str(tmp_path / "other.toml"))
+    with pytest.raises(DataError, match="check instrument, filter and pixel scale"):
+        extract(cube)
+
+
+def test_files_that_hold_no_cube_are_named(niriss: Instrument, tmp_path: Path) -> None:
+    images = binary_images(niriss, jittered(3, 28), (0.0, 0.0), 0.0)
+    whole = tmp_path / "whole.fits"
+    write_cube(whole, cube_of(images, niriss))
+    cut, ramp, wide = (tmp_path / f"{name}.fits" for name in ("cut", "ramp", "dq"))
+    cut.write_bytes(whole.read_bytes()[:40000])
+    with fits.open(whole) as hdus:
+        hdus["SCI"].data = np.ones((2, 3, 4, 8, 8), dtype=np.float32)
+        hdus.writeto(ramp)
+    with fits.open(whole) as hdus:
+        hdus["DQ"].data = np.zeros((80, 80), dtype=np.uint32)
+        hdus.writeto(wide)
+    for path, message in ((cut, "cut short"), (ramp, "5-dimensional"), (wide, "DQ has the shape")):
+        with pytest.raises(DataError, match=message) as raised:
+            extract(path)
+        assert str(raised.value).startswith(str(path))
+        assert main(["extract", str(path), "--out", str(tmp_path / "out"), "--overwrite"]) == 3
+    missing = replace(cube_of(images, niriss), images=np.full_like(images, np.nan), error=None)
+    with pytest.raises(DataError, match="no integration holds light"):
+        extract(missing)
+
+
+def test_a_plain_image_is_one_integration(niriss: Instrument, tmp_path: Path) -> None:
+    image = with_photons(binary_images(niriss, jittered(1, 29), (0.0, 0.0), 0.0), 30)[0]
+    fits.writeto(tmp_path / "image.fits", image)
+    header = {"instrument": "niriss", "filter": "F430M"}
+    found = extract_all(tmp_path / "image.fits", **header)[0]
+    assert found.observables.n_integrations is None
+    assert rms(found.average.vis2 - 1.0) < 0.02
+
+
+def test_memory_does_not_grow_with_the_number_of_integrations(
+    niriss: Instrument, tmp_path: Path
+) -> None:
+    image = binary_images(niriss, jittered(1, 32), (0.0, 0.0), 0.0)
+    cube = cube_of(image, niriss)
+    peaks = []
+    for n in (300, 1500):
+        rng = np.random.default_rng(n)
+        with cube_stream(tmp_path / f"{n}.fits", cube, n) as stream:
+            for start in range(0, n, 100):
+                noisy = rng.poisson(np.tile(cube.images, (100, 1, 1))).astype(float)
+                stream.write(start, noisy, np.tile(cube.error, (100, 1, 1)))
+        tracemalloc.start()
+        found = extract_all(tmp_path / f"{n}.fits")[0]
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert found.frames.used.sum() > 0.98 * n
+    # Images of 1200 more integrations, with errors and flags, would be 150 MB.
+    assert peaks[1] < peaks[0] + 10e6
 
 
 def test_command_writes_what_it_says(
