@@ -179,7 +179,10 @@ def geometry_of(cube: Cube, method: str = "fringes") -> tuple[Geometry, FloatArr
     return found.benches[0].geometry, found.average.vis2
 
 
-@pytest.mark.parametrize("method", ["fringes", "matched", "square"])
+@pytest.mark.parametrize(
+    "method",
+    ["fringes", *(pytest.param(m, marks=pytest.mark.slow) for m in ("matched", "square"))],
+)
 def test_wrong_pixel_scale_and_rotation_are_found_and_do_no_harm(
     niriss: Instrument, method: str
 ) -> None:
