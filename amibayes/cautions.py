@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import chi2
 
 from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.posterior import Posterior, modes_to_sample
@@ -13,6 +14,12 @@ from amibayes.vetting import Vetting, doubts
 
 MOST_NAMED = 3
 """Outliers that a warning names."""
+
+ENOUGH, DOMINANT = 3.0, 0.5
+"""Integrations per datum, or else share of the expected noise, that make a covariance good."""
+
+FAR_TOO_SMALL = 1e-6
+"""Probability of a χ² as small, below which the errors are far too large."""
 
 
 def vetting_cautions(vetting: Vetting | None) -> list[str]:
@@ -46,6 +53,31 @@ def _outliers(result: SearchResult) -> list[str]:
     ]
 
 
+def _of_covariance(result: SearchResult) -> list[str]:
+    """Say where too few integrations tell the covariance, and no expectation helps."""
+    freedom, p = result.likelihood.observables.freedom, result.likelihood.n_independent
+    if freedom is None or freedom.scatter + 1.0 >= ENOUGH * p:
+        return []
+    if freedom.scatter_share <= 1.0 - DOMINANT:
+        return []
+    return [
+        f"the covariance of {p} independent data rests on the scatter of about "
+        f"{freedom.scatter + 1.0:.0f} integrations (N/p = {(freedom.scatter + 1.0) / p:.1f}), "
+        "which the expected noise does not describe: errors and false-alarm probability are "
+        "approximate"
+    ]
+
+
+def _of_errors(result: SearchResult) -> list[str]:
+    """Say where the errors are so large that CANDID's nσ has lost its meaning."""
+    if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
+        return []
+    return [
+        f"the errors are far too large: chi2 is {result.chi2_binary:.2g} for {result.ndof} degrees "
+        "of freedom with the companion; CANDID's n_sigma, a ratio of two such chi2, means nothing"
+    ]
+
+
 def search_cautions(
     observables: Observables,
     result: SearchResult,
@@ -54,7 +86,7 @@ def search_cautions(
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
     """Say what makes the numbers of a search less than they seem."""
-    found = [*result.warnings, *observables.notes]
+    found = [*result.warnings, *observables.notes, *_of_covariance(result), *_of_errors(result)]
     if noise.any:
         found.append(
             f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "

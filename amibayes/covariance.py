@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.errors import DataError
@@ -287,6 +287,21 @@ def as_blocks(covariance: Covariance, shift: int = 0) -> list[Block]:
     return [Block(shift + np.arange(covariance.size), covariance.dense())]
 
 
+def sparse_covariance(covariance: Covariance) -> csr_array:
+    """Write a covariance as a sparse matrix."""
+    rows, columns, values = [], [], []
+    for block in as_blocks(covariance):
+        m = len(block.index)
+        rows.append(np.repeat(block.index, m))
+        columns.append(np.tile(block.index, m))
+        values.append(block.matrix.ravel())
+    shape = (covariance.size, covariance.size)
+    if not rows:
+        return csr_array(shape)
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return coo_array(entries, shape=shape).tocsr()
+
+
 def stack_covariances(parts: Sequence[Covariance]) -> Covariance:
     """Covariance of independent data vectors laid end to end."""
     if all(isinstance(part, DiagonalCovariance) for part in parts):
@@ -313,5 +328,6 @@ __all__ = [
     "as_blocks",
     "covariance_from_matrix",
     "dense_covariance",
+    "sparse_covariance",
     "stack_covariances",
 ]

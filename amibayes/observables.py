@@ -20,6 +20,7 @@ from amibayes.covariance import (
     stack_covariances,
 )
 from amibayes.errors import DataError
+from amibayes.freedom import Freedom, stacked_freedom
 from amibayes.notebook import observables_html, observables_table
 from amibayes.units import FloatArray
 
@@ -144,6 +145,8 @@ class Observables:
         Number of integrations an estimated covariance rests on.
     notes : tuple of str
         What the reader had to decide (tables not used, columns absent, …).
+    freedom : Freedom, optional
+        Of an estimated covariance; without it the covariance counts as known.
 
     Raises
     ------
@@ -158,6 +161,7 @@ class Observables:
     setups: tuple[Setup, ...]
     n_integrations: int | None = None
     notes: tuple[str, ...] = ()
+    freedom: Freedom | None = None
 
     def __post_init__(self) -> None:
         if self.covariance.size != len(self.data):
@@ -193,6 +197,11 @@ class Observables:
     def n_independent(self) -> int:
         """Number of independent data."""
         return self.covariance.rank
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the t distribution of the data; infinite where it is Gaussian."""
+        return np.inf if self.freedom is None else self.freedom.degrees
 
     @cached_property
     def errors(self) -> tuple[FloatArray, FloatArray]:
@@ -360,7 +369,7 @@ def join(parts: Sequence[Observables]) -> Observables:
     """Lay independent data sets together for one fit.
 
     The kind of the whole covariance is that of its least certain part, in the order
-    given, estimated, assumed, diagonal.
+    given, estimated, assumed, diagonal; its freedom that of `stacked_freedom`.
     """
     if len(parts) == 1:
         return parts[0]
@@ -382,6 +391,7 @@ def join(parts: Sequence[Observables]) -> Observables:
         tuple(s for p in parts for s in p.setups),
         min(known) if known else None,
         tuple(n for p in parts for n in p.notes),
+        stacked_freedom((p.n_independent, p.freedom) for p in parts),
     )
 
 

@@ -18,16 +18,17 @@ from scipy import stats
 from amibayes.calibration import Method, calibrate
 from amibayes.errors import DataError
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.detection import chi2_survival
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
+from amibayes.inference.redraw import profiled
 from amibayes.inference.refine import fit_single, single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolves_stars, search
 from amibayes.inference.significance import (
     Significance,
     bank_statistic,
-    profiled,
     significance,
 )
 from amibayes.observables import Observables
@@ -188,8 +189,9 @@ def _agreement(one: Observables, others: Sequence[Observables]) -> float:
     white = left.covariance.whiten(left.data - expected)
     chi2, n = float((white**2).sum()), left.n_independent
     if len(others) == 1:
-        return float(stats.chi2.sf(chi2, n))
-    return float(stats.f.sf(chi2 / n, n, n * (len(others) - 1)))
+        return chi2_survival(chi2, n, left.degrees_of_freedom)
+    known = min(left.degrees_of_freedom, n * (len(others) - 1))
+    return float(stats.f.sf(chi2 / n, n, known))
 
 
 def _by_itself(
@@ -215,7 +217,8 @@ def _by_itself(
     if not data.n_vis2:
         return verdict
     disc = Likelihood(data, BinaryModel(diameter_mas="free"))
-    best, chi2 = fit_single(disc)
+    best, _ = fit_single(disc)
+    chi2 = float(single_likelihood(disc).chi2(best)[0])
     point = float(disc.chi2([[0.0, 0.0, 0.0, 0.0]])[0])
     # A diameter cannot be negative: half of the χ² distribution of one degree of freedom.
     gain = profiled(np.array([max(point - chi2, 0.0)]), np.array([point]), data.n_independent)

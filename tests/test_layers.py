@@ -31,6 +31,7 @@ LAYERS = [
     "response",
     "closure",
     "covariance",
+    "freedom",
     "observables",
     "synthetic",
     "oifits",

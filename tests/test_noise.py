@@ -12,8 +12,9 @@ from scipy import stats
 from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.noise import ExtraNoise, add_noise, fit_noise, search_with_noise
+from amibayes.inference.redraw import profiled
 from amibayes.inference.refine import single_likelihood
-from amibayes.inference.significance import bank_statistic, null_maxima, profiled
+from amibayes.inference.significance import bank_statistic, null_maxima
 from amibayes.observables import join
 
 FIELD = (50.0, 400.0)

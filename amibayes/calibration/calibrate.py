@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array, triu
 
+from amibayes.calibration.freedom import calibrated_freedom, response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, keys_of
 from amibayes.calibration.transfer import (
@@ -165,6 +166,7 @@ def calibrate(
         response = weighted_response(kept, keys)
     else:
         response = hierarchical_response(kept, keys, rng or np.random.default_rng(1), covariate)
+    response = replace(response, freedom=response_freedom([calibrators[j] for j in serving], kept))
     return Calibration(
         _calibrated(target, keys, response, calibrators),
         chosen,
@@ -290,12 +292,17 @@ def _calibrated(
         )
     used = target.select(*_on_entries(target, keep)).unflagged()
     key, sign = keys.key[keep], keys.sign[keep]
-    value, by_target, by_response = _values(used, key, sign, response)
-    spread = coo_array((by_response, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
-    own = diags_array(by_target)
-    covariance = own @ sparse_covariance(used.covariance) @ own
-    covariance = csr_array(covariance + spread @ response.covariance @ spread.T)
-    return _rebuilt(target, keep, value, covariance, _kind(target, calibrators, keys), keys)
+    value, target_slope, response_slope = _values(used, key, sign, response)
+    spread = coo_array((response_slope, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
+    own = diags_array(target_slope)
+    by_target = csr_array(own @ sparse_covariance(used.covariance) @ own)
+    by_response = csr_array(spread @ response.covariance @ spread.T)
+    kind = _kind(target, calibrators, keys)
+    made = _rebuilt(target, keep, value, csr_array(by_target + by_response), kind, keys)
+    freedom = calibrated_freedom(
+        made.covariance, by_target, used.freedom, by_response, response.freedom
+    )
+    return replace(made, freedom=freedom)
 
 
 def _values(

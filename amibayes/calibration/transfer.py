@@ -10,7 +10,7 @@ from scipy.sparse import block_array, coo_array, csr_array, diags_array
 
 from amibayes.calibration.matching import Keys, Match, match
 from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import Covariance, as_blocks
+from amibayes.covariance import sparse_covariance
 from amibayes.disc import uniform_disc
 from amibayes.observables import BoolArray, IntArray, Observables
 from amibayes.units import FloatArray
@@ -111,21 +111,6 @@ def _disc_correction(
     scale[is_vis2] = 1.0 / amplitude[entry] ** 2
     change[is_vis2] = -2.0 * slope[entry] / amplitude[entry] ** 3
     return scale, change
-
-
-def sparse_covariance(covariance: Covariance) -> csr_array:
-    """Write a covariance as a sparse matrix."""
-    rows, columns, values = [], [], []
-    for block in as_blocks(covariance):
-        m = len(block.index)
-        rows.append(np.repeat(block.index, m))
-        columns.append(np.tile(block.index, m))
-        values.append(block.matrix.ravel())
-    shape = (covariance.size, covariance.size)
-    if not rows:
-        return csr_array(shape)
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return coo_array(entries, shape=shape).tocsr()
 
 
 @dataclass(frozen=True, eq=False)

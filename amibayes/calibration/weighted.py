@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import Transfer, kernel_projector
+from amibayes.freedom import Freedom
 from amibayes.observables import BoolArray
 from amibayes.units import FloatArray
 
@@ -28,12 +29,15 @@ class Response:
     tau : (n_samples, 2) float array, optional
         Posterior draws of the scatter between calibrators of V² and closure phase (radians);
         NaN for a kind that is absent.
+    freedom : Freedom, optional
+        Of the covariance, where calibrators have estimated ones.
     """
 
     value: FloatArray
     covariance: csr_array
     known: BoolArray
     tau: FloatArray | None = None
+    freedom: Freedom | None = None
 
 
 def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:

@@ -338,6 +338,7 @@ def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Obser
         shrunk.matrix / n,
         n_integrations=n if n > 1 else None,
         kind="estimated" if n > 1 else "given",
+        freedom=shrunk.carried,
         response=part.response,
         mjd=_mjd(frames, part.template),
         integration_s=n * (part.template.integration_time_s or 0.0),

@@ -53,7 +53,8 @@ def integrations(extraction: Extraction) -> Observables:
                 covariance=whole,
             )
         )
-    return join(parts)
+    # All of them rest on the same scatter: there is no more of it in many than in one.
+    return replace(join(parts), freedom=mean.freedom)
 
 
 def _at(table: Measurements, value: FloatArray, mjd: float, n: int) -> Measurements:

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import multigammaln
+from scipy.special import digamma, gammaln
 
+from amibayes.errors import DataError
 from amibayes.extraction.sampling import BoolArray
+from amibayes.freedom import Freedom
 from amibayes.units import FloatArray, read_only
 
 MOST_FREEDOM = 1e4
@@ -34,7 +36,10 @@ class Shrunk:
     prior_freedom : float
         Integrations that the physical covariance counts for (infinite: it alone).
     freedom : float
-        Degrees of freedom of the t-distribution of new data of this covariance.
+        Degrees of freedom of the t distribution of data of this covariance (infinite: a
+        Gaussian). The matrix is the covariance of that distribution.
+    scatter_freedom : float
+        Degrees of freedom of the scatter: integrations, or blocks of them, less one.
     scale_vis2, scale_closure : float
         Measured variances in units of the physical ones.
     block : int
@@ -46,6 +51,7 @@ class Shrunk:
     matrix: FloatArray
     prior_freedom: float
     freedom: float
+    scatter_freedom: float
     scale_vis2: float
     scale_closure: float
     block: int
@@ -53,6 +59,11 @@ class Shrunk:
 
     def __post_init__(self) -> None:
         read_only(self, "matrix")
+
+    @property
+    def carried(self) -> Freedom | None:
+        """What the observables carry on; None where the covariance is taken as known."""
+        return Freedom(self.freedom, self.scatter_freedom) if np.isfinite(self.freedom) else None
 
 
 def shrunk_covariance(
@@ -75,6 +86,11 @@ def shrunk_covariance(
     n_vis2 : int
         How many of the independent observables are V².
     kind : {"shrunk", "scatter", "physical"}
+
+    Raises
+    ------
+    DataError
+        Where the scatter alone is asked for and has not more than p + 2 integrations.
     """
     lower = np.linalg.cholesky(basis.T @ physical @ basis)
     white = np.linalg.solve(lower, basis.T @ deviation.T)
@@ -84,15 +100,27 @@ def shrunk_covariance(
     if kind == "physical" or n < 2:
         inner, prior, freedom, scales = np.eye(p), np.inf, np.inf, (1.0, 1.0)
     elif kind == "scatter":
-        inner, prior, freedom = white @ white.T / (n - 1), 0.0, float(n - p)
-        scales = _scales(inner, groups)
+        inner, prior, freedom = _scatter_alone(white), 0.0, float(n - p)
+        scales = _scales(white @ white.T / (n - 1), groups)
     else:
         prior, scales = _most_likely(white, groups)
         psi = (prior - p - 1.0) * np.where(groups, scales[0], scales[1])
-        freedom = prior + n - 1.0 - p + 1.0
-        inner = (np.diag(psi) + white @ white.T) / (prior + n - 1.0 - p - 1.0)
+        freedom = prior + n - p
+        inner = (np.diag(psi) + white @ white.T) / (freedom - 2.0)
     spread = basis @ lower
-    return Shrunk(spread @ inner @ spread.T, prior, freedom, *scales, block, correlation)
+    matrix = spread @ inner @ spread.T
+    return Shrunk(matrix, prior, freedom, n - 1.0, *scales, block, correlation)
+
+
+def _scatter_alone(white: FloatArray) -> FloatArray:
+    """Covariance of the t distribution that scatter without a prior makes of data, (p, p)."""
+    p, n = white.shape
+    if n <= p + 2:
+        raise DataError(
+            f"the scatter of {n} integrations is no covariance of {p} independent observables",
+            remedy="take it together with the expected noise (shrunk)",
+        )
+    return np.asarray(white @ white.T / (n - p - 2.0))
 
 
 def _scales(inner: FloatArray, groups: BoolArray) -> tuple[float, float]:
@@ -104,27 +132,45 @@ def _scales(inner: FloatArray, groups: BoolArray) -> tuple[float, float]:
 def _most_likely(white: FloatArray, groups: BoolArray) -> tuple[float, tuple[float, float]]:
     """Prior degrees of freedom and the two scales of greatest marginal likelihood."""
     p, n = white.shape
-    m, scatter = n - 1, white @ white.T
-    start = np.log(np.maximum(_scales(scatter / m, groups), 1e-3))
-
-    def cost(at: FloatArray) -> float:
-        nu = p + 2.0 + np.exp(at[0])
-        psi = (nu - p - 1.0) * np.where(groups, np.exp(at[1]), np.exp(at[2]))
-        logdet = np.linalg.slogdet(np.diag(psi) + scatter)[1]
-        return float(
-            multigammaln(nu / 2.0, p)
-            - multigammaln((nu + m) / 2.0, p)
-            - 0.5 * nu * np.log(psi).sum()
-            + 0.5 * (nu + m) * logdet
-        )
-
+    scatter = white @ white.T
+    start = np.log(np.maximum(_scales(scatter / (n - 1), groups), 1e-3))
     bounds = [(-2.0, np.log(MOST_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
     tries = [
-        minimize(cost, [first, *start], bounds=bounds, method="L-BFGS-B")
+        minimize(
+            _loss,
+            [first, *start],
+            args=(scatter, n - 1, groups),
+            jac=True,
+            bounds=bounds,
+            method="L-BFGS-B",
+        )
         for first in (1.0, 4.0, 7.0)
     ]
     best = min(tries, key=lambda t: float(t.fun)).x
     return float(p + 2.0 + np.exp(best[0])), (float(np.exp(best[1])), float(np.exp(best[2])))
+
+
+def _loss(
+    at: FloatArray, scatter: FloatArray, m: int, groups: BoolArray
+) -> tuple[float, FloatArray]:
+    """−ln of the marginal likelihood of a scatter of m degrees of freedom, and its gradient.
+
+    ``at`` holds ln(ν0 − p − 2) and the logarithms of the two scales.
+    """
+    p = len(scatter)
+    nu, scale = p + 2.0 + np.exp(at[0]), np.where(groups, np.exp(at[1]), np.exp(at[2]))
+    psi = (nu - p - 1.0) * scale
+    total = np.diag(psi) + scatter
+    logdet = float(np.linalg.slogdet(total)[1])
+    steps = -0.5 * np.arange(p)
+    gammas = gammaln(0.5 * nu + steps) - gammaln(0.5 * (nu + m) + steps)
+    loss = gammas.sum() - 0.5 * nu * np.log(psi).sum() + 0.5 * (nu + m) * logdet
+    by_psi = 0.5 * (nu + m) * np.diag(np.linalg.inv(total)) - 0.5 * nu / psi
+    digammas = digamma(0.5 * nu + steps) - digamma(0.5 * (nu + m) + steps)
+    by_nu = 0.5 * (digammas.sum() - np.log(psi).sum() + logdet) + by_psi @ scale
+    pull = by_psi * psi
+    slope = [by_nu * np.exp(at[0]), pull[groups].sum(), pull[~groups].sum()]
+    return float(loss), np.array(slope)
 
 
 def _uncorrelated(white: FloatArray) -> tuple[FloatArray, int, float]:

@@ -10,6 +10,7 @@ from amibayes.cube import Cube
 from amibayes.extraction.averaging import Average
 from amibayes.extraction.response import relative_band
 from amibayes.extraction.view import View
+from amibayes.freedom import Freedom
 from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
 from amibayes.response import REVERSED
 from amibayes.units import FloatArray
@@ -34,6 +35,7 @@ def observables_of(
     *,
     n_integrations: int | None,
     kind: CovarianceKind,
+    freedom: Freedom | None,
     response: FloatArray,
     mjd: float,
     integration_s: float,
@@ -55,6 +57,7 @@ def observables_of(
         (setup,),
         n_integrations,
         notes,
+        freedom,
     )
 
 

@@ -124,14 +124,15 @@ class TemplateBank:
     ) -> None:
         self.grid = grid
         self.n_data = likelihood.n_independent
+        self.freedom = likelihood.observables.freedom
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
         self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
         self._offset = np.asarray(self._even.matrix @ self._primary)
         if beside is None:
-            self._basis = _nuisance_basis(likelihood, nuisance)
+            self.nuisance_basis = _nuisance_basis(likelihood, nuisance)
         else:
-            self._basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
+            self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
 
     def __len__(self) -> int:
         return len(self.grid)
@@ -139,7 +140,7 @@ class TemplateBank:
     @property
     def n_nuisance(self) -> int:
         """Number of nuisance directions."""
-        return int(self._basis.shape[1])
+        return int(self.nuisance_basis.shape[1])
 
     @property
     def symmetric(self) -> bool:
@@ -148,7 +149,8 @@ class TemplateBank:
 
     def project(self, data: FloatArray) -> FloatArray:
         """Take the nuisance directions out of whitened data (n_data, …)."""
-        return data - self._basis @ (self._basis.T @ data) if self._basis.size else data
+        basis = self.nuisance_basis
+        return data - basis @ (basis.T @ data) if basis.size else data
 
     def scan(self, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Best contrast and its error at every position, from whitened residuals (n_data,).
@@ -290,10 +292,9 @@ class TemplateBank:
         common, i, j = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
         cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(common) else 0.0 * norm
         both = _both(norm, cross)
-        if self._basis.size:
-            along = _both(
-                self._basis[self._even.rows].T @ even, self._basis[self._odd.rows].T @ odd
-            )
+        if self.nuisance_basis.size:
+            basis = self.nuisance_basis
+            along = _both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
             both -= (along**2).sum(axis=0)
         return both
 

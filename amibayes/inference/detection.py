@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import stats
 from scipy.special import gammaincc, gammaln, ndtri_exp
 
 from amibayes.units import FloatArray
@@ -31,6 +32,17 @@ def _log_far_tail(a: float, z: FloatArray) -> FloatArray:
     for k in range(CONTINUED_FRACTION_TERMS, 0, -1):
         fraction = k * (a - k) / (z + 2 * k + 1 - a + fraction)
     return np.asarray(a * np.log(z) - z - gammaln(a) - np.log(z + 1 - a + fraction))
+
+
+def chi2_survival(chi2: float, dof: float, degrees: float = np.inf) -> float:
+    """Probability of a χ² as large, of ``dof`` independent data.
+
+    With a covariance of ``degrees`` degrees of freedom the data follow a t distribution, and
+    χ²/dof, in units of its scale matrix, follows F.
+    """
+    if not np.isfinite(degrees):
+        return float(stats.chi2.sf(chi2, dof))
+    return float(stats.f.sf(chi2 / dof * degrees / (degrees - 2.0), dof, degrees))
 
 
 def candid_n_sigma(chi2_single: ArrayLike, chi2_binary: ArrayLike, dof: float) -> FloatArray:

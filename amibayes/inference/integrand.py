@@ -134,16 +134,17 @@ class Integrand:
     def __init__(self, likelihood: Likelihood, prior: Prior) -> None:
         self.likelihood, self.prior = likelihood, prior
         self.fringe_mas = float(1.0 / likelihood.samples.frequency.max() / MAS)
-        self.single, self.chi2_single = fit_single(likelihood)
+        self.single, self.deviance_single = fit_single(likelihood)
         lattice = self.fringe_mas / CELLS_PER_FRINGE
         self.grid = make_grid(prior.inner_mas, prior.outer_mas, lattice)
         self._scan()
         self.nuisance = self._nuisance()
         self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
         self.log_z_none = log_evidence_none(likelihood, prior, self.single)
-        self.best_none = float(single_likelihood(likelihood).log_prob(self.single[None])[0])
-        best = self._best
-        self.most = max(self.chi2_single - float(likelihood.chi2(best[None])[0]), 0.0)
+        alone = single_likelihood(likelihood)
+        self.best_none = float(alone.log_prob(self.single[None])[0])
+        without, left = alone.chi2(self.single[None])[0], likelihood.chi2(self._best[None])[0]
+        self.most = max(float((without - left) / likelihood.inflation(left)), 0.0)
         self.n_evaluations = 0
 
     def _scan(self) -> None:
@@ -189,7 +190,7 @@ class Integrand:
         place = [self.grid.east_mas[k], self.grid.north_mas[k], np.clip(self.contrast[k], 0, 1)]
         box = Box(self.prior.inner_mas, self.prior.outer_mas, self.fringe_mas)
         seed = np.concatenate([place, self.single])
-        return np.array(refine(self.likelihood, seed, box, self.chi2_single).theta)
+        return np.array(refine(self.likelihood, seed, box, self.deviance_single).theta)
 
     def log_prob(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
         """Log-likelihood (n, k) at sites (n, 2 + n_nuisance), each with k contrasts (n, k)."""

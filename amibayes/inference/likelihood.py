@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import gammaln
 
 from amibayes.inference.model import BinaryModel, ComplexArray
 from amibayes.inference.samples import Samples, samples_of
@@ -18,8 +19,32 @@ NEVER_ZERO = 1e-30
 """Keeps the phase derivative finite at an exact null of the visibility."""
 
 
+def log_peak(n: int, degrees: float) -> float:
+    """Logarithm of the density of n data of unit covariance where they have no residuals."""
+    gaussian = -0.5 * n * LOG_TWO_PI
+    if not np.isfinite(degrees):
+        return gaussian
+    half = 0.5 * degrees
+    ratio = gammaln(half + 0.5 * n) - gammaln(half) - 0.5 * n * np.log(half - 1.0)
+    return float(gaussian + ratio)
+
+
+def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
+    """−2 ln L of χ² (any shape) of n data, 0 without residuals.
+
+    χ² where the data are Gaussian, (ν + n) ln[1 + χ²/(ν − 2)] where they follow a t
+    distribution of ν ``degrees`` of freedom.
+    """
+    if not np.isfinite(degrees):
+        return chi2
+    return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))
+
+
 class Likelihood:
-    """Gaussian likelihood of a binary model, vectorised over parameter sets.
+    """Likelihood of a binary model, vectorised over parameter sets.
+
+    Gaussian; where the covariance was estimated, the t distribution of its degrees of
+    freedom ν, L ∝ [1 + χ²/(ν − 2)]^{−(ν + n)/2} of n independent data.
 
     Parameters
     ----------
@@ -54,10 +79,27 @@ class Likelihood:
         other.__dict__.update(self.__dict__, model=model)
         return other
 
+    @property
+    def degrees(self) -> float:
+        """Degrees of freedom of the distribution of the data; infinite for a Gaussian."""
+        return self.observables.degrees_of_freedom
+
     @cached_property
     def log_norm(self) -> float:
-        """Logarithm of the normalisation of the Gaussian."""
-        return -0.5 * (self.observables.covariance.logdet() + self.n_independent * LOG_TWO_PI)
+        """Logarithm of the likelihood of data without residuals."""
+        peak = log_peak(self.n_independent, self.degrees)
+        return peak - 0.5 * self.observables.covariance.logdet()
+
+    def deviance(self, chi2: ArrayLike) -> FloatArray:
+        """−2 ln L of χ² (any shape), 0 without residuals: χ² itself where L is Gaussian."""
+        return deviance(np.asarray(chi2, dtype=float), self.n_independent, self.degrees)
+
+    def inflation(self, chi2: FloatArray) -> FloatArray:
+        """dχ²/d(deviance): variance of what is left, in units of the covariance's (any shape)."""
+        nu = self.degrees
+        if not np.isfinite(nu):
+            return np.ones_like(chi2)
+        return np.asarray((nu - 2.0 + chi2) / (nu + self.n_independent))
 
     def predict(self, theta: ArrayLike) -> FloatArray:
         """Model of the data: V², then closure phases in radians, (n_data, n)."""
@@ -74,15 +116,24 @@ class Likelihood:
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
-        return self.log_norm - 0.5 * self.chi2(theta)
+        return self.log_norm - 0.5 * self.deviance(self.chi2(theta))
 
     def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
-        """Δχ² that goes with a gain in ln L over no companion, (n,)."""
-        return np.asarray(2.0 * log_gain)
+        """Δχ² that goes with a gain in ln L over no companion, (n,).
+
+        In units of the variance that is left with the companion, if data follow a t.
+        """
+        count = self.degrees + self.n_independent
+        if not np.isfinite(count):
+            return np.asarray(2.0 * log_gain)
+        return np.asarray(count * np.expm1(np.minimum(2.0 * log_gain / count, 50.0)))
 
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """What a Δχ² from the best fit costs in ln L, (n,)."""
-        return np.asarray(0.5 * delta_chi2)
+        count = self.degrees + self.n_independent
+        if not np.isfinite(count):
+            return np.asarray(0.5 * delta_chi2)
+        return np.asarray(0.5 * count * np.log1p(delta_chi2 / count))
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood (n,) and its gradient (n, n_dim)."""
@@ -94,8 +145,8 @@ class Likelihood:
         # gradient costs one product per parameter and no Jacobian of the data.
         pull = 2.0 * (self.samples.squares.T @ weighted[: self._n2]) * value.conj()
         pull -= 1j * (self.samples.legs.T @ weighted[self._n2 :]) / (value + NEVER_ZERO)
-        gradient = np.einsum("sn,psn->np", pull, slopes).real
-        return self.log_norm - 0.5 * chi2, np.asarray(gradient)
+        gradient = np.einsum("sn,psn->np", pull, slopes).real / self.inflation(chi2)[:, None]
+        return self.log_norm - 0.5 * self.deviance(chi2), np.asarray(gradient)
 
     def jacobian(self, theta: ArrayLike) -> FloatArray:
         """Whitened derivatives of the model at one parameter set, (n_independent, n_dim)."""
@@ -106,12 +157,20 @@ class Likelihood:
         return self.observables.covariance.whiten(rows)
 
     def errors(self, theta: ArrayLike) -> FloatArray:
-        """Covariance (n_dim, n_dim) of the parameters from the inverse of the Fisher matrix."""
+        """Covariance (n_dim, n_dim) of the parameters from the inverse of the Fisher matrix.
+
+        With an estimated covariance that of the t distribution which parameters of a linear
+        model have: (ν − 2 + χ²)/(ν + n − n_dim − 2) times as large.
+        """
         jacobian = self.jacobian(theta)
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0
         fisher = (jacobian / scale).T @ (jacobian / scale)
-        return np.asarray(np.linalg.pinv(fisher, hermitian=True) / np.outer(scale, scale))
+        inverse = np.linalg.pinv(fisher, hermitian=True) / np.outer(scale, scale)
+        if not np.isfinite(self.degrees):
+            return np.asarray(inverse)
+        rest = self.degrees - 2.0 + self.n_independent - len(scale)
+        return np.asarray(inverse * (self.degrees - 2.0 + self.chi2(theta)[0]) / rest)
 
     def _sets(self, theta: ArrayLike) -> FloatArray:
         sets = np.atleast_2d(np.asarray(theta, dtype=float))

@@ -348,4 +348,9 @@ def _spread(setting: Setting, trials: Trials, sigma: FloatArray) -> FloatArray:
 def _gain_at(significance: Significance, bank: TemplateBank) -> float:
     """Gain in χ² that reaches the threshold, if the rest of χ² is its expectation."""
     threshold, n = significance.threshold(), bank.n_data - bank.n_nuisance
-    return float(n * np.expm1(threshold / n)) if significance.free_scale else threshold
+    if significance.free_scale:
+        return float(n * np.expm1(threshold / n))
+    if bank.freedom is None:
+        return threshold
+    degrees = bank.freedom.degrees
+    return float((n + degrees - 2.0) * np.expm1(threshold / (bank.n_data + degrees)))

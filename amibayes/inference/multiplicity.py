@@ -86,8 +86,7 @@ def search_second(result: SearchResult) -> TwoCompanions:
     found = _settled(result, bank, two, found)
     modes = _distinct(found, 0.25 * resolution_mas(one))
     theta = np.array(modes[0].theta)
-    chi2 = result.chi2_single - modes[0].delta_chi2
-    return TwoCompanions(two, theta, two.errors(theta), chi2, modes)
+    return TwoCompanions(two, theta, two.errors(theta), float(two.chi2(theta)[0]), modes)
 
 
 def _beside(
@@ -103,8 +102,9 @@ def _beside(
     at = peaks(grid, gain, fringe)[:SEEDS]
     second = np.column_stack([grid.east_mas[at], grid.north_mas[at], np.clip(contrast[at], 0, 1)])
     box = Box(grid.inner_mas, grid.outer_mas, fringe)
+    single = float(two.deviance(result.chi2_single))
     seeds = [np.concatenate([first[:3], place, first[3:]]) for place in second]
-    return [_bright_first(refine(two, s, box, result.chi2_single)) for s in seeds]
+    return [_bright_first(refine(two, s, box, single)) for s in seeds]
 
 
 def _settled(

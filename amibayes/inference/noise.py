@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import optimize
 
 from amibayes.closure import closure_matrix
 from amibayes.covariance import (
@@ -22,7 +22,10 @@ from amibayes.covariance import (
     Covariance,
     DiagonalCovariance,
     as_blocks,
+    sparse_covariance,
 )
+from amibayes.freedom import squared_share, welch_satterthwaite
+from amibayes.inference.detection import chi2_survival
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import search
@@ -62,10 +65,21 @@ class ExtraNoise:
 
 
 def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
-    """Add extra noise to the covariance of unflagged observables."""
+    """Add extra noise to the covariance of unflagged observables.
+
+    Its size is taken as known: an estimated covariance then has more degrees of freedom.
+    """
     if not extra.any:
         return observables
     data = observables.unflagged()
+    noisy = _with_noise(data, extra)
+    if data.freedom is None:
+        return noisy
+    share = squared_share(sparse_covariance(data.covariance), noisy.covariance)
+    return replace(noisy, freedom=welch_satterthwaite([(share, data.freedom)]))
+
+
+def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
     n_vis2 = data.n_vis2
     diagonal = np.zeros(data.covariance.size)
     diagonal[:n_vis2] = extra.vis2**2
@@ -136,13 +150,13 @@ def _one_kind(
     part = data.select(np.full(n, name == "vis2"), np.full(data.n_closure_phases, name != "vis2"))
     residual = difference[which]
     chi2, dof = _chi2(part.covariance, residual), share * part.covariance.rank
-    if stats.chi2.sf(chi2, dof) > UNLIKELY:
+    if chi2_survival(chi2, dof, data.degrees_of_freedom) > UNLIKELY:
         return 0.0
     typical = float(np.sqrt(np.median(part.covariance.variance)))
     largest = typical * np.sqrt(chi2 / dof)
 
     def loss(log_sigma: float) -> float:
-        noisy = add_noise(part, ExtraNoise(**{name: float(np.exp(log_sigma))})).covariance
+        noisy = _with_noise(part, ExtraNoise(**{name: float(np.exp(log_sigma))})).covariance
         return _chi2(noisy, residual) + share * noisy.logdet()
 
     bounds = float(np.log(1e-2 * typical)), float(np.log(10.0 * largest))
@@ -196,8 +210,8 @@ UNSETTLED = (
 
 
 def _score(result: SearchResult) -> float:
-    """−2 ln L of a best fit, up to a constant of the data."""
-    return result.chi2_binary + result.likelihood.observables.covariance.logdet()
+    """−2 ln L of a best fit."""
+    return float(-2.0 * result.likelihood.log_prob(result.theta)[0])
 
 
 def _same(a: ExtraNoise, b: ExtraNoise) -> bool:

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
 from amibayes.covariance import DiagonalCovariance, as_blocks
-from amibayes.inference.likelihood import LOG_TWO_PI, Likelihood
+from amibayes.inference.likelihood import Likelihood, deviance, log_peak
 from amibayes.inference.marginal import Marginal
 from amibayes.inference.noise import ExtraNoise, add_noise
 from amibayes.observables import Observables
@@ -60,6 +60,8 @@ class NoiseTerm:
         Median stated error of each kind (V², or radians).
     log_det : float
         Logarithm of the determinant of the stated covariance.
+    degrees : float
+        Degrees of freedom of the t distribution of the data; infinite for a Gaussian.
     node : (n_nodes,) float array
         ln(total error/stated error) at the nodes; the first is 0, the stated error.
     edges : (n_nodes,) float array
@@ -73,6 +75,7 @@ class NoiseTerm:
     share: FloatArray
     typical: dict[str, float]
     log_det: float
+    degrees: float = np.inf
     node: FloatArray = field(default_factory=lambda: np.zeros(1))
     edges: FloatArray = field(default_factory=lambda: np.zeros(1))
     log_prior: FloatArray = field(default_factory=lambda: np.zeros(1))
@@ -85,9 +88,10 @@ class NoiseTerm:
     def log_likelihoods(self, difference: FloatArray, node: FloatArray) -> FloatArray:
         """ln L (n_nodes, n) of data minus model (n_data, n) for amounts of noise (n_nodes,)."""
         variance = 1.0 + np.outer(np.expm1(2.0 * node), self.share)
-        norm = np.log(variance).sum(axis=1) + self.log_det + self.n_independent * LOG_TWO_PI
+        n = self.n_independent
+        norm = log_peak(n, self.degrees) - 0.5 * (np.log(variance).sum(axis=1) + self.log_det)
         chi2 = (1.0 / variance) @ np.asarray(self.whitening @ difference) ** 2
-        return np.asarray(-0.5 * (norm[:, None] + chi2))
+        return np.asarray(norm[:, None] - 0.5 * deviance(chi2, n, self.degrees))
 
     def log_parts(self, difference: FloatArray) -> FloatArray:
         """Logarithm of likelihood times prior at the nodes, (n_nodes, n)."""
@@ -261,9 +265,8 @@ def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, f
         (np.ones(len(columns)), (np.arange(len(columns)), columns)),
         shape=(len(columns), len(which)),
     )
-    return NoiseTerm(
-        kind, csr_array(turn @ white @ place), share, typical, part.covariance.logdet()
-    )
+    whitening, log_det = csr_array(turn @ white @ place), part.covariance.logdet()
+    return NoiseTerm(kind, whitening, share, typical, log_det, part.degrees_of_freedom)
 
 
 def _sparse(blocks: Sequence[tuple[IntArray, FloatArray]], size: int) -> csr_array:

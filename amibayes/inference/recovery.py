@@ -1,9 +1,10 @@
 """Injection and recovery of companions by the criterion of the search itself.
 
 A companion is put into the fitted model without one, noise is drawn anew from the data's
-covariance, and the search's statistic is formed: it is detected where the false-alarm
-probability is below α, and located where the search would report it at its place too. In
-whitened data a trial costs no more than a null search, a column of a matrix product.
+covariance (itself estimated anew where it was estimated), and the search's statistic is
+formed: it is detected where the false-alarm probability is below α, and located where the
+search would report it at its place too. In whitened data a trial costs no more than a null
+search, a column of a matrix product.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.redraw import Searched, search_many, search_simulated, twice_log_ratio
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.search import resolution_mas
-from amibayes.inference.significance import profiled
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
@@ -85,7 +86,7 @@ def recover(
         Statistic that counts as a detection.
     rng : numpy.random.Generator
     free_scale : bool
-        The statistic is `profiled`, else the gain in χ².
+        The statistic is `profiled`, else 2Δln L with the errors as they are.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places of the trials, if it is known already.
     executor : Executor, optional
@@ -122,16 +123,10 @@ def _recover_piece(
 ) -> dict[str, BoolArray]:
     theta, nearer, seed = piece
     signal = injected_signal(likelihood, single, theta)
-    noise = np.random.default_rng(seed).standard_normal(signal.shape)
-    found = judge(
-        bank,
-        resolution_mas(likelihood),
-        theta[:, :2],
-        signal + noise,
-        threshold,
-        free_scale=free_scale,
-        nearer=nearer,
-    )
+    rng = np.random.default_rng(seed)
+    hit = search_simulated(bank, rng.standard_normal(signal.shape), rng, signal)
+    fringe, places = resolution_mas(likelihood), theta[:, :2]
+    found = _judged(bank, fringe, places, hit, threshold, free_scale=free_scale, nearer=nearer)
     return {name: found[name] for name in ("detected", "located")}
 
 
@@ -159,7 +154,7 @@ def judge(
     threshold : float
         Statistic that counts as a detection.
     free_scale : bool
-        The statistic is `profiled`, else the gain in χ².
+        The statistic is `profiled`, else 2Δln L with the errors as they are.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places, if it is known already.
 
@@ -168,12 +163,23 @@ def judge(
     dict of (n,) arrays
         ``detected`` and ``located`` as in `Recovery`, and the ``statistic``.
     """
-    data = bank.project(white)
-    gain, position = bank.largest_gain(data.astype(np.float32))
-    statistic = gain
-    if free_scale:
-        statistic = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
-    detected = statistic > threshold
+    hit = search_many(bank, white)
+    return _judged(bank, fringe_mas, places, hit, threshold, free_scale=free_scale, nearer=nearer)
+
+
+def _judged(
+    bank: TemplateBank,
+    fringe_mas: float,
+    places: FloatArray,
+    hit: Searched,
+    threshold: float,
+    *,
+    free_scale: bool,
+    nearer: FloatArray | None,
+) -> dict[str, Any]:
+    """What the search makes of what was found, as `judge` has it."""
+    statistic = twice_log_ratio(bank, hit.gain, hit.chi2, free_scale=free_scale)
+    position, detected = hit.position, statistic > threshold
     found = np.column_stack([bank.grid.east_mas[position], bank.grid.north_mas[position]])
     right = np.hypot(*(found - places).T) < 0.5 * fringe_mas
     doubtful = np.flatnonzero(detected & ~right)
@@ -186,7 +192,7 @@ def judge(
     else:
         closer = nearer[sure]
     located = np.zeros(len(places), dtype=bool)
-    located[sure] = ~ambiguous(closer, gain[sure])
+    located[sure] = ~ambiguous(closer, hit.gain[sure])
     return {"detected": detected, "located": located, "statistic": statistic}
 
 

@@ -58,11 +58,11 @@ def nuisance_bounds(likelihood: Likelihood) -> list[tuple[float, float]]:
 
 
 def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
-    """Best fit without a companion: its parameters (n_nuisance,) and χ²."""
+    """Best fit without a companion: its parameters (n_nuisance,) and deviance."""
     without = single_likelihood(likelihood)
     bounds = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
     if not len(bounds):
-        return np.empty(0), float(without.chi2(np.empty((1, 0)))[0])
+        return np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0])
     # A disc has lobes: the fit starts from the best of a ladder of values.
     ladder = bounds[:, 0] + np.outer(np.linspace(0.0, 1.0, 201) ** 2, bounds[:, 1] - bounds[:, 0])
     start = ladder[np.argmin(without.chi2(ladder))]
@@ -70,22 +70,22 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
     return _minimise(_objective(without, scale), start, scale, bounds)
 
 
-def refine(likelihood: Likelihood, seed: FloatArray, box: Box, chi2_single: float) -> Mode:
+def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: float) -> Mode:
     """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
     n_pairs = 3 * likelihood.model.companions
     bounds = np.empty((len(seed), 2))
     bounds[:n_pairs] = seed[:n_pairs, None] + box.fringe_mas * np.array([-1.0, 1.0])
     bounds[2:n_pairs:3] = 0.0, MAX_CONTRAST
     bounds[n_pairs:] = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
-    theta, chi2 = seed, np.inf
+    theta, deviance = seed, np.inf
     for _ in range(MOST_ROUNDS):
         scale = _natural_scale(likelihood, theta, box)
         limits = [x for k in range(0, n_pairs, 3) for x in _field_limits(seed, box, scale, k)]
-        before = chi2
-        theta, chi2 = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
-        if chi2 > before - SETTLED:
+        before = deviance
+        theta, deviance = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
+        if deviance > before - SETTLED:
             break
-    return Mode(tuple(float(x) for x in theta), chi2_single - chi2)
+    return Mode(tuple(float(x) for x in theta), deviance_single - deviance)
 
 
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
@@ -98,7 +98,7 @@ def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> Float
 
 
 def global_check(
-    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, chi2_single: float
+    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, deviance_single: float
 ) -> Mode:
     """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
 
@@ -126,19 +126,19 @@ def global_check(
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
     contrast = np.clip(best_at(position)[0], 0.0, MAX_CONTRAST)
-    return refine(likelihood, np.concatenate([position, [contrast], single]), box, chi2_single)
+    return refine(likelihood, np.concatenate([position, [contrast], single]), box, deviance_single)
 
 
 def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:
-    """χ² and its gradient in scaled variables, as NLopt asks for them."""
+    """Deviance and its gradient in scaled variables, as NLopt asks for them."""
 
-    def chi2(x: FloatArray, gradient: FloatArray) -> float:
+    def deviance(x: FloatArray, gradient: FloatArray) -> float:
         value, slope = likelihood.log_prob_and_gradient((x * scale)[None])
         if gradient.size:
             gradient[:] = -2.0 * slope[0] * scale
         return float(-2.0 * (value[0] - likelihood.log_norm))
 
-    return chi2
+    return deviance
 
 
 def _field_limits(seed: FloatArray, box: Box, scale: FloatArray, at: int) -> list[Objective]:

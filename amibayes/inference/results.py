@@ -89,7 +89,10 @@ class Companion:
 
 @dataclass(frozen=True)
 class Mode:
-    """A local maximum of the likelihood: its parameters, and its gain over no companion."""
+    """A local maximum of the likelihood: its parameters, and 2Δln L over no companion.
+
+    The gain is that in χ² where the covariance is known.
+    """
 
     theta: tuple[float, ...]
     delta_chi2: float
@@ -146,8 +149,9 @@ class SearchResult:
 
     @property
     def delta_chi2(self) -> float:
-        """χ² without minus χ² with the companion."""
-        return self.chi2_single - self.chi2_binary
+        """2Δln L of the companion: χ² without minus χ² with it where the covariance is known."""
+        single, binary = self.likelihood.deviance([self.chi2_single, self.chi2_binary])
+        return float(single - binary)
 
     @property
     def candid_n_sigma(self) -> float:
@@ -156,6 +160,16 @@ class SearchResult:
 
     @property
     def bank_delta_chi2(self) -> FloatArray:
+        """2Δln L at every position of the grid, for positive contrast."""
+        gain = self.bank_gain
+        if not np.isfinite(self.likelihood.degrees):
+            return gain
+        left = np.maximum(self.chi2_single - gain, 0.0)
+        deviance = self.likelihood.deviance
+        return np.asarray(deviance(self.chi2_single) - deviance(left))
+
+    @property
+    def bank_gain(self) -> FloatArray:
         """Gain in χ² at every position of the grid, for positive contrast."""
         return np.where(self.bank_contrast > 0, (self.bank_contrast / self.bank_sigma) ** 2, 0.0)
 

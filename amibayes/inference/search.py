@@ -74,7 +74,7 @@ def look_outside(result: SearchResult) -> float | None:
     if not len(around):
         return None
     gain, place = _best_on(around, result)
-    inside = float(result.bank_delta_chi2.max())
+    inside = float(result.bank_gain.max())
     return place if gain >= inside + max(MODE_LIMIT, 0.1 * inside) else None
 
 
@@ -99,7 +99,7 @@ def look_inside(result: SearchResult) -> float | None:
         return None
     gain, place = _best_on(within, result)
     # A peak falls between the positions of either grid, which costs it up to 5 %.
-    as_good = 0.95 * float(result.bank_delta_chi2.max()) - MODE_LIMIT
+    as_good = 0.95 * float(result.bank_gain.max()) - MODE_LIMIT
     return place if gain >= max(as_good, SURELY_NOT_NOISE) else None
 
 
@@ -161,14 +161,14 @@ def search(
             source="--separation",
             remedy="widen the range",
         )
-    single, chi2_single = fit_single(likelihood)
+    single, deviance_single = fit_single(likelihood)
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     contrast, sigma = bank.scan(residuals)
     box = Box(inner, outer, fringe)
     seeds = _seeds(likelihood, grid, contrast, sigma, single, box)
-    found = [refine(likelihood, theta, box, chi2_single) for theta in seeds]
-    check = global_check(likelihood, bank, box, single, chi2_single)
+    found = [refine(likelihood, theta, box, deviance_single) for theta in seeds]
+    check = global_check(likelihood, bank, box, single, deviance_single)
     modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
     theta = np.array(modes[0].theta)
     # Without a companion there is nothing whose errors could be told.
@@ -180,8 +180,8 @@ def search(
         theta=theta,
         theta_covariance=covariance,
         single_theta=single,
-        chi2_single=chi2_single,
-        chi2_binary=chi2_single - modes[0].delta_chi2,
+        chi2_single=float(residuals @ residuals),
+        chi2_binary=float(likelihood.chi2(theta)[0]),
         ndof=likelihood.n_independent - len(likelihood.parameters),
         modes=modes,
         grid=grid,

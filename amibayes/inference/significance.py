@@ -3,7 +3,8 @@
 The statistic of the data and of every simulated null data set is one and the same: the
 largest gain in χ² over the template bank, for positive contrast, nuisance directions
 projected out. In whitened data a null set is a vector of independent unit normals, so ten
-thousand searches are two matrix products.
+thousand searches are two matrix products. Where the covariance was estimated, a null set
+gets an estimate of its own (see `amibayes.inference.redraw`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy import stats
 from scipy.special import gamma, gammaln
 
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.redraw import search_many, search_simulated, twice_log_ratio
 from amibayes.inference.robust import Frame, scores
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
@@ -77,11 +79,13 @@ class Significance:
     alpha : float
         Detection means ``probability`` < ``alpha``.
     free_scale : bool
-        The statistic is that of `profiled`: the size of the noise is not taken on trust.
+        The statistic is that of `amibayes.inference.redraw.profiled`: the size of the noise is not taken on trust.
     field : (n_grid,) float array, optional
         The statistic of the data at every position of the bank.
     n_free : int
         Number of independent data less the nuisance parameters.
+    degrees : float
+        Degrees of freedom of the t distribution of the data; infinite for a Gaussian.
     """
 
     statistic: float
@@ -93,6 +97,7 @@ class Significance:
     free_scale: bool = False
     field: FloatArray | None = None
     n_free: int = 0
+    degrees: float = np.inf
 
     @property
     def n_draws(self) -> int:
@@ -133,14 +138,15 @@ class Significance:
     def local_survival(self, statistic: FloatArray) -> FloatArray:
         """Probability that noise alone reaches the statistic at one given position.
 
-        One side of a normal deviate (Δχ²), or of Student's t with the scale free: exact for
-        one linear parameter, so it needs no draws.
+        One side of a normal deviate (Δχ²), or of Student's t with the scale free or the
+        covariance estimated: exact for one linear parameter, so it needs no draws. The
+        covariance's own error is that of the t distribution of the data.
         """
         x = np.asarray(statistic, dtype=float)
-        if not self.free_scale:
+        count = self.n_free if self.free_scale else self.n_free + self.degrees
+        if not np.isfinite(count):
             return np.asarray(stats.norm.sf(np.sqrt(x)))
-        ratio = np.expm1(x / self.n_free)
-        return np.asarray(stats.t.sf(np.sqrt((self.n_free - 1) * ratio), self.n_free - 1))
+        return np.asarray(stats.t.sf(np.sqrt((count - 1) * np.expm1(x / count)), count - 1))
 
     def tail_curves(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Both fitted laws, for a picture: statistic and probability to exceed it."""
@@ -154,36 +160,16 @@ class Significance:
         }
 
 
-def profiled(gain: FloatArray, chi2: FloatArray, n_data: int) -> FloatArray:
-    """Turn a gain in χ² into 2Δln L of a fit that scales the errors as well.
-
-    With the scale of the noise free, 2Δln L = n ln(χ²/(χ² − gain)): residuals and errors of
-    one data set grow together, and only their ratio counts.
-
-    Parameters
-    ----------
-    gain : (n,) float array
-    chi2 : (n,) float array
-        Without the companion.
-    n_data : int
-        Number of independent data less the nuisance parameters.
-    """
-    return np.asarray(-n_data * np.log1p(-np.minimum(gain / chi2, 1.0 - 1e-15)))
-
-
 def bank_statistic(
     bank: TemplateBank, white: FloatArray, *, free_scale: bool, frame: Frame | None = None
 ) -> FloatArray:
-    """Statistic of whitened data sets (n_data, n), the observed one as well as null ones.
+    """Statistic of data sets (n_data, n) whitened by the covariance of the bank.
 
     With a ``frame`` that of `amibayes.inference.robust.scores`: outliers count no more than
     their bounded score, in the data and in the null sets.
     """
-    data = bank.project(_bounded(bank, white, frame))
-    gain, _ = bank.largest_gain(data.astype(np.float32))
-    if not free_scale:
-        return gain
-    return profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
+    found = search_many(bank, _bounded(bank, white, frame))
+    return twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)
 
 
 def _bounded(bank: TemplateBank, white: FloatArray, frame: Frame | None) -> FloatArray:
@@ -200,10 +186,8 @@ def statistic_field(
     white = _bounded(bank, white[:, None], frame)[:, 0]
     contrast, sigma = bank.scan(white)
     gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
-    if not free_scale:
-        return gain
     chi2 = np.full(len(gain), float((bank.project(white) ** 2).sum()))
-    return profiled(gain, chi2, bank.n_data - bank.n_nuisance)
+    return twice_log_ratio(bank, gain, chi2, free_scale=free_scale)
 
 
 def null_maxima(
@@ -225,7 +209,7 @@ def null_maxima(
     n_draws : int
     rng : numpy.random.Generator
     free_scale : bool
-        Use the statistic of `profiled`, for noise whose size was fitted.
+        Use the statistic of `amibayes.inference.redraw.profiled`, for noise whose size was fitted.
     frame : Frame, optional
         Use the robust statistic; see `bank_statistic`.
     executor : Executor, optional
@@ -255,10 +239,21 @@ def _null_piece(
     piece: tuple[np.random.SeedSequence, int],
 ) -> dict[str, FloatArray]:
     seed, size = piece
-    noise = np.random.default_rng(seed).standard_normal((bank.n_data, size), dtype=np.float32)
-    return {
-        "statistic": bank_statistic(bank, noise.astype(float), free_scale=free_scale, frame=frame)
-    }
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((bank.n_data, size), dtype=np.float32).astype(float)
+    if frame is not None:
+        noise = _spread(bank, noise, rng)
+        return {"statistic": bank_statistic(bank, noise, free_scale=free_scale, frame=frame)}
+    found = search_simulated(bank, noise, rng)
+    return {"statistic": twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)}
+
+
+def _spread(bank: TemplateBank, noise: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Make unit normals (n_data, n) the t distribution that an estimated covariance leaves."""
+    if bank.freedom is None:
+        return noise
+    degrees = bank.freedom.degrees
+    return np.asarray(noise * np.sqrt((degrees - 2.0) / rng.chisquare(degrees, noise.shape[1])))
 
 
 def significance(
@@ -287,7 +282,7 @@ def significance(
     rng : numpy.random.Generator
     alpha : float
     free_scale : bool
-        The size of the noise was fitted: see `profiled`; the statistic has to be so too.
+        The size of the noise was fitted: see `amibayes.inference.redraw.profiled`; the statistic has to be so too.
     frame, executor, progress, journal
         As in `null_maxima`.
     """
@@ -315,6 +310,7 @@ def significance(
         alpha,
         free_scale,
         n_free=bank.n_data - bank.n_nuisance,
+        degrees=np.inf if bank.freedom is None else bank.freedom.degrees,
     )
 
 

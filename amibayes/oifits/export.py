@@ -162,10 +162,10 @@ def _one_object(parts: Sequence[Observables]) -> tuple[Observables, tuple[str, .
     correlated = not isinstance(whole.covariance, DiagonalCovariance)
     notes += ["correlations left out: the program cannot use them"] if correlated else []
     errors = DiagonalCovariance(whole.covariance.variance)
-    return replace(whole, covariance=errors, covariance_kind="diagonal", n_integrations=None), (
-        *notes,
-        "complex visibilities (OI_VIS) are not written",
+    plain = replace(
+        whole, covariance=errors, covariance_kind="diagonal", n_integrations=None, freedom=None
     )
+    return plain, (*notes, "complex visibilities (OI_VIS) are not written")
 
 
 def _of_target(setup: Setup, first: Setup) -> Setup:

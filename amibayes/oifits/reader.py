@@ -80,7 +80,7 @@ def observables_of(
         _in_written_order(_stack([p for p in parts if p.u == 1], 1)),
         _in_written_order(_stack([p for p in parts if p.u == 2], 2)),
     )
-    covariance, kind, count, notes = stated_covariance(oifits, content, closure_covariance)
+    stated = stated_covariance(oifits, content, closure_covariance)
     unused = tuple(
         f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused if t.name != RESPONSE
     )
@@ -88,12 +88,13 @@ def observables_of(
     return Observables(
         content.vis2.measurements,
         content.closure.measurements,
-        covariance,
-        kind,
+        stated.covariance,
+        stated.kind,
         setups,
-        count,
-        (*(n for p in parts for n in p.rows.notes), *notes, *unused)
+        stated.n_integrations,
+        (*(n for p in parts for n in p.rows.notes), *stated.notes, *unused)
         + (trailing if oifits.trailing_bytes else ()),
+        stated.freedom,
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from amibayes.covariance import Covariance, DiagonalCovariance
 from amibayes.errors import DataError
+from amibayes.freedom import Freedom
 from amibayes.observables import BoolArray, CovarianceKind, IntArray, Measurements
 from amibayes.oifits.correlations import (
     REMEDY,
@@ -65,10 +66,21 @@ class Content:
         return self.vis2, self.closure
 
 
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """A covariance, its kind, what an estimated one rests on, and notes."""
+
+    covariance: Covariance
+    kind: CovarianceKind
+    n_integrations: int | None
+    freedom: Freedom | None
+    notes: tuple[str, ...]
+
+
 def stated_covariance(
     oifits: OIFits, content: Content, closure_covariance: ClosureCovariance
-) -> tuple[Covariance, CovarianceKind, int | None, tuple[str, ...]]:
-    """Covariance of what is not flagged, its kind, number of integrations and notes."""
+) -> Stated:
+    """Covariance of what is not flagged, and what the file says of it."""
     flag = np.concatenate([c.measurements.flag for c in content.both])
     variance = np.concatenate([c.variance for c in content.both])
     closure = content.closure.measurements
@@ -83,7 +95,7 @@ def stated_covariance(
     images, variance, notes = _image_pairs(oifits, content, variance)
     if closure_covariance == "diagonal":
         set_aside = ("correlations of the file set aside",) if tables or notes else ()
-        return DiagonalCovariance(variance[~flag]), "diagonal", None, set_aside
+        return Stated(DiagonalCovariance(variance[~flag]), "diagonal", None, None, set_aside)
     pairs = _unflagged(joined([images, *_table_pairs(oifits, content, tables, variance)]), flag)
     pairs, doubt = trusted_pairs(pairs, variance[~flag], closure)
     notes += (doubt,) if doubt else ()
@@ -100,7 +112,7 @@ def stated_covariance(
     kind: CovarianceKind = "given" if len(pairs.first) else "assumed"
     if independent[len(independent) - len(closure) :].all() and kind == "assumed":
         kind = "diagonal"
-    return covariance, said or kind, _integrations(tables), notes
+    return Stated(covariance, said or kind, _integrations(tables), _freedom(tables), notes)
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:
@@ -179,6 +191,17 @@ def _said_kind(tables: list[OITable]) -> CovarianceKind | None:
     kinds = [str(t.header.get(f"{OWN_KEY} COVARIANCE", "")) for t in tables]
     known: tuple[CovarianceKind, ...] = get_args(CovarianceKind)
     return next((k for k in known if kinds and all(kind == k for kind in kinds)), None)
+
+
+def _freedom(tables: list[OITable]) -> Freedom | None:
+    """Degrees of freedom that amibayes wrote into OI_CORR, the least where there are several."""
+    found = []
+    for table in tables:
+        values = [table.header.get(f"{OWN_KEY} {key}") for key in ("DOF", "SCATDOF")]
+        numbers = [float(v) for v in values if isinstance(v, int | float)]
+        if len(numbers) == 2 and numbers[0] > 2.0 and numbers[1] > 0.0:
+            found.append(Freedom(*numbers))
+    return min(found, key=lambda f: f.degrees) if found else None
 
 
 def _integrations(tables: list[OITable]) -> int | None:

@@ -297,6 +297,7 @@ def _needs_correlations(observables: Observables) -> bool:
     return not (
         observables.covariance_kind == "diagonal"
         and observables.n_integrations is None
+        and observables.freedom is None
         and isinstance(observables.covariance, DiagonalCovariance)
     )
 
@@ -320,6 +321,9 @@ def _correlation_table(observables: Observables, grids: list[Grid]) -> Any:
     _own(table, "COVARIANCE", observables.covariance_kind)
     if observables.n_integrations is not None:
         _own(table, "NINT", observables.n_integrations)
+    if observables.freedom is not None:
+        _own(table, "DOF", observables.freedom.degrees)
+        _own(table, "SCATDOF", observables.freedom.scatter)
     return table
 
 

@@ -278,7 +278,7 @@ def _compass(ax: Axes) -> None:
 
 def local_n_sigma(result: SearchResult) -> FloatArray:
     """CANDID's nσ of the best positive contrast at every position of the grid, (n_grid,)."""
-    chi2 = result.chi2_single - result.bank_delta_chi2
+    chi2 = result.chi2_single - result.bank_gain
     return candid_n_sigma(result.chi2_single, chi2, result.ndof)
 
 

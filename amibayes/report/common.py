@@ -31,12 +31,16 @@ def inputs_json(targets: Sequence[str], calibrators: Sequence[str]) -> list[Json
 def data_json(result: SearchResult) -> Json:
     """Say what data were fitted, and over which field."""
     used = result.likelihood.observables
+    freedom = used.freedom
     return {
         "n_vis2": used.n_vis2,
         "n_closure_phases": used.n_closure_phases,
         "n_independent": used.n_independent,
         "covariance": used.covariance_kind,
         "n_integrations": used.n_integrations,
+        "degrees_of_freedom": None if freedom is None else freedom.degrees,
+        "n_over_p": None if freedom is None else (freedom.scatter + 1.0) / used.n_independent,
+        "scatter_share": None if freedom is None else min(1.0, freedom.scatter_share),
         "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
         "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
         "separation_mas": [result.grid.inner_mas, result.grid.outer_mas],
