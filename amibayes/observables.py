@@ -238,10 +238,8 @@ class Observables:
         DataError
             Where nothing is left.
         """
-        chosen = self.select(
-            np.full(len(self.vis2), "vis2" in kinds),
-            np.full(len(self.closure_phase), "cp" in kinds),
-        )
+        n, m = len(self.vis2), len(self.closure_phase)
+        chosen = self.select(np.full(n, "vis2" in kinds), np.full(m, "cp" in kinds))
         if not len(chosen.data):
             raise DataError(f"holds no usable {' or '.join(kinds)}", source=self.source)
         return chosen
@@ -375,7 +373,6 @@ def join(parts: Sequence[Observables]) -> Observables:
         return parts[0]
     shifts = np.cumsum([0, *(len(p.setups) for p in parts)])
     order = [np.arange(p.n_vis2) for p in parts], [np.arange(p.n_closure_phases) for p in parts]
-    stacked = stack_covariances([p.covariance for p in parts])
     starts = np.cumsum([0, *(p.covariance.size for p in parts)])
     vis2_first = np.concatenate(
         [s + i for s, i in zip(starts, order[0], strict=False)]
@@ -386,7 +383,7 @@ def join(parts: Sequence[Observables]) -> Observables:
     return Observables(
         _concatenate([p.vis2 for p in parts], shifts),
         _concatenate([p.closure_phase for p in parts], shifts),
-        stacked.select(vis2_first),
+        stack_covariances([p.covariance for p in parts]).select(vis2_first),
         min((p.covariance_kind for p in parts), key=kinds.index),
         tuple(s for p in parts for s in p.setups),
         min(known) if known else None,
@@ -399,6 +396,5 @@ def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurement
     columns = {
         f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(parts[0])
     }
-    sizes = [len(p) for p in parts]
-    columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], sizes)
+    columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
     return Measurements(**columns)

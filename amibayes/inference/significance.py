@@ -79,7 +79,7 @@ class Significance:
     alpha : float
         Detection means ``probability`` < ``alpha``.
     free_scale : bool
-        The statistic is that of `redraw.profiled`: the size of the noise is not taken on trust.
+        The statistic is that of `profiled`: the size of the noise is not taken on trust.
     field : (n_grid,) float array, optional
         The statistic of the data at every position of the bank.
     n_free : int
@@ -209,7 +209,7 @@ def null_maxima(
     n_draws : int
     rng : numpy.random.Generator
     free_scale : bool
-        Use the statistic of `redraw.profiled`, for noise whose size was fitted.
+        Use the statistic of `profiled`, for noise whose size was fitted.
     frame : Frame, optional
         Use the robust statistic; see `bank_statistic`.
     executor : Executor, optional
@@ -282,7 +282,7 @@ def significance(
     rng : numpy.random.Generator
     alpha : float
     free_scale : bool
-        The size of the noise was fitted: see `redraw.profiled`; the statistic has to be so too.
+        The size of the noise was fitted: see `profiled`; the statistic has to be so too.
     frame, executor, progress, journal
         As in `null_maxima`.
     """
