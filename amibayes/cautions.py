@@ -113,8 +113,10 @@ def search_cautions(
                 f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
+        exact = "; posterior.integrated in result.json does not rest on the chain"
         found.append(
             f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "
             f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
+            + (exact if posterior.mode_method == "grid" else "")
         )
     return tuple(found)

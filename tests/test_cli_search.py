@@ -243,6 +243,13 @@ def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> N
     limit = posterior["upper_limit"]
     assert limit["method"] == "grid"
     assert 1e-5 < limit["contrast"] < 0.01
+    integrated, chain = posterior["integrated"]["contrast"], posterior["contrast"]
+    assert integrated["upper"] == pytest.approx(chain["upper"], rel=0.3)
+    none = result["noise"]["posterior"]["extra_vis2"]
+    assert none["lower"] <= none["median"] <= none["upper"] < 0.02
+    assert 0.0 < none["probability_errors_right"] < 1.0
+    second = evidence["two_companions"]
+    assert second["false_alarm_probability"] > 0.0013
     assert limit["contrast"] == pytest.approx(posterior["contrast"]["upper_95"], rel=0.5)
     assert limit["contrast"] == limit["contrast_uniform_prior"]
     assert evidence["companions"] == [0, 1, 2]

@@ -53,9 +53,9 @@ def check(ranks: np.ndarray) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(RANGES))
 def test_ranks_of_the_grid_posterior_are_uniform(name) -> None:
-    """200 truths in each range of contrast, 600 in all."""
+    """170 truths in each range of contrast, 510 in all: three minutes on one core."""
     ranks = []
-    for prior, truth, likelihood in truths(name, 200, seed=11):
+    for prior, truth, likelihood in truths(name, 170, seed=11):
         grid = grid_posterior(likelihood, prior)
         ranks.append([grid.cdf(n, x) for n, x in zip(NAMES, truth, strict=True)])
     check(np.array(ranks))
@@ -64,9 +64,9 @@ def test_ranks_of_the_grid_posterior_are_uniform(name) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(RANGES))
 def test_ranks_of_the_chain_are_uniform(name) -> None:
-    """60 truths in each range, 180 in all: a chain costs a few seconds."""
+    """40 truths in each range, 120 in all: three minutes on one core."""
     ranks = []
-    for k, (prior, truth, likelihood) in enumerate(truths(name, 60, seed=12)):
+    for k, (prior, truth, likelihood) in enumerate(truths(name, 40, seed=12)):
         result = search(likelihood, FIELD)
         posterior = sample(result, prior, np.random.default_rng([13, k]))
         sampled = posterior.samples.copy()

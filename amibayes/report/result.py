@@ -9,6 +9,7 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
+from amibayes.inference.grid_posterior import GridPosterior
 from amibayes.inference.multiplicity import TwoCompanions
 from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.posterior import Posterior
@@ -188,18 +189,7 @@ def _mode(mode: Mode) -> Json:
 
 def _posterior(report: SearchReport, posterior: Posterior) -> Json:
     names = [*QUANTITIES, *posterior.names[3:]]
-    out: Json = {}
-    for name in names:
-        median, lower, upper = posterior.interval(name, 0.68)
-        _, lower95, upper95 = posterior.interval(name, 0.95)
-        out[name] = {
-            "median": median,
-            "lower": lower,
-            "upper": upper,
-            "lower_95": lower95,
-            "upper_95": upper95,
-        }
-    return out | {
+    return _intervals(posterior, names) | {
         "autocorrelation_time": number(posterior.autocorrelation_time),
         "n_effective": posterior.n_effective,
         "n_steps": posterior.n_steps,
@@ -211,11 +201,28 @@ def _posterior(report: SearchReport, posterior: Posterior) -> Json:
             name: {key: number(value) for key, value in line.items()}
             for name, line in posterior.convergence().items()
         },
+        "integrated": None if report.grid is None else _intervals(report.grid, names),
         "mode_method": posterior.mode_method,
         "probability_elsewhere": number(posterior.elsewhere),
         "upper_limit": upper_limit(report),
         "prior": prior_json(posterior.prior, posterior.names[3:]),
     }
+
+
+def _intervals(found: Posterior | GridPosterior, names: list[str]) -> Json:
+    """Median, 68 and 95 % intervals: of the chain, or by direct integration over the field."""
+    out: Json = {}
+    for name in names:
+        median, lower, upper = found.interval(name, 0.68)
+        _, lower95, upper95 = found.interval(name, 0.95)
+        out[name] = {
+            "median": median,
+            "lower": lower,
+            "upper": upper,
+            "lower_95": lower95,
+            "upper_95": upper95,
+        }
+    return out
 
 
 def prior_json(prior: Prior, nuisance: tuple[str, ...]) -> Json:
