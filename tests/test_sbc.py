@@ -64,9 +64,9 @@ def test_ranks_of_the_grid_posterior_are_uniform(name) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(RANGES))
 def test_ranks_of_the_chain_are_uniform(name) -> None:
-    """40 truths in each range, 120 in all: three minutes on one core."""
+    """30 truths in each range, 90 in all: two and a half minutes on one core."""
     ranks = []
-    for k, (prior, truth, likelihood) in enumerate(truths(name, 40, seed=12)):
+    for k, (prior, truth, likelihood) in enumerate(truths(name, 30, seed=12)):
         result = search(likelihood, FIELD)
         posterior = sample(result, prior, np.random.default_rng([13, k]))
         sampled = posterior.samples.copy()
