@@ -34,11 +34,11 @@ POSITIONS = 40_000
 DRAWS = 10_000
 
 
-def simulated() -> Observables:
+def simulated(n_exposures: int = 50) -> Observables:
     """Exposures that the sky's rotation spreads over the (u, v) plane."""
     rng = np.random.default_rng(1)
     parts = []
-    for k in range(50):
+    for k in range(n_exposures):
         turn = np.radians(1.5 * k)
         rotate = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         stations = np.array([[0.0, 0.0], [50.0, 10.0], [20.0, 70.0], [-30.0, 60.0]]) @ rotate

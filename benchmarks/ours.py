@@ -1,0 +1,82 @@
+"""CPU time of amibayes for what the peers do too, and what part of it the machine itself needs."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amibayes import BinaryModel, Cube, Likelihood, read_oifits, sample, search
+from amibayes.extraction import ExtractOptions, extract_all
+from amibayes.inference.bank import TemplateBank
+from amibayes.inference.priors import default_prior
+from amibayes.inference.significance import null_maxima
+from benchmarks.search import gemm_seconds
+
+DRAWS = 10_000
+
+
+def cpu(function: Callable[[], Any], repeat: int = 3) -> tuple[float, Any]:
+    """Least CPU time of a few calls, and the last result."""
+    times = []
+    for _ in range(repeat):
+        begin = time.process_time()
+        result = function()
+        times.append(time.process_time() - begin)
+    return min(times), result
+
+
+def searches(path: Path, field: tuple[float, float], model: BinaryModel) -> dict[str, float]:
+    """Searches of the data, of null draws, the likelihood, and draws of the posterior."""
+    likelihood = Likelihood(read_oifits(path), model)
+    whole, result = cpu(lambda: search(likelihood, field))
+    bank = TemplateBank(likelihood, result.grid, result.single_theta)
+    null, _ = cpu(lambda: null_maxima(bank, DRAWS, np.random.default_rng(1)), repeat=1)
+    noise, _ = cpu(
+        lambda: np.random.default_rng(1).standard_normal((bank.n_data, DRAWS), dtype=np.float32)
+    )
+    floor = gemm_seconds(2.0 * (len(bank) / 2) * bank.n_data * DRAWS)
+    theta = np.tile(result.theta, (4096, 1)) * np.linspace(0.9, 1.1, 4096)[:, None]
+    density, _ = cpu(lambda: likelihood.log_prob(theta))
+    prior = default_prior(likelihood, *field)
+    chain, posterior = cpu(lambda: sample(result, prior, np.random.default_rng(1)), repeat=1)
+    return {
+        "search_per_position": whole / len(bank),
+        "null_search_per_position": null / DRAWS / len(bank),
+        "null_share_gemm": floor / null,
+        "null_share_random": noise / null,
+        "log_probability": density / len(theta),
+        "posterior_draw": chain / posterior.n_effective,
+    }
+
+
+def extraction(path: Path) -> dict[str, float]:
+    """The default extraction of a cube that is in memory, beside one FFT of every image."""
+    from astropy.io import fits
+
+    images = fits.getdata(path).astype(np.float64)
+    scale = 65.6 * np.pi / 180 / 3.6e6
+    cube = Cube(images=images, pixel_scale_rad=scale, instrument="NIRISS", filter="F480M")
+    seconds, _ = cpu(lambda: extract_all(cube, ExtractOptions()))
+    fourier, _ = cpu(lambda: np.fft.rfft2(images))
+    return {
+        "extraction_per_integration": seconds / len(images),
+        "extraction_over_fft": seconds / fourier,
+    }
+
+
+def whole(path: Path) -> float:
+    """CPU seconds of the command with all of its stages, from start to end of the process."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as folder:
+        words = [sys.executable, "-m", "amibayes", "search", str(path), "--out", folder, "--quiet"]
+        subprocess.run(words, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
