@@ -1,6 +1,6 @@
 """Measure everything in one run and print ratios.
 
-    python -m benchmarks --peers FOLDER [--out TABLE.md]
+    python -m benchmarks --peers FOLDER [--only PART …]
 
 FOLDER keeps the environments of AMICAL, virgil, fouriever and PMOIRED, which are installed
 from PyPI the first time; one that cannot be had is reported so. All numbers are CPU time
@@ -23,8 +23,6 @@ from threadpoolctl import threadpool_limits
 from amibayes import BinaryModel
 from benchmarks import ours, peers
 from benchmarks.data import write_all
-
-VLTI_FIELD, NIRISS_FIELD = (0.7, 50.0), (50.0, 400.0)
 
 WORDS = {
     "extraction_per_integration": "extraction, per integration of 80 × 80 pixels",
@@ -72,53 +70,65 @@ def compare(
     ]
 
 
-def table(folder: Path, work: Path) -> list[str]:
-    """Measure; return the lines of a table and of the machine's own limits."""
-    paths = write_all(work)
-    images = ours.extraction(paths["cube"])
-    snapshot = ours.searches(paths["niriss"], NIRISS_FIELD, BinaryModel())
-    vlti = ours.searches(paths["vlti"], VLTI_FIELD, BinaryModel(diameter_mas="free"))
-    whole = {"whole": ours.whole(paths["niriss"])}
-    niriss, vlti_file = str(paths["niriss"]), str(paths["vlti"])
-    rows = [
-        *compare("amical", "NIRISS cube", images, [str(paths["cube"])], folder),
-        *compare("virgil", "NIRISS snapshot", snapshot, [niriss, "draws"], folder),
-        *compare("fouriever", "NIRISS snapshot", snapshot, [niriss], folder),
-        *compare("pmoired", "VLTI, 10 exposures", vlti, [vlti_file], folder),
-        *compare(
-            "virgil", "NIRISS snapshot", whole, [niriss, "pipeline", str(work / "run")], folder
-        ),
-    ]
+def extraction(paths: dict[str, Path], folder: Path) -> list[str]:
+    """AMICAL, and one FFT of every image."""
+    mine = ours.extraction(paths["cube"])
+    rows = compare("amical", "NIRISS cube", mine, [str(paths["cube"])], folder)
+    share = f"{mine['extraction_over_fft']:.0f} times the FFTs of its images"
+    return [*rows, f"| limit of the machine: extraction takes | NIRISS cube | | | | {share} |"]
+
+
+def snapshot(paths: dict[str, Path], folder: Path) -> list[str]:
+    """virgil and fouriever on few data, products of matrices and random numbers."""
+    mine = ours.searches(paths["niriss"], (50.0, 400.0), BinaryModel())
+    path, data = str(paths["niriss"]), "NIRISS snapshot"
     return [
-        "| what | data | program | its CPU time | amibayes | ratio |",
-        "|---|---|---|---|---|---|",
-        *rows,
-        "",
-        "| limit of the machine | share |",
-        "|---|---|",
-        *(
-            f"| {what}, {data} | {100 * mine[key]:.0f} % |"
-            for data, mine in (("NIRISS", snapshot), ("VLTI", vlti))
-            for what, key in (
-                ("matrix products in the time of null draws", "null_share_gemm"),
-                ("random numbers in the time of null draws", "null_share_random"),
-            )
-        ),
-        f"| extraction over one FFT of every image | {images['extraction_over_fft']:.1f} times |",
+        *compare("virgil", data, mine, [path, "draws"], folder),
+        *compare("fouriever", data, mine, [path], folder),
+        *limits(data, mine),
     ]
+
+
+def vlti(paths: dict[str, Path], folder: Path) -> list[str]:
+    """PMOIRED on many data."""
+    mine = ours.searches(paths["vlti"], (0.7, 50.0), BinaryModel(diameter_mas="free"))
+    data = "VLTI, 10 exposures"
+    return [*compare("pmoired", data, mine, [str(paths["vlti"])], folder), *limits(data, mine)]
+
+
+def command(paths: dict[str, Path], folder: Path) -> list[str]:
+    """virgil's pipeline against the command, each with all of its stages."""
+    mine = {"whole": ours.whole(paths["niriss"])}
+    path, run = str(paths["niriss"]), str(paths["niriss"].parent / "run")
+    return compare("virgil", "NIRISS snapshot", mine, [path, "pipeline", run], folder)
+
+
+def limits(data: str, mine: dict[str, float]) -> list[str]:
+    """What the machine itself needs of the time of null draws."""
+    shares = {"matrix products": "null_share_gemm", "random numbers": "null_share_random"}
+    return [
+        f"| limit of the machine: {what} in null draws | {data} | | | | "
+        f"{100 * mine[key]:.0f} % of the time |"
+        for what, key in shares.items()
+    ]
+
+
+PARTS = {"extraction": extraction, "snapshot": snapshot, "vlti": vlti, "command": command}
+
+HEAD = ["| what | data | program | its CPU time | amibayes | ratio |", "|---|---|---|---|---|---|"]
 
 
 def main() -> None:
     """Run."""
     parser = argparse.ArgumentParser(description="Ratios of CPU time, all from one run.")
     parser.add_argument("--peers", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--out", type=Path, metavar="TABLE.md", help="write the table there too")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts")
     arguments = parser.parse_args()
+    print("\n".join(HEAD), flush=True)
     with tempfile.TemporaryDirectory() as work, threadpool_limits(1):
-        lines = table(arguments.peers.resolve(), Path(work))
-    print("\n".join(lines))
-    if arguments.out:
-        arguments.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        paths = write_all(Path(work))
+        for part in arguments.only:
+            print("\n".join(PARTS[part](paths, arguments.peers.resolve())), flush=True)
 
 
 if __name__ == "__main__":

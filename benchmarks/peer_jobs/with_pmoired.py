@@ -21,14 +21,14 @@ if __name__ == "__main__":
         fixed = ["*,f", "c,ud"]
         begin = cpu()
         oi.gridFit(
-            {"grid": {"c,x": (-30, 30, 10.0), "c,y": (-30, 30, 10.0)}},
+            {"grid": {"c,x": (-30, 30, 15.0), "c,y": (-30, 30, 15.0)}},
             model=model,
             doNotFit=fixed,
             multi=False,
         )
-        search = (cpu() - begin) / 49
+        search = (cpu() - begin) / 25
         begin = cpu()
-        oi.bootstrapFit(20, multi=False)
-        resampled = (cpu() - begin) / 20
+        oi.bootstrapFit(10, multi=False)
+        resampled = (cpu() - begin) / 10
     print("cpu_s search_per_position", search)
     print("cpu_s posterior_draw", resampled)
