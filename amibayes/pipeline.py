@@ -26,8 +26,8 @@ from amibayes.inference.noise_marginal import (
 from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
-from amibayes.inference.results import SearchResult
-from amibayes.inference.robust import Frame, frame_of
+from amibayes.inference.results import SearchResult, judging
+from amibayes.inference.robust import Frame
 from amibayes.inference.robust_noise import student_likelihood
 from amibayes.inference.robust_search import search_robust
 from amibayes.inference.search import (
@@ -360,15 +360,6 @@ def weigh_second(
     residuals = likelihood.residuals(result.theta)
     run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, None)
     return run.judge(bank, residuals, options, rng)
-
-
-def judging(result: SearchResult) -> tuple[Likelihood, Frame | None]:
-    """Likelihood by which a search is judged, and the frame of robust residuals."""
-    if result.robustness is None:
-        return result.likelihood, None
-    # Weights were found with a companion; no companion may be judged by them.
-    base = result.robustness.base
-    return Likelihood(base, result.likelihood.model), frame_of(base)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -13,12 +15,13 @@ from amibayes.inference.limits import detection_limit
 from amibayes.inference.logistic import fit_logistic
 from amibayes.inference.recovery import recover
 from amibayes.inference.refine import single_likelihood
+from amibayes.inference.results import judging
 from amibayes.inference.search import search
 from amibayes.inference.significance import bank_statistic, significance
 from amibayes.job import SearchOptions
 from amibayes.limits_job import LimitsOptions, measure_limits
 from amibayes.oifits import write_oifits
-from amibayes.pipeline import search_field
+from amibayes.pipeline import search_field, weigh
 from amibayes.units import offset
 
 
@@ -48,7 +51,7 @@ def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
     """
     _, _, weight, limit = setting
     rng = np.random.default_rng(3)
-    n, k = 60, 3
+    n, k = 40, 3
     for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
         places = zip(*offset(limit.separation_mas[k], rng.uniform(0, 360, n)), strict=True)
         found = sum(
@@ -173,3 +176,40 @@ def test_same_seed_same_limit(setting) -> None:
     first = detection_limit(result, weight, np.random.default_rng(5), trials_per_cell=10)
     again = detection_limit(result, weight, np.random.default_rng(5), trials_per_cell=10)
     np.testing.assert_array_equal(first.contrast, again.contrast)
+
+
+def test_robust_search_has_limits_of_its_own_statistic() -> None:
+    """One closure phase is 30 sigma off: threshold, rate and limit are those of robust searches.
+
+    Injections of nothing are found at the rate α, and the limit is that of clean data but for the
+    scale, which the outlier stretches a little.
+    """
+    clean = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    phases = clean.closure_phase.value.copy()
+    phases[3] += np.radians(9.0)
+    spoilt = replace(clean, closure_phase=replace(clean.closure_phase, value=phases))
+    asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=20_000, alpha=0.01, robust=True)
+    found = []
+    for data in (clean, spoilt):
+        result, _, _ = search_field(data, asked)
+        weight = weigh(result, asked, np.random.default_rng(2), None, None)
+        rng = np.random.default_rng(3)
+        limit = detection_limit(result, weight, rng, separation_mas=[200.0], trials_per_cell=300)
+        likelihood, frame = judging(result)
+        assert frame is not None
+        bank = TemplateBank(likelihood, result.grid, result.single_theta)
+        nothing = np.column_stack([np.full(10_000, 200.0), np.zeros((10_000, 2))])
+        blank = recover(
+            likelihood,
+            bank,
+            np.empty(0),
+            nothing,
+            limit.threshold,
+            rng,
+            free_scale=True,
+            frame=frame,
+        )
+        sigma = np.sqrt(0.01 * 0.99 * (1 / 10_000 + 1 / 20_000))
+        assert abs(blank.detected.mean() - 0.01) < 4.5 * sigma
+        found.append(limit.delta_mag[0])
+    assert abs(found[0] - found[1]) < 0.4

@@ -113,4 +113,10 @@ def add_data(group: argparse._ActionsContainer) -> None:
         help="add noise where the stated errors do not explain the residuals (default: yes)",
     )
     add_insname(group)
+    group.add_argument(
+        "--robust",
+        action="store_true",
+        help="Student-t residuals: outliers lose their weight, in search, null draws, limits and "
+        "posterior",
+    )
     group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")

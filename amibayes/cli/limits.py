@@ -240,6 +240,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
         insname=arguments.insname,
         target=arguments.target,
         extra_noise=arguments.extra_noise,
+        robust=arguments.robust,
         null_draws=_null_draws(arguments),
         seed=arguments.seed,
         images=common.image_options_of(arguments),

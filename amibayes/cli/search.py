@@ -38,11 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     data = parser.add_argument_group("data")
     data_options.add_observables(data, ("vis2", "cp"), "which observables to fit (default: both)")
     data_options.add_data(data)
-    data.add_argument(
-        "--robust",
-        action="store_true",
-        help="Student-t residuals: outliers lose their weight, in search, null draws and posterior",
-    )
     common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
     data_options.add_null_draws(stages, 10_000)

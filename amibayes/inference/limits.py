@@ -24,7 +24,7 @@ from amibayes.inference.recovery import (
     nearer_aliases,
     recover,
 )
-from amibayes.inference.results import SearchResult
+from amibayes.inference.results import SearchResult, judging
 from amibayes.inference.rings import Rings, make_rings
 from amibayes.inference.rounds import IntArray, Setting, Trials, inject, spawned
 from amibayes.inference.search import resolution_mas
@@ -210,29 +210,44 @@ def detection_limit(
     -------
     DetectionLimit
     """
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    rings = make_rings(result, n_separations, separation_mas)
-    gain = _gain_at(significance, bank)
-    sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
-    level = _levels(gain, sigma)
-    nearer = _nearer(bank, rings, result, executor, journals)
-    seen_at = np.full(nearer.shape, (np.sqrt(gain) + stats.norm.ppf(COMPLETENESS)) ** 2)
-    lost = ambiguous(nearer, seen_at).mean(axis=1)
-    setting = Setting(
-        result,
-        bank,
-        rings,
-        nearer,
-        level,
-        lost > MOST_AMBIGUOUS,
-        significance.threshold(),
-        significance.free_scale,
-        executor,
-        journals,
+    setting, lost, sigma = _prepared(
+        result, significance, make_rings(result, n_separations, separation_mas), executor, journals
     )
     trials = inject(setting, trials_per_cell, rng, progress)
     false = _false_positives(setting, significance, rng)
     return _summarised(setting, trials, sigma, lost, significance.alpha, false)
+
+
+def _prepared(
+    result: SearchResult,
+    significance: Significance,
+    rings: Rings,
+    executor: Executor | None,
+    journals: Journals | None,
+) -> tuple[Setting, FloatArray, FloatArray]:
+    """What all rounds need, the ambiguous share of every ring, and errors of the contrast."""
+    likelihood, frame = judging(result)
+    bank = TemplateBank(likelihood, result.grid, result.single_theta)
+    gain = _gain_at(significance, bank)
+    sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
+    nearer = _nearer(bank, rings, result, executor, journals)
+    seen_at = np.full(nearer.shape, (np.sqrt(gain) + stats.norm.ppf(COMPLETENESS)) ** 2)
+    lost = ambiguous(nearer, seen_at).mean(axis=1)
+    setting = Setting(
+        likelihood=likelihood,
+        single=result.single_theta,
+        frame=frame,
+        bank=bank,
+        rings=rings,
+        nearer=nearer,
+        level=_levels(gain, sigma),
+        by_detection=lost > MOST_AMBIGUOUS,
+        threshold=significance.threshold(),
+        free_scale=significance.free_scale,
+        executor=executor,
+        journals=journals,
+    )
+    return setting, lost, sigma
 
 
 def _levels(gain: float, sigma: FloatArray) -> FloatArray:
@@ -270,6 +285,7 @@ def _false_positives(
         significance.n_draws,
         spawned(rng),
         free_scale=setting.free_scale,
+        frame=setting.frame,
         executor=setting.executor,
         journal=journal,
     )

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.redraw import Searched, search_many, search_simulated, twice_log_ratio
+from amibayes.inference.redraw import Searched, search_many, twice_log_ratio
 from amibayes.inference.refine import single_likelihood
+from amibayes.inference.robust import Frame
 from amibayes.inference.search import resolution_mas
+from amibayes.inference.significance import bounded, search_drawn
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
@@ -66,6 +68,7 @@ def recover(
     rng: np.random.Generator,
     *,
     free_scale: bool = False,
+    frame: Frame | None = None,
     nearer: FloatArray | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -87,6 +90,8 @@ def recover(
     rng : numpy.random.Generator
     free_scale : bool
         The statistic is `profiled`, else 2Δln L with the errors as they are.
+    frame : Frame, optional
+        The statistic is the robust one; see `amibayes.inference.significance.bank_statistic`.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places of the trials, if it is known already.
     executor : Executor, optional
@@ -105,7 +110,7 @@ def recover(
         (theta[p], None if nearer is None else nearer[p], seed)
         for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)
     ]
-    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale)
+    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale, frame)
     executor = executor or SerialExecutor()
     done = list(run_job(work, pieces, executor, journal=journal, progress=progress))
     return Recovery(
@@ -119,12 +124,13 @@ def _recover_piece(
     single: FloatArray,
     threshold: float,
     free_scale: bool,
+    frame: Frame | None,
     piece: tuple[FloatArray, FloatArray | None, np.random.SeedSequence],
 ) -> dict[str, BoolArray]:
     theta, nearer, seed = piece
     signal = injected_signal(likelihood, single, theta)
     rng = np.random.default_rng(seed)
-    hit = search_simulated(bank, rng.standard_normal(signal.shape), rng, signal)
+    hit = search_drawn(bank, rng.standard_normal(signal.shape), rng, frame, signal)
     fringe, places = resolution_mas(likelihood), theta[:, :2]
     found = _judged(bank, fringe, places, hit, threshold, free_scale=free_scale, nearer=nearer)
     return {name: found[name] for name in ("detected", "located")}
@@ -138,6 +144,7 @@ def judge(
     threshold: float,
     *,
     free_scale: bool = False,
+    frame: Frame | None = None,
     nearer: FloatArray | None = None,
 ) -> dict[str, Any]:
     """Search data sets that hold a companion each.
@@ -155,6 +162,8 @@ def judge(
         Statistic that counts as a detection.
     free_scale : bool
         The statistic is `profiled`, else 2Δln L with the errors as they are.
+    frame : Frame, optional
+        The statistic is the robust one; see `amibayes.inference.significance.bank_statistic`.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places, if it is known already.
 
@@ -163,7 +172,7 @@ def judge(
     dict of (n,) arrays
         ``detected`` and ``located`` as in `Recovery`, and the ``statistic``.
     """
-    hit = search_many(bank, white)
+    hit = search_many(bank, bounded(bank, white, frame))
     return _judged(bank, fringe_mas, places, hit, threshold, free_scale=free_scale, nearer=nearer)
 
 

@@ -12,7 +12,7 @@ from astropy.table import QTable
 from amibayes.inference.bank import Grid
 from amibayes.inference.detection import candid_n_sigma
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.robust import Robustness
+from amibayes.inference.robust import Frame, Robustness, frame_of
 from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import (
     FloatArray,
@@ -205,6 +205,15 @@ class SearchResult:
             f"<SearchResult: {c.separation_mas:.2f} mas, PA {c.position_angle_deg:.2f}°, contrast "
             f"{c.contrast:.3g}, Δχ² {self.delta_chi2:.1f}, {len(self.modes)} modes>"
         )
+
+
+def judging(result: SearchResult) -> tuple[Likelihood, Frame | None]:
+    """Likelihood by which a search is judged, and the frame of robust residuals."""
+    if result.robustness is None:
+        return result.likelihood, None
+    # Weights were found with a companion; no companion may be judged by them.
+    base = result.robustness.base
+    return Likelihood(base, result.likelihood.model), frame_of(base)
 
 
 def companion_of(theta: FloatArray, covariance: FloatArray) -> Companion:

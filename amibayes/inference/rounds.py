@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.recovery import TRIALS_AT_ONCE, recover
-from amibayes.inference.results import SearchResult
 from amibayes.inference.rings import Rings
+from amibayes.inference.robust import Frame
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journals, Progress, spawn
 from amibayes.units import FloatArray
@@ -45,7 +46,9 @@ class Trials:
 class Setting:
     """What stays the same over all rounds."""
 
-    result: SearchResult
+    likelihood: Likelihood
+    single: FloatArray
+    frame: Frame | None
     bank: TemplateBank
     rings: Rings
     nearer: FloatArray
@@ -136,13 +139,14 @@ def _one_round(
         ]
     )
     found = recover(
-        setting.result.likelihood,
+        setting.likelihood,
         setting.bank,
-        setting.result.single_theta,
+        setting.single,
         theta,
         setting.threshold,
         rng,
         free_scale=setting.free_scale,
+        frame=setting.frame,
         nearer=setting.nearer[ring, angle],
         executor=setting.executor,
         progress=progress,

@@ -18,7 +18,7 @@ from scipy import stats
 from scipy.special import gamma, gammaln
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.inference.redraw import search_many, search_simulated, twice_log_ratio
+from amibayes.inference.redraw import Searched, search_many, search_simulated, twice_log_ratio
 from amibayes.inference.robust import Frame, scores
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
@@ -168,11 +168,12 @@ def bank_statistic(
     With a ``frame`` that of `amibayes.inference.robust.scores`: outliers count no more than
     their bounded score, in the data and in the null sets.
     """
-    found = search_many(bank, _bounded(bank, white, frame))
+    found = search_many(bank, bounded(bank, white, frame))
     return twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)
 
 
-def _bounded(bank: TemplateBank, white: FloatArray, frame: Frame | None) -> FloatArray:
+def bounded(bank: TemplateBank, white: FloatArray, frame: Frame | None) -> FloatArray:
+    """Scores of whitened data (n_data, n) that no outlier can dominate; the data without frame."""
     return white if frame is None else scores(frame, bank.project(white))
 
 
@@ -183,7 +184,7 @@ def statistic_field(
 
     Its maximum is that of `bank_statistic`.
     """
-    white = _bounded(bank, white[:, None], frame)[:, 0]
+    white = bounded(bank, white[:, None], frame)[:, 0]
     contrast, sigma = bank.scan(white)
     gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
     chi2 = np.full(len(gain), float((bank.project(white) ** 2).sum()))
@@ -241,11 +242,36 @@ def _null_piece(
     seed, size = piece
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((bank.n_data, size), dtype=np.float32).astype(float)
-    if frame is not None:
-        noise = _spread(bank, noise, rng)
-        return {"statistic": bank_statistic(bank, noise, free_scale=free_scale, frame=frame)}
-    found = search_simulated(bank, noise, rng)
+    found = search_drawn(bank, noise, rng, frame)
     return {"statistic": twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)}
+
+
+def search_drawn(
+    bank: TemplateBank,
+    noise: FloatArray,
+    rng: np.random.Generator,
+    frame: Frame | None = None,
+    signal: FloatArray | None = None,
+) -> Searched:
+    """Search simulated data sets as the observed one is searched, robustly or not.
+
+    Parameters
+    ----------
+    bank : TemplateBank
+    noise : (n_data, n) float array
+        Independent unit normals.
+    rng : numpy.random.Generator
+        For what is estimated from every data set.
+    frame : Frame, optional
+        Of the robust statistic.
+    signal : (n_data, n) float array, optional
+        What is in the data beside noise, whitened.
+    """
+    if frame is None:
+        return search_simulated(bank, noise, rng, signal)
+    white = _spread(bank, noise, rng)
+    white = white if signal is None else white + signal
+    return search_many(bank, bounded(bank, white, frame))
 
 
 def _spread(bank: TemplateBank, noise: FloatArray, rng: np.random.Generator) -> FloatArray:
