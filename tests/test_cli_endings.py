@@ -191,15 +191,21 @@ LONG = ("--separation", "50:400", "--null-draws", "100000000", "--quiet")
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
 @pytest.mark.parametrize(
-    ("number", "workers"), [(signal.SIGINT, 1), (signal.SIGINT, 2), (signal.SIGTERM, 1)]
+    ("number", "workers", "pause"),
+    [
+        (signal.SIGINT, 1, 1.0),
+        (signal.SIGINT, 2, 1.0),  # while the workers start
+        (signal.SIGINT, 2, 4.0),
+        (signal.SIGTERM, 1, 1.0),
+    ],
 )
-def test_a_run_that_is_stopped(number, workers, target: Path, tmp_path: Path) -> None:
+def test_a_run_that_is_stopped(number, workers, pause, target: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = start(
         "search", target, *LONG, "--workers", workers, "--out", out, start_new_session=True
     )
     begun(out)
-    time.sleep(3.0 if workers > 1 else 1.0)
+    time.sleep(pause)
     os.killpg(process.pid, number)
     status, line = ended(process)
     assert status == 4

@@ -15,6 +15,7 @@ import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -28,13 +29,30 @@ ATTEMPTS = 3
 _SPAWN = multiprocessing.get_context("spawn")
 
 
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back: a process that starts meanwhile never hears it, this one afterwards.
+
+    A worker cannot ignore it by itself before it has started up, which takes a second.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Worker:
     """One process and this end of its pipe."""
 
     def __init__(self) -> None:
         self.connection, theirs = _SPAWN.Pipe()
         self.process = _SPAWN.Process(target=_work, args=(theirs,), daemon=True)
-        self.process.start()
+        with _without_interrupt():
+            self.process.start()
         theirs.close()  # or the end of the worker would not be the end of the pipe
         self.piece: int | None = None
         self._knows: Any = None
