@@ -73,7 +73,7 @@ def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Lo
 
     A statistic that scatters normally about the contrast, averaged over directions of unequal
     sensitivity, is no straight line in ln contrast: with the square and the cube the
-    fit follows it to 0.3 % of probability, without them to 4 %.
+    fit follows it to 0.5 % of probability, without them to 3 %.
 
     Parameters
     ----------
