@@ -18,9 +18,12 @@ if TYPE_CHECKING:
     from amibayes.extraction import extract
     from amibayes.inference.analytic_limits import AnalyticLimit, analytic_limit
     from amibayes.inference.bank import TemplateBank
+    from amibayes.inference.by_file import file_residuals
     from amibayes.inference.evidence import Evidence, weigh_models
     from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
     from amibayes.inference.injection import Criterion, MeasuredStar, make_criterion, measure_star
+    from amibayes.inference.joint import joint_likelihood
+    from amibayes.inference.joint_bank import bank_of
     from amibayes.inference.likelihood import Likelihood
     from amibayes.inference.limits import DetectionLimit, detection_limit
     from amibayes.inference.model import BinaryModel
@@ -93,14 +96,17 @@ _HOME = {
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
     "analytic_limit": "amibayes.inference.analytic_limits",
+    "bank_of": "amibayes.inference.joint_bank",
     "calibrate": "amibayes.calibration",
     "detection_limit": "amibayes.inference.limits",
     "expect": "amibayes.planning",
     "extract": "amibayes.extraction",
+    "file_residuals": "amibayes.inference.by_file",
     "fringe_basis": "amibayes.optics",
     "grid_posterior": "amibayes.inference.grid_posterior",
     "instrument_names": "amibayes.instrument",
     "join": "amibayes.observables",
+    "joint_likelihood": "amibayes.inference.joint",
     "load_instrument": "amibayes.instrument",
     "load_scene": "amibayes.scene_file",
     "make_criterion": "amibayes.inference.injection",
@@ -169,14 +175,17 @@ __all__ = [
     "Wavefront",
     "__version__",
     "analytic_limit",
+    "bank_of",
     "calibrate",
     "detection_limit",
     "expect",
     "extract",
+    "file_residuals",
     "fringe_basis",
     "grid_posterior",
     "instrument_names",
     "join",
+    "joint_likelihood",
     "load_instrument",
     "load_scene",
     "make_criterion",

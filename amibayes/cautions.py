@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from amibayes.inference.grid_posterior import integrable
 from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.posterior import Posterior, modes_to_sample
 from amibayes.inference.results import SearchResult
@@ -78,6 +79,42 @@ def _of_errors(result: SearchResult) -> list[str]:
     ]
 
 
+def _noise_caution(noise: ExtraNoise) -> str:
+    each = [f for f in noise.files if f.vis2 > 0.0 or f.closure_phase_rad > 0.0]
+    if each:
+        added = ", ".join(f"{_amount(f.vis2, f.closure_phase_rad)} to {f.source}" for f in each)
+    else:
+        added = _amount(noise.vis2, noise.closure_phase_rad)
+    return (
+        f"the stated errors do not explain the residuals: noise of {added} was added in "
+        "quadrature; chi2 and errors include it"
+    )
+
+
+def _amount(vis2: float, closure_phase_rad: float) -> str:
+    return f"{vis2:.2g} in V2 and {np.degrees(closure_phase_rad):.2g} deg in closure phase"
+
+
+def _joint_cautions(result: SearchResult) -> list[str]:
+    """Say what free contrasts and motion take away, and where the rate is no measurement."""
+    model = result.likelihood.model
+    if integrable(result.likelihood):
+        return []
+    free = [f"{model.n_contrasts} contrasts"] * (model.n_contrasts > 1) + ["motion"] * model.moves
+    found = [
+        f"with {' and '.join(free)} the posterior is not integrated directly: modes are weighed by "
+        "Laplace's approximation, one companion's evidence by importance sampling; limits are of "
+        "one contrast in every band, at rest"
+    ]
+    rates = result.theta[model.rate_columns]
+    if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
+        found.append(
+            f"the rate stands at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
+            "raise --fastest"
+        )
+    return found
+
+
 def search_cautions(
     observables: Observables,
     result: SearchResult,
@@ -86,13 +123,10 @@ def search_cautions(
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
     """Say what makes the numbers of a search less than they seem."""
-    found = [*result.warnings, *observables.notes, *_of_covariance(result), *_of_errors(result)]
+    found = [*result.warnings, *observables.notes, *_joint_cautions(result)]
+    found += [*_of_covariance(result), *_of_errors(result)]
     if noise.any:
-        found.append(
-            f"the stated errors do not explain the residuals: noise of {noise.vis2:.2g} in V2 and "
-            f"{np.degrees(noise.closure_phase_rad):.2g} deg in closure phase was added in "
-            "quadrature; chi2 and errors include it"
-        )
+        found.append(_noise_caution(noise))
     elif result.chi2_binary / result.ndof > 2.0:
         found.append(
             f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "

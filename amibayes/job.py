@@ -10,6 +10,7 @@ from amibayes.extraction.reading import ImageOptions
 from amibayes.inference.evidence import Evidence
 from amibayes.inference.evidence import Method as EvidenceMethod
 from amibayes.inference.grid_posterior import GridPosterior
+from amibayes.inference.joint import ContrastKind
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.noise_marginal import NoisePosterior
@@ -50,10 +51,18 @@ class SearchOptions:
         0 leaves the false-alarm probability out.
     alpha : float
         False-alarm probability of a detection.
+    contrast : {"tied", "per-filter"}, optional
+        One contrast for all bands, or one for each: the default with several bands.
+    motion : bool
+        The companion moves linearly between the dates of the data.
+    fastest_mas_yr : float, optional
+        Largest rate of a motion along east and along north; by default λ/B_max over the span.
     extra_noise : bool
         Add noise per kind of observable where the residuals ask for it.
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
+    file_noise : bool, optional
+        Judge that noise for every file by itself; by default where there are several.
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
@@ -82,8 +91,12 @@ class SearchOptions:
     target: str | None = None
     null_draws: int = 10_000
     alpha: float = ALPHA
+    contrast: ContrastKind | None = None
+    motion: bool = False
+    fastest_mas_yr: float | None = None
     extra_noise: bool = True
     robust: bool = False
+    file_noise: bool | None = None
     posterior: bool = True
     limits: bool = True
     companions: tuple[int, ...] | None = None

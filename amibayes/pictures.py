@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.inference.by_file import file_residuals
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.search import resolution_mas
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchOptions, SearchReport, calibrator_verdicts
 from amibayes.limits_job import NAMES, LimitsReport
+from amibayes.plots.by_file import file_residuals_plot
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
@@ -35,12 +37,13 @@ from amibayes.units import FloatArray, contrast_to_delta_mag
 MAPS = "maps.fits"
 
 
-def picture_names(options: SearchOptions, *, calibrated: bool) -> list[str]:
+def picture_names(options: SearchOptions, *, calibrated: bool, several: bool = False) -> list[str]:
     """List the files that `save_pictures` will write for a job."""
     names = ["map.png", "nsigma.png", "fit.png", "coverage.png", "correlation.png", MAPS]
     names += ["null.png", "false_alarm.png"] if options.null_draws else []
     names += ["corner.png", "chains.png"] if options.posterior else []
     names += ["limits.png", "completeness.png"] if options.limits and options.null_draws else []
+    names += ["files.png"] if several else []
     return names + (["calibrators.png"] if calibrated else [])
 
 
@@ -74,6 +77,8 @@ def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
         "coverage.png": lambda: coverage_plot(result.likelihood.observables),
         "correlation.png": lambda: correlation_plot(result.likelihood.observables),
     }
+    if len(report.targets) > 1:
+        out["files.png"] = lambda: file_residuals_plot(file_residuals(result))
     if report.calibration is not None:
         out["calibrators.png"] = lambda: _calibrators(report)
     weight = report.significance

@@ -11,8 +11,11 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.cautions import search_cautions
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.by_file import files_of
 from amibayes.inference.evidence import Evidence, weigh_models
 from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
+from amibayes.inference.joint import joint_likelihood
+from amibayes.inference.joint_bank import bank_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import detection_limit
 from amibayes.inference.model import BinaryModel
@@ -21,6 +24,7 @@ from amibayes.inference.noise import ExtraNoise, search_with_noise
 from amibayes.inference.noise_marginal import (
     MarginalLikelihood,
     NoisePosterior,
+    files_share_errors,
     marginal_likelihood,
 )
 from amibayes.inference.posterior import Posterior, sample
@@ -167,19 +171,24 @@ def noise_averaged(
     observables : Observables
         With the stated errors.
     options : SearchOptions
-        Without ``extra_noise`` the stated errors are believed, and nothing changes.
+        Without ``extra_noise`` the stated errors are believed, and nothing changes; nor where
+        files that are judged apart share errors: then the noise of the search is taken.
     """
     if not (options.extra_noise or options.robust):
         return result, two
     profile = result.likelihood
     fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
     fits += [(two.likelihood, two.theta)] if two else []
+    stated = observables.only(options.observables)
+    per_file = options.file_noise is not False and len(files_of(stated)) > 1
     if result.robustness is not None:
         averaged = student_likelihood(
             profile, result.robustness, fits, free_scale=options.extra_noise
         )
+    elif per_file and files_share_errors(stated):
+        return result, two
     else:
-        averaged = marginal_likelihood(profile, observables.only(options.observables), fits)
+        averaged = marginal_likelihood(profile, stated, fits, per_file=per_file)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two
@@ -227,13 +236,19 @@ def search_field(
 ) -> tuple[SearchResult, ExtraNoise, list[str]]:
     """Search the field; the default one is widened where something around it fits better."""
     likelihood = Likelihood(observables.only(options.observables))
-    likelihood = likelihood.with_model(_model(likelihood, options))
+    likelihood = joint_likelihood(
+        likelihood.with_model(_model(likelihood, options)),
+        contrast=options.contrast,
+        motion=options.motion,
+        fastest_mas_yr=options.fastest_mas_yr,
+    )
+    apart = options.file_noise is not False
     field, said = options.separation_mas, []
     for _ in range(MOST_FIELDS):
         if options.robust:
             result, noise = search_robust(likelihood, field, free_scale=options.extra_noise)
         elif options.extra_noise:
-            result, noise = search_with_noise(likelihood, field)
+            result, noise = search_with_noise(likelihood, field, per_file=apart)
         else:
             result, noise = search(likelihood, field), ExtraNoise()
         place = None if options.separation_mas else look_outside(result)
@@ -274,8 +289,9 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
 
 
 def _prior(result: SearchResult, options: SearchOptions) -> Prior:
-    prior = default_prior(result.likelihood, result.grid.inner_mas, result.grid.outer_mas)
-    return edit_prior(prior, options.prior, result.likelihood.parameters[3:])
+    likelihood = result.likelihood
+    prior = default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas)
+    return edit_prior(prior, options.prior, single_likelihood(likelihood).parameters)
 
 
 def _integrated(
@@ -335,7 +351,7 @@ def weigh(
     should have been: a statistic that does not know the scale needs no such decision.
     """
     likelihood, frame = judging(result)
-    bank = TemplateBank(likelihood, result.grid, result.single_theta)
+    bank = bank_of(likelihood, result.grid, result.single_theta)
     residuals = single_likelihood(likelihood).residuals(result.single_theta)
     run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, journal)
     weight = run.judge(bank, residuals, options, rng)
@@ -356,7 +372,7 @@ def weigh_second(
     data and of the null sets.
     """
     likelihood, frame = judging(result)
-    bank = TemplateBank(likelihood, result.grid, result.single_theta, beside=result.theta)
+    bank = bank_of(likelihood, result.grid, result.single_theta, beside=result.theta)
     residuals = likelihood.residuals(result.theta)
     run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, None)
     return run.judge(bank, residuals, options, rng)

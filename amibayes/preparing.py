@@ -15,6 +15,7 @@ from amibayes.cautions import vetting_cautions
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import read_observations
 from amibayes.job import SearchOptions
+from amibayes.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.observables import Observables, join
 from amibayes.vetting import Vetting, vet
 
@@ -51,7 +52,7 @@ class Prepared:
     observables : Observables
         All targets together.
     parts, references : tuple of Observables
-        Each target and each calibrator as read.
+        Each target (by date, whatever the order given) and each calibrator as read.
     calibration : Calibration, optional
     vetting : Vetting, optional
     cautions : tuple of str
@@ -79,15 +80,21 @@ def prepare(
     DataError
         Where a file cannot be read or vetting leaves no calibrator.
     UsageError
-        Where no target is given.
+        Where no target is given, or one of them twice under two names.
     """
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
     with clock.stage("read"):
         parts = [read(path, options) for path in targets]
         references = [read(path, options) for path in calibrators]
+    parts = in_order(parts)
+    joined = (
+        *refuse_twice(parts),
+        *unused(parts, options.observables),
+        *different_targets(parts),
+    )
     vetting, calibration, observables = _calibrated(parts, references, options, rng, clock)
-    cautions = (*vetting_cautions(vetting), *_different_targets(parts))
+    cautions = (*vetting_cautions(vetting), *joined)
     return Prepared(observables, tuple(parts), tuple(references), calibration, vetting, cautions)
 
 
@@ -147,10 +154,3 @@ def _believed(references: list[Observables], vetting: Vetting) -> list[Observabl
             remedy="give other calibrators, or --keep-all",
         )
     return kept
-
-
-def _different_targets(parts: list[Observables]) -> list[str]:
-    names = dict.fromkeys(s.target for p in parts for s in p.setups if s.target)
-    if len(names) < 2:
-        return []
-    return [f"targets of different names are fitted as one: {', '.join(names)}"]

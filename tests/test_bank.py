@@ -57,9 +57,9 @@ def test_scan_is_the_least_squares_contrast_of_every_position(rng) -> None:
         best = np.linalg.lstsq(design, residuals, rcond=None)[0]
         error = np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
         np.testing.assert_allclose([contrast[k], sigma[k]], [best[0], error], rtol=1e-5)
-        off_lattice = bank.matched_filter(residuals)(np.array(theta[:2]))
+        (found,), off_lattice = bank.matched_filter(residuals)(np.array(theta[:2]))
         gain = max(best[0], 0.0) ** 2 / error**2
-        np.testing.assert_allclose(off_lattice, [best[0], gain], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose([found, off_lattice], [best[0], gain], rtol=1e-5, atol=1e-9)
 
 
 def test_largest_gain_of_many_data_sets_is_the_scan_of_each(rng) -> None:

@@ -42,6 +42,7 @@ LAYERS = [
     "planning",
     "plots",
     "job",
+    "joining",
     "cautions",
     "preparing",
     "pipeline",

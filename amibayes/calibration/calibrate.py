@@ -11,7 +11,7 @@ from scipy.sparse import coo_array, csr_array, diags_array, triu
 
 from amibayes.calibration.freedom import calibrated_freedom, response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
-from amibayes.calibration.matching import Keys, keys_of
+from amibayes.calibration.matching import Keys, foreign, keys_of
 from amibayes.calibration.transfer import (
     Diameter,
     Transfer,
@@ -162,13 +162,14 @@ def calibrate(
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     kept = on_one_branch([seen[j] for j in serving], keys.n_vis2)
     kept = kept if clip is None else clipped(kept, keys, clip)
+    notes = tuple(n for j in serving if (n := foreign(calibrators[j], keys)))
     if chosen == "weighted":
         response = weighted_response(kept, keys)
     else:
         response = hierarchical_response(kept, keys, rng or np.random.default_rng(1), covariate)
     response = replace(response, freedom=response_freedom([calibrators[j] for j in serving], kept))
     return Calibration(
-        _calibrated(target, keys, response, calibrators),
+        _calibrated(target, keys, response, calibrators, notes),
         chosen,
         _uses(calibrators, seen, dict(zip(serving, kept, strict=True))),
         *_tau(response),
@@ -277,7 +278,11 @@ def _covariate(
 
 
 def _calibrated(
-    target: Observables, keys: Keys, response: Response, calibrators: list[Observables]
+    target: Observables,
+    keys: Keys,
+    response: Response,
+    calibrators: list[Observables],
+    notes: tuple[str, ...],
 ) -> Observables:
     """Apply the response to the target."""
     error = np.sqrt(response.covariance.diagonal())
@@ -298,7 +303,7 @@ def _calibrated(
     by_target = csr_array(own @ sparse_covariance(used.covariance) @ own)
     by_response = csr_array(spread @ response.covariance @ spread.T)
     kind = _kind(target, calibrators, keys)
-    made = _rebuilt(target, keep, value, csr_array(by_target + by_response), kind, keys)
+    made = _rebuilt(target, keep, value, csr_array(by_target + by_response), kind, keys, notes)
     freedom = calibrated_freedom(
         made.covariance, by_target, used.freedom, by_response, response.freedom
     )
@@ -332,6 +337,7 @@ def _rebuilt(
     covariance: csr_array,
     kind: CovarianceKind,
     keys: Keys,
+    notes: tuple[str, ...],
 ) -> Observables:
     """The target with calibrated values; what could not be calibrated is flagged."""
     vis2_kept, closure_kept = _on_entries(target, keep)
@@ -347,7 +353,7 @@ def _rebuilt(
     )
     everywhere = np.ones(len(value), dtype=bool)
     lost = int((~keep).sum())
-    notes = (f"{lost} value(s) without calibrator flagged",) if lost else ()
+    notes = (*notes, *((f"{lost} value(s) without calibrator flagged",) if lost else ()))
     return replace(
         target,
         vis2=new_vis2,

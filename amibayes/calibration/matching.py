@@ -176,6 +176,18 @@ def _serving_setups(calibrator: Observables, setup: Setup) -> list[int]:
     ]
 
 
+def foreign(calibrator: Observables, keys: Keys) -> str:
+    """Say so where a calibrator of another INSNAME serves a target, else an empty text."""
+    names = {s.insname for s in calibrator.setups}
+    wanted = {c.setup.insname for c in keys.configurations}
+    if names & wanted:
+        return ""
+    return (
+        f"calibrator {calibrator.source} is of INSNAME {', '.join(sorted(names))} and not of "
+        f"{', '.join(sorted(wanted))}: it was matched by stations and wavelength"
+    )
+
+
 def _match_setup(
     calibrator: Observables, keys: Keys, number: int, setup: int
 ) -> tuple[list[IntArray], list[IntArray], list[IntArray]]:

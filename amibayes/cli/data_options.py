@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from amibayes.cli import common
+from amibayes.errors import UsageError
 
 
 def add_calibration(group: argparse._ActionsContainer) -> None:
@@ -84,6 +85,45 @@ def add_model(group: argparse._ActionsContainer) -> None:
         default=True,
         help="average the model over the width of each channel (default: yes)",
     )
+
+
+def add_joint(group: argparse._ActionsContainer) -> None:
+    """Add what several files share and what they do not."""
+    group.add_argument(
+        "--contrast",
+        choices=["tied", "per-filter"],
+        help="one contrast for all bands, or one for each (default: per-filter where the files "
+        "are of several bands)",
+    )
+    group.add_argument(
+        "--motion",
+        action="store_true",
+        help="the companion moves linearly between the dates of the files",
+    )
+    group.add_argument(
+        "--fastest",
+        type=common.positive_float,
+        metavar="MAS/YR",
+        help="largest rate of a motion along east and along north (default: lambda/B_max over "
+        "the time between the first and the last date)",
+    )
+    group.add_argument(
+        "--file-noise",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="judge noise beyond the stated errors for every file by itself (default: yes)",
+    )
+
+
+def refuse_idle_rate(arguments: argparse.Namespace) -> None:
+    """Refuse a largest rate without a motion.
+
+    Raises
+    ------
+    UsageError
+    """
+    if arguments.fastest and not arguments.motion:
+        raise UsageError("needs a motion", source="--fastest", remedy="give --motion")
 
 
 def add_observables(

@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_limit(parser.add_argument_group("limit"))
     data_options.add_model(parser.add_argument_group("model"))
+    data_options.add_joint(parser.add_argument_group("several files"))
     data = parser.add_argument_group("data")
     data_options.add_observables(
         data, None, "limits from these alone (default: from both, and from each by itself)"
@@ -226,6 +227,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
     from amibayes.job import SearchOptions
     from amibayes.limits_job import LimitsOptions
 
+    data_options.refuse_idle_rate(arguments)
     if arguments.calibration and not arguments.cal:
         raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
     search = SearchOptions(
@@ -239,8 +241,12 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
         keep_all=arguments.keep_all,
         insname=arguments.insname,
         target=arguments.target,
+        contrast=arguments.contrast,
+        motion=arguments.motion,
+        fastest_mas_yr=arguments.fastest,
         extra_noise=arguments.extra_noise,
         robust=arguments.robust,
+        file_noise=arguments.file_noise,
         null_draws=_null_draws(arguments),
         seed=arguments.seed,
         images=common.image_options_of(arguments),

@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
     data_options.add_model(parser.add_argument_group("model"))
+    data_options.add_joint(parser.add_argument_group("several files"))
     _add_weighing(parser.add_argument_group("prior and evidence"))
     data = parser.add_argument_group("data")
     data_options.add_observables(data, ("vis2", "cp"), "which observables to fit (default: both)")
@@ -99,21 +100,22 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
 
     options = _options(arguments)
     overwrite = arguments.overwrite or arguments.resume
-    names = _names(options, calibrated=bool(arguments.cal))
+    several = len(arguments.targets) > 1
+    names = _names(options, calibrated=bool(arguments.cal), several=several)
     folder = output_folder(arguments.out, names, overwrite=overwrite)
     if arguments.resume and not arguments.overwrite:
         _refuse_other_data(folder / RESULT, [*arguments.targets, *arguments.cal])
     report = _search(arguments, options, folder)
-    for stale in set(_names(type(options)(), calibrated=True)) - set(names):
+    for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
     return report, folder, _write(arguments, report, folder)
 
 
-def _names(options: SearchOptions, *, calibrated: bool) -> list[str]:
+def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[str]:
     """List the files of a run."""
     from amibayes.pictures import picture_names
 
-    names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated)]
+    names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated, several=several)]
     names += [CHAIN] if options.posterior else []
     return [*names, CALIBRATED] if calibrated else names
 
@@ -158,6 +160,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
 def _options(arguments: argparse.Namespace) -> SearchOptions:
     from amibayes.job import SearchOptions
 
+    data_options.refuse_idle_rate(arguments)
     if arguments.calibration and not arguments.cal:
         raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
     return SearchOptions(
@@ -172,8 +175,12 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         keep_all=arguments.keep_all,
         insname=arguments.insname,
         target=arguments.target,
+        contrast=arguments.contrast,
+        motion=arguments.motion,
+        fastest_mas_yr=arguments.fastest,
         extra_noise=arguments.extra_noise,
         robust=arguments.robust,
+        file_noise=arguments.file_noise,
         null_draws=arguments.null_draws,
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,

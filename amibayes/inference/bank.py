@@ -23,6 +23,8 @@ from amibayes.units import MAS, FloatArray
 
 IntArray = NDArray[np.intp]
 
+MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
+
 DENSE_ENOUGH = 0.15
 """Share of non-zeros above which a dense product is the faster one."""
 
@@ -92,6 +94,39 @@ def make_grid(inner_mas: float, outer_mas: float, step_mas: float) -> Grid:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What a scan of one data set found at every position.
+
+    Parameters
+    ----------
+    contrast, sigma : (n_positions,) float array
+        Best contrast, the same in every band and at rest, and its error.
+    gain : (n_positions,) float array
+        Largest gain in χ², for positive contrasts.
+    tail : (n_positions, width − 2) float array
+        Contrasts and rates that gain so much.
+    n_contrasts : int
+    """
+
+    contrast: FloatArray
+    sigma: FloatArray
+    gain: FloatArray
+    tail: FloatArray
+    n_contrasts: int = 1
+
+    @property
+    def contrasts(self) -> FloatArray:
+        """Contrasts of the largest gain, (n_positions, n_contrasts)."""
+        return self.tail[:, : self.n_contrasts]
+
+    def bounded(self, at: IntArray) -> FloatArray:
+        """Contrasts, cut off at 0 and 1, and rates at some positions."""
+        tail = self.tail[at]
+        tail[:, : self.n_contrasts] = np.clip(tail[:, : self.n_contrasts], 0.0, 1.0)
+        return tail
+
+
 class TemplateBank:
     """Whitened templates of a faint companion, nuisance directions projected out.
 
@@ -118,6 +153,7 @@ class TemplateBank:
         self.grid = grid
         self.n_data = likelihood.n_independent
         self.freedom = likelihood.observables.freedom
+        self.n_contrasts = likelihood.model.n_contrasts
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
         self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
@@ -160,6 +196,12 @@ class TemplateBank:
             norm[index] = self._norm(even, odd)
         return match / norm, 1.0 / np.sqrt(norm)
 
+    def survey(self, residuals: FloatArray) -> Survey:
+        """Scan whitened residuals (n_data,): contrasts and the largest gain everywhere."""
+        contrast, sigma = self.scan(residuals)
+        gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+        return Survey(contrast, sigma, gain, contrast[:, None])
+
     def largest_gain(self, data: NDArray[np.float32]) -> tuple[FloatArray, IntArray]:
         """Search many data sets: largest gain in χ² over the bank, for positive contrast.
 
@@ -190,7 +232,7 @@ class TemplateBank:
                 best[better], where[better] = value[better], index[half][top[better]]
         return np.asarray(best, dtype=float) ** 2, where
 
-    def matched_filter(self, residuals: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
+    def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
 
         Contrasts below zero gain nothing.
@@ -198,11 +240,11 @@ class TemplateBank:
         data = self.project(residuals)
         data_even, data_odd = data[self._even.rows], data[self._odd.rows]
 
-        def best(position: FloatArray) -> tuple[float, float]:
+        def best(position: FloatArray) -> tuple[FloatArray, float]:
             even, odd = self._parts_at(position[:1], position[1:])
             match = float(data_even @ even[:, 0] + data_odd @ odd[:, 0])
             norm = float(self._norm(even, odd)[0])
-            return match / norm, max(match, 0.0) ** 2 / norm
+            return np.array([match / norm]), max(match, 0.0) ** 2 / norm
 
         return best
 
@@ -260,6 +302,11 @@ class TemplateBank:
             templates[self._odd.rows] += np.hstack([odd, -odd])
             yield index, self.project(templates) / np.sqrt(self._norm(even, odd))
 
+    def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""
+        for index, templates in self.chunks():
+            yield index, templates[None]
+
     def _halves(self) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Yield positions and their mirror images (2m,) with the parts that they share.
 
@@ -267,17 +314,32 @@ class TemplateBank:
         data that a part touches are kept, (n_rows, m).
         """
         half = len(self.grid) // 2
-        n = self.grid.half_width
+        for index, cosine, sine in self._half_plane():
+            even = self._even.matrix @ cosine - self._offset[:, None]
+            yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
+
+    def _half_plane(
+        self, drift: tuple[FloatArray, FloatArray] | None = None
+    ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Yield positions (m,) of one half plane with cosine and sine, (n_samples, m) each.
+
+        ``drift`` is how far east and north, mas, the companion has moved at each sample.
+        """
+        half, n = len(self.grid) // 2, self.grid.half_width
         axis = np.linspace(-n, n, 2 * n + 1) * self.grid.step_mas
-        waves = Waves(self._samples, axis, self._smearing)
+        u, v = self._samples.u, self._samples.v
+        turn = None if drift is None else 2.0 * np.pi * MAS * (u * drift[0] + v * drift[1])
+        waves = Waves(self._samples, axis, self._smearing, turn)
         columns, rows = self.grid.columns[:half] + n, self.grid.rows[:half] + n
         breaks = (np.diff(rows) != 0) | (np.diff(columns) != 1) | (columns[1:] % WIDTH == 0)
         for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
             span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
             cosine, sine = waves(span, int(rows[index[0]]))
-            self._let_through(cosine, sine, self.grid.east_mas[index], self.grid.north_mas[index])
-            even = self._even.matrix @ cosine - self._offset[:, None]
-            yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
+            east, north = self.grid.east_mas[index], self.grid.north_mas[index]
+            if drift is not None:
+                east, north = east + drift[0][:, None], north + drift[1][:, None]
+            self._let_through(cosine, sine, east, north)
+            yield index, cosine, sine
 
     def _norm(self, even: FloatArray, odd: FloatArray) -> FloatArray:
         """t·t at positions and their mirror images, (2m,), without the nuisance part."""

@@ -29,6 +29,7 @@ from amibayes.inference.laplace import (
     sampled,
 )
 from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.model import IntArray
 from amibayes.inference.multiplicity import TwoCompanions
 from amibayes.inference.priors import Prior
 from amibayes.inference.refine import single_likelihood
@@ -151,7 +152,7 @@ def weigh_models(
     log_z, error, how = zip(*found, strict=True)
     halo = log_evidence_halo(result.likelihood, prior)
     shares = tuple(float(w) for w in weights / weights.sum())
-    names = result.likelihood.parameters[3:]
+    names = result.likelihood.parameters[result.likelihood.model.width :]
     return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two, names)
 
 
@@ -190,11 +191,10 @@ def log_evidence_halo(likelihood: Likelihood, prior: Prior) -> float:
     if likelihood.model.background == "free":
         return float("nan")
     halo = likelihood.with_model(replace(likelihood.model, background="free"))
-    ranges = dict(zip(likelihood.parameters[3:], prior.nuisance, strict=True))
+    names = [single_likelihood(one).parameters for one in (likelihood, halo)]
+    ranges = dict(zip(names[0], prior.nuisance, strict=True))
     ranges["background"] = (0.0, HALO_BACKGROUND)
-    return log_evidence_none(
-        halo, replace(prior, nuisance=tuple(ranges[name] for name in halo.parameters[3:]))
-    )
+    return log_evidence_none(halo, replace(prior, nuisance=tuple(ranges[n] for n in names[1])))
 
 
 def log_evidence_importance(
@@ -227,11 +227,11 @@ def log_evidence_importance(
     n = int(np.clip(wanted, FEWEST_DRAWS, MOST_DRAWS))
     counts = [int(share * n)] * len(sources)
     drawn = [s.draw(rng, m) for s, m in zip(sources, counts, strict=True)]
-    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), k))
+    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), likelihood.model))
     x = np.concatenate(drawn)
     log_prior = prior.log_density(x)
     x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
-    log_f = log_prior + _in_batches(likelihood, physical(x, k))
+    log_f = log_prior + _in_batches(likelihood, physical(x, likelihood.model))
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)
@@ -245,6 +245,11 @@ def log_evidence_importance(
 def _in_batches(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     pieces = np.array_split(theta, 1 + len(theta) * len(likelihood.samples) // 1_500_000)
     return np.concatenate([likelihood.log_prob(piece) for piece in pieces])
+
+
+def _swapped(width: int, n_dim: int) -> IntArray:
+    """Columns of two companions in the other order."""
+    return np.asarray(np.r_[width : 2 * width, 0:width, 2 * width : n_dim])
 
 
 class _Heavy:
@@ -282,10 +287,11 @@ class _Gaussians:
         self, likelihood: Likelihood, modes: Sequence[Mode], prior: Prior, n_free: int
     ) -> None:
         self.companions = likelihood.model.companions + n_free
+        self.model, self.width = likelihood.model, likelihood.model.width
         self.prior, self.n_free = prior, n_free
         fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
         at_peak = [
-            likelihood.log_prob(physical(c[None], likelihood.model.companions))[0]
+            likelihood.log_prob(physical(c[None], likelihood.model))[0]
             + np.log(np.abs(np.linalg.det(s)))
             for c, s in fits
         ]
@@ -299,20 +305,22 @@ class _Gaussians:
         x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
         if not self.n_free:
             return x
-        free = sampled(self.prior.draw(rng, n, 1), 1)[:, :3]
-        return np.hstack([x[:, :3], free, x[:, 3:]])
+        w = self.width
+        free = sampled(self.prior.draw(rng, n, 1), self.model)[:, :w]
+        return np.hstack([x[:, :w], free, x[:, w:]])
 
     def log_density(self, x: FloatArray) -> FloatArray:
         if self.companions == 1:
             return self._ordered(x)
-        swapped = x[:, np.r_[3:6, 0:3, 6 : x.shape[1]]]
+        swapped = x[:, _swapped(self.width, x.shape[1])]
         return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
 
     def _ordered(self, x: FloatArray) -> FloatArray:
         log = np.zeros(len(x))
         if self.n_free:
             bare = replace(self.prior, nuisance=())
-            log, x = bare.log_density(x[:, 3:6]), np.delete(x, np.s_[3:6], axis=1)
+            free = np.s_[self.width : 2 * self.width]
+            log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
         parts = [t.log_density(x) for t in self.mixture]
         return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
 
@@ -337,13 +345,13 @@ def log_evidence_nested(
         raise UsageError(
             "nested sampling needs dynesty", remedy="pip install 'amibayes[evidence]'"
         ) from error
-    k = likelihood.model.companions
+    k, w = likelihood.model.companions, likelihood.model.width
 
     def theta_of(cube: FloatArray) -> FloatArray:
         theta = prior.from_cube(cube[None])[0]
         # Both orders are one solution: the brighter one first, at the same evidence.
-        swap = k == 2 and theta[5] > theta[2]
-        return np.asarray(theta[np.r_[3:6, 0:3, 6 : len(theta)]] if swap else theta)
+        swap = k == 2 and theta[w + 2] > theta[2]
+        return np.asarray(theta[_swapped(w, len(theta))] if swap else theta)
 
     sampler = dynesty.NestedSampler(
         lambda theta: float(likelihood.log_prob(theta[None])[0]),

@@ -190,8 +190,18 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
     return _finished(work, cells, log_mass)
 
 
+def integrable(likelihood: Likelihood) -> bool:
+    """Whether the model has one contrast and stands still, as the grid posterior needs it."""
+    return likelihood.model.width == 3
+
+
 def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:
-    """Whether the grid posterior takes fewer model values than ``most`` (a few seconds)."""
+    """Whether the grid posterior takes fewer model values than ``most`` (a few seconds).
+
+    Several contrasts and motion are dimensions that it does not have.
+    """
+    if not integrable(likelihood):
+        return False
     work = Integrand(likelihood, prior)
     n_sets = len(work.start()) * len(work.nuisance.value) * (work.n_boxes + 16)
     return n_sets * len(likelihood.samples) < most

@@ -10,6 +10,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from amibayes.inference.likelihood import LOG_TWO_PI, Likelihood
+from amibayes.inference.model import BinaryModel, IntArray
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Mode
 from amibayes.units import FloatArray
@@ -31,15 +32,25 @@ def log_masses(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> F
 
 
 def _log_mass(likelihood: Likelihood, theta: FloatArray, prior: Prior) -> float:
-    """Mass of one mode's Gaussian, cut off at the ranges of the nuisance parameters."""
-    k = likelihood.model.companions
+    """Mass of one mode's Gaussian, cut off at the ranges of rates and nuisance parameters."""
+    model = likelihood.model
     centre, scatter = gaussian_of(likelihood, theta, prior)
-    sigma = np.sqrt(np.diag(scatter @ scatter.T))[3 * k :]
-    pull = (np.array(prior.nuisance).reshape(-1, 2) - centre[3 * k :, None]) / sigma[:, None]
+    bounded, ranges = _bounded(likelihood, prior)
+    sigma = np.sqrt(np.diag(scatter @ scatter.T))[bounded]
+    pull = (ranges - centre[bounded, None]) / sigma[:, None]
     inside = np.prod(stats.norm.cdf(pull[:, 1]) - stats.norm.cdf(pull[:, 0]))
     volume = np.linalg.slogdet(scatter)[1] + 0.5 * len(centre) * LOG_TWO_PI
-    at_peak = likelihood.log_prob(physical(centre[None], k))[0]
+    at_peak = likelihood.log_prob(physical(centre[None], model))[0]
     return float(at_peak + _log_prior(centre, prior) + volume + np.log(inside))
+
+
+def _bounded(likelihood: Likelihood, prior: Prior) -> tuple[IntArray, FloatArray]:
+    """Columns of rates and nuisance parameters, and their ranges (n, 2)."""
+    model = likelihood.model
+    columns = [*model.rate_columns, *range(model.width * model.companions, len(model.parameters))]
+    rate = prior.fastest_mas_yr
+    ranges = [(-rate, rate)] * len(model.rate_columns) + list(prior.nuisance)
+    return np.array(columns, dtype=np.intp), np.array(ranges).reshape(-1, 2)
 
 
 def _log_prior(centre: FloatArray, prior: Prior) -> float:
@@ -48,7 +59,7 @@ def _log_prior(centre: FloatArray, prior: Prior) -> float:
     if np.isfinite(density):
         return density
     moved = centre.copy()
-    for k in range(0, len(centre) - len(prior.nuisance), 3):
+    for k in range(0, len(centre) - len(prior.nuisance), prior.width):
         rho = max(float(np.hypot(*centre[k : k + 2])), 1e-300)
         slack = 1e-6 * (prior.outer_mas - prior.inner_mas)
         moved[k : k + 2] *= np.clip(rho, prior.inner_mas + slack, prior.outer_mas - slack) / rho
@@ -63,14 +74,13 @@ def gaussian_of(
     Contrasts below their error are moved up to it: there the posterior in ln contrast ends.
     No axis is longer than ``widest`` times the field.
     """
-    k = likelihood.model.companions
-    bright = np.arange(2, 3 * k, 3)
+    bright = likelihood.model.contrast_columns
     sigma = np.sqrt(np.diag(likelihood.errors(theta)))
     theta = np.array(theta)
     least = np.maximum(np.minimum(sigma[bright], 0.1), 1.01 * prior.contrast_min)
     theta[bright] = np.clip(theta[bright], least, prior.contrast_max)
-    nuisance = np.array(prior.nuisance).reshape(-1, 2)
-    theta[3 * k :] = np.clip(theta[3 * k :], nuisance[:, 0], nuisance[:, 1])
+    bounded, ranges = _bounded(likelihood, prior)
+    theta[bounded] = np.clip(theta[bounded], ranges[:, 0], ranges[:, 1])
     stretch = np.ones(len(theta))
     stretch[bright] = 1.0 / theta[bright]
     values, vectors = np.linalg.eigh(likelihood.errors(theta) * np.outer(stretch, stretch))
@@ -79,15 +89,15 @@ def gaussian_of(
     return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
 
 
-def physical(x: FloatArray, companions: int) -> FloatArray:
+def physical(x: FloatArray, model: BinaryModel) -> FloatArray:
     """From the sampled coordinates to the model's."""
     theta = x.copy()
-    theta[..., 2 : 3 * companions : 3] = np.exp(theta[..., 2 : 3 * companions : 3])
+    theta[..., model.contrast_columns] = np.exp(theta[..., model.contrast_columns])
     return theta
 
 
-def sampled(theta: FloatArray, companions: int) -> FloatArray:
+def sampled(theta: FloatArray, model: BinaryModel) -> FloatArray:
     """From the model's coordinates to the sampled ones."""
     x = theta.copy()
-    x[..., 2 : 3 * companions : 3] = np.log(x[..., 2 : 3 * companions : 3])
+    x[..., model.contrast_columns] = np.log(x[..., model.contrast_columns])
     return x

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import gammaln
 
+from amibayes.inference.bands import band_numbers
 from amibayes.inference.model import BinaryModel, ComplexArray
 from amibayes.inference.samples import Samples, samples_of
 from amibayes.observables import Observables
@@ -40,6 +41,12 @@ def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
     return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))
 
 
+def _samples(observables: Observables, model: BinaryModel) -> Samples:
+    """Points of the data, kept apart by what the model tells apart."""
+    bands = band_numbers(observables, model.bands) if model.bands else None
+    return samples_of(observables, bands, dated=model.moves)
+
+
 class Likelihood:
     """Likelihood of a binary model, vectorised over parameter sets.
 
@@ -60,7 +67,7 @@ class Likelihood:
     def __init__(self, observables: Observables, model: BinaryModel | None = None) -> None:
         self.observables = observables.unflagged()
         self.model = model or BinaryModel()
-        self.samples: Samples = samples_of(self.observables)
+        self.samples: Samples = _samples(self.observables, self.model)
         self._n2 = len(self.observables.vis2)
 
     @property
@@ -77,6 +84,8 @@ class Likelihood:
         """Make the likelihood of another model on the same data."""
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, model=model)
+        if (model.bands, model.moves) != (self.model.bands, self.model.moves):
+            other.samples = _samples(self.observables, model)
         return other
 
     @property

@@ -16,6 +16,7 @@ from astropy.table import QTable
 from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.joint_bank import bank_of
 from amibayes.inference.logistic import fit_logistic
 from amibayes.inference.recovery import (
     Recovery,
@@ -227,7 +228,7 @@ def _prepared(
 ) -> tuple[Setting, FloatArray, FloatArray]:
     """What all rounds need, the ambiguous share of every ring, and errors of the contrast."""
     likelihood, frame = judging(result)
-    bank = TemplateBank(likelihood, result.grid, result.single_theta)
+    bank = bank_of(likelihood, result.grid, result.single_theta)
     gain = _gain_at(significance, bank)
     sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
     nearer = _nearer(bank, rings, result, executor, journals)

@@ -9,6 +9,7 @@ import numpy as np
 
 from amibayes.errors import DataError
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.joint_bank import bank_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import Box, refine
 from amibayes.inference.results import Companion, Mode, SearchResult, companion_of
@@ -49,7 +50,7 @@ class TwoCompanions:
     @property
     def companions(self) -> tuple[Companion, Companion]:
         """Both, with errors from the inverse Hessian of the joint fit."""
-        second = np.r_[3:6]
+        second = self.likelihood.model.width + np.arange(3)
         covariance = self.theta_covariance[np.ix_(second, second)]
         return (
             companion_of(self.theta, self.theta_covariance),
@@ -79,12 +80,12 @@ def search_second(result: SearchResult) -> TwoCompanions:
             source=two.observables.source,
             remedy="ask for fewer companions",
         )
-    bank = TemplateBank(one, result.grid, result.single_theta)
+    bank = bank_of(one, result.grid, result.single_theta)
     found: list[Mode] = []
     for first in result.modes[:FIRST_MODES]:
         found += _beside(result, bank, two, np.array(first.theta))
     found = _settled(result, bank, two, found)
-    modes = _distinct(found, 0.25 * resolution_mas(one))
+    modes = _distinct(found, 0.25 * resolution_mas(one), one.model.width)
     theta = np.array(modes[0].theta)
     return TwoCompanions(two, theta, two.errors(theta), float(two.chi2(theta)[0]), modes)
 
@@ -94,30 +95,30 @@ def _beside(
 ) -> list[Mode]:
     """Joint fits from the first companion (n_dim of one) and peaks of what it leaves."""
     fringe = resolution_mas(two)
-    contrast, sigma = bank.scan(result.likelihood.residuals(first)[:, 0])
-    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
-    grid = result.grid
+    survey = bank.survey(result.likelihood.residuals(first)[:, 0])
+    gain, grid, w = survey.gain.copy(), result.grid, two.model.width
     # What stands at the first companion's own place is its error, not another one.
     gain[np.hypot(grid.east_mas - first[0], grid.north_mas - first[1]) < 0.25 * fringe] = 0.0
     at = peaks(grid, gain, fringe)[:SEEDS]
-    second = np.column_stack([grid.east_mas[at], grid.north_mas[at], np.clip(contrast[at], 0, 1)])
+    second = np.column_stack([grid.east_mas[at], grid.north_mas[at], survey.bounded(at)])
     box = Box(grid.inner_mas, grid.outer_mas, fringe)
     single = float(two.deviance(result.chi2_single))
-    seeds = [np.concatenate([first[:3], place, first[3:]]) for place in second]
-    return [_bright_first(refine(two, s, box, single)) for s in seeds]
+    seeds = [np.concatenate([first[:w], place, first[w:]]) for place in second]
+    return [_bright_first(refine(two, s, box, single), w) for s in seeds]
 
 
 def _settled(
     result: SearchResult, bank: TemplateBank, two: Likelihood, found: list[Mode]
 ) -> list[Mode]:
     """Look for each companion again on what the other one leaves, until nothing is gained."""
+    w = two.model.width
     for _ in range(MOST_ROUNDS):
         best = max(found, key=lambda m: m.delta_chi2)
         theta = np.array(best.theta)
         again = [
             mode
-            for kept in (theta[:3], theta[3:6])
-            for mode in _beside(result, bank, two, np.concatenate([kept, theta[6:]]))
+            for kept in (theta[:w], theta[w : 2 * w])
+            for mode in _beside(result, bank, two, np.concatenate([kept, theta[2 * w :]]))
         ]
         found = found + again
         if max(m.delta_chi2 for m in again) < best.delta_chi2 + 1e-2:
@@ -125,26 +126,27 @@ def _settled(
     return found
 
 
-def _bright_first(mode: Mode) -> Mode:
+def _bright_first(mode: Mode, width: int) -> Mode:
     theta = mode.theta
-    if theta[5] > theta[2]:
-        theta = (*theta[3:6], *theta[:3], *theta[6:])
+    if theta[width + 2] > theta[2]:
+        theta = (*theta[width : 2 * width], *theta[:width], *theta[2 * width :])
     return Mode(theta, mode.delta_chi2)
 
 
-def _distinct(found: Sequence[Mode], apart_mas: float) -> tuple[Mode, ...]:
+def _distinct(found: Sequence[Mode], apart_mas: float, width: int) -> tuple[Mode, ...]:
     """Solutions of which at least one companion stands elsewhere than in any better one."""
     kept: list[Mode] = []
     for mode in sorted(found, key=lambda m: -m.delta_chi2):
         if kept and mode.delta_chi2 < kept[0].delta_chi2 - MODE_LIMIT:
             break
-        if not any(_alike(mode, other, apart_mas) for other in kept):
+        if not any(_alike(mode, other, apart_mas, width) for other in kept):
             kept.append(mode)
     return tuple(kept)
 
 
-def _alike(mode: Mode, other: Mode, apart_mas: float) -> bool:
+def _alike(mode: Mode, other: Mode, apart_mas: float, width: int) -> bool:
     a, b = np.array(mode.theta), np.array(other.theta)
-    orders = (b[[0, 1, 3, 4]], b[[3, 4, 0, 1]])
-    moved = [np.abs(a[[0, 1, 3, 4]] - place).max() for place in orders]
+    places = [0, 1, width, width + 1]
+    orders = (b[places], b[[*places[2:], *places[:2]]])
+    moved = [np.abs(a[places] - place).max() for place in orders]
     return bool(min(moved) < apart_mas)

@@ -3,7 +3,8 @@
 Where the best model leaves residuals that the stated errors cannot explain, a variance is
 added to every V² and one to every closure phase (through the baselines that its triangles
 share) that makes the residuals as likely as can be. A reduced χ² of ten then means errors
-three times larger, and not a companion.
+three times larger, and not a companion. Of a joint fit each file may be judged by itself:
+one with calibration errors of its own then does not spoil the others.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from amibayes.covariance import (
     sparse_covariance,
 )
 from amibayes.freedom import squared_share, welch_satterthwaite
+from amibayes.inference.by_file import files_of, residual
 from amibayes.inference.detection import chi2_survival
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.results import SearchResult
@@ -44,6 +46,15 @@ SETTLED = 0.01
 
 
 @dataclass(frozen=True)
+class FileNoise:
+    """Standard deviations added to the V² and to the closure phases of one file."""
+
+    source: str
+    vis2: float = 0.0
+    closure_phase_rad: float = 0.0
+
+
+@dataclass(frozen=True)
 class ExtraNoise:
     """Standard deviations added in quadrature.
 
@@ -53,15 +64,30 @@ class ExtraNoise:
         To every V².
     closure_phase_rad : float
         To every closure phase.
+    files : tuple of FileNoise
+        What each file gets, where files are told apart; the two above are then the root mean
+        squares over all data.
     """
 
     vis2: float = 0.0
     closure_phase_rad: float = 0.0
+    files: tuple[FileNoise, ...] = ()
 
     @property
     def any(self) -> bool:
         """Whether there is any."""
         return self.vis2 > 0.0 or self.closure_phase_rad > 0.0
+
+    def of(self, data: Observables) -> tuple[FloatArray, FloatArray]:
+        """Variance added to each unflagged V² (n_vis2,) and closure phase (n_closure,)."""
+        vis2 = np.full(data.n_vis2, self.vis2**2)
+        closure = np.full(data.n_closure_phases, self.closure_phase_rad**2)
+        if self.files:
+            own = {f.source: f for f in self.files}
+            for part in files_of(data):
+                vis2[part.vis2] = own[part.source].vis2 ** 2
+                closure[part.closure_phase] = own[part.source].closure_phase_rad ** 2
+        return vis2, closure
 
 
 def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
@@ -80,18 +106,21 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
-    n_vis2 = data.n_vis2
-    diagonal = np.zeros(data.covariance.size)
-    diagonal[:n_vis2] = extra.vis2**2
+    n_vis2, (vis2, closure) = data.n_vis2, extra.of(data)
+    diagonal = np.concatenate([vis2, np.zeros(len(closure))])
     if isinstance(data.covariance, DiagonalCovariance):
-        diagonal[n_vis2:] = extra.closure_phase_rad**2
+        diagonal[n_vis2:] = closure
         return replace(data, covariance=DiagonalCovariance(data.covariance.variance + diagonal))
     blocks = as_blocks(data.covariance)
     matrices = [b.matrix + np.diag(diagonal[b.index]) for b in blocks]
     home, place = _places(blocks, data.covariance.size)
     for entries, shared in _shared_noise(data):
-        at = place[entries + n_vis2]
-        matrices[home[entries[0] + n_vis2]][np.ix_(at, at)] += extra.closure_phase_rad**2 * shared
+        at, block = place[entries + n_vis2], home[entries + n_vis2]
+        # A covariance may hold triangles of one exposure apart (independent errors).
+        for number in np.unique(block):
+            own = np.flatnonzero(block == number)
+            noise = closure[entries[0]] * shared[np.ix_(own, own)]
+            matrices[number][np.ix_(at[own], at[own])] += noise
     noisy: Covariance = BlockCovariance(
         data.covariance.size,
         [Block(b.index, m, b.basis) for b, m in zip(blocks, matrices, strict=True)],
@@ -114,7 +143,7 @@ def _shared_noise(data: Observables) -> Iterator[tuple[IntArray, FloatArray]]:
         yield entries, matrix @ matrix.T / 3.0
 
 
-def fit_noise(likelihood: Likelihood, theta: FloatArray) -> ExtraNoise:
+def fit_noise(likelihood: Likelihood, theta: FloatArray, *, per_file: bool = False) -> ExtraNoise:
     """Find the extra noise that makes the residuals of a fit most likely.
 
     Each kind of observable is judged by itself: it gets extra noise only where its χ² has a
@@ -127,17 +156,32 @@ def fit_noise(likelihood: Likelihood, theta: FloatArray) -> ExtraNoise:
         With the stated errors.
     theta : (n_dim,) float array
         The fit.
+    per_file : bool
+        Judge the files apart.
     """
-    data = likelihood.observables
-    difference = data.data - likelihood.predict(theta)[:, 0]
-    closure = difference[data.n_vis2 :]
-    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+    data, difference = likelihood.observables, residual(likelihood, theta)
     vis2 = np.arange(data.covariance.size) < data.n_vis2
     share = 1.0 - len(theta) / likelihood.n_independent
-    return ExtraNoise(
-        _one_kind(data, difference, vis2, share, "vis2"),
-        _one_kind(data, difference, ~vis2, share, "closure_phase_rad"),
+    parts = files_of(data)
+    if not per_file or len(parts) < 2:
+        return ExtraNoise(
+            _one_kind(data, difference, vis2, share, "vis2"),
+            _one_kind(data, difference, ~vis2, share, "closure_phase_rad"),
+        )
+    files = tuple(
+        FileNoise(
+            part.source,
+            _one_kind(data, difference, part.of_kind("vis2"), share, "vis2"),
+            _one_kind(data, difference, part.of_kind("cp"), share, "closure_phase_rad"),
+        )
+        for part in parts
     )
+    vis2_mean, closure_mean = (_rms(v) for v in ExtraNoise(files=files).of(data))
+    return ExtraNoise(vis2_mean, closure_mean, files)
+
+
+def _rms(variance: FloatArray) -> float:
+    return float(np.sqrt(variance.mean())) if len(variance) else 0.0
 
 
 def _one_kind(
@@ -147,7 +191,7 @@ def _one_kind(
     if not which.any():
         return 0.0
     n = data.n_vis2
-    part = data.select(np.full(n, name == "vis2"), np.full(data.n_closure_phases, name != "vis2"))
+    part = data.select(which[:n], which[n:])
     residual = difference[which]
     chi2, dof = _chi2(part.covariance, residual), share * part.covariance.rank
     if chi2_survival(chi2, dof, data.degrees_of_freedom) > UNLIKELY:
@@ -156,7 +200,9 @@ def _one_kind(
     largest = typical * np.sqrt(chi2 / dof)
 
     def loss(log_sigma: float) -> float:
-        noisy = _with_noise(part, ExtraNoise(**{name: float(np.exp(log_sigma))})).covariance
+        sigma = float(np.exp(log_sigma))
+        extra = ExtraNoise(vis2=sigma) if name == "vis2" else ExtraNoise(closure_phase_rad=sigma)
+        noisy = _with_noise(part, extra).covariance
         return _chi2(noisy, residual) + share * noisy.logdet()
 
     bounds = float(np.log(1e-2 * typical)), float(np.log(10.0 * largest))
@@ -169,7 +215,10 @@ def _chi2(covariance: Covariance, residual: FloatArray) -> float:
 
 
 def search_with_noise(
-    likelihood: Likelihood, separation_mas: tuple[float, float] | None = None
+    likelihood: Likelihood,
+    separation_mas: tuple[float, float] | None = None,
+    *,
+    per_file: bool = False,
 ) -> tuple[SearchResult, ExtraNoise]:
     """Search, and search again with the extra noise that the residuals ask for.
 
@@ -178,6 +227,8 @@ def search_with_noise(
     likelihood : Likelihood
         With the stated errors.
     separation_mas : (inner, outer), optional
+    per_file : bool
+        Judge the noise of every file by itself.
 
     Returns
     -------
@@ -190,7 +241,7 @@ def search_with_noise(
     tried = [(_score(result), result, noise)]
     settled = False
     while not settled and len(tried) <= MOST_ROUNDS:
-        before, noise = noise, fit_noise(likelihood, result.theta)
+        before, noise = noise, fit_noise(likelihood, result.theta, per_file=per_file)
         settled = _same(before, noise)
         if not settled:
             noisy = Likelihood(add_noise(likelihood.observables, noise), likelihood.model)
@@ -215,5 +266,8 @@ def _score(result: SearchResult) -> float:
 
 
 def _same(a: ExtraNoise, b: ExtraNoise) -> bool:
-    pairs = (a.vis2, b.vis2), (a.closure_phase_rad, b.closure_phase_rad)
+    pairs = [(a.vis2, b.vis2), (a.closure_phase_rad, b.closure_phase_rad)]
+    if a.files and b.files:
+        for x, y in zip(a.files, b.files, strict=True):
+            pairs += [(x.vis2, y.vis2), (x.closure_phase_rad, y.closure_phase_rad)]
     return all(abs(x - y) <= SETTLED * max(x, y) for x, y in pairs)

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
 from amibayes.covariance import DiagonalCovariance, as_blocks
+from amibayes.inference.by_file import files_of
 from amibayes.inference.likelihood import Likelihood, deviance, log_peak
 from amibayes.inference.marginal import Marginal
 from amibayes.inference.noise import ExtraNoise, add_noise
@@ -68,6 +69,8 @@ class NoiseTerm:
         Ends of the ranges that the others stand for, one more than those.
     log_prior : (n_nodes,) float array
         Logarithm of the prior probability that each stands for.
+    source : str
+        The file whose data they are, where files are told apart.
     """
 
     kind: str
@@ -79,6 +82,7 @@ class NoiseTerm:
     node: FloatArray = field(default_factory=lambda: np.zeros(1))
     edges: FloatArray = field(default_factory=lambda: np.zeros(1))
     log_prior: FloatArray = field(default_factory=lambda: np.zeros(1))
+    source: str = ""
 
     @property
     def n_independent(self) -> int:
@@ -176,7 +180,8 @@ class MarginalLikelihood(Likelihood):
     def noise_posterior(self, theta: FloatArray) -> dict[str, NoisePosterior]:
         """Posterior of the extra noise of each kind, given samples (n, n_dim) of the rest.
 
-        Keys are those of `ExtraNoise`; V² is dimensionless, closure phases are in radians.
+        Keys are those of `ExtraNoise`, followed by a colon and the file where files are told
+        apart; V² is dimensionless, closure phases are in radians.
         """
         difference = self._difference(self.predict(theta))
         out = {}
@@ -186,12 +191,17 @@ class MarginalLikelihood(Likelihood):
             for name in term.typical:
                 ends = term.amounts(term.edges, name)
                 low, high = np.append(0.0, ends[:-1]), np.append(0.0, ends[1:])
-                out[name] = NoisePosterior(float(share[0]), Marginal(low, high, share))
+                key = f"{name}:{term.source}" if term.source else name
+                out[key] = NoisePosterior(float(share[0]), Marginal(low, high, share))
         return out
 
 
 def marginal_likelihood(
-    profile: Likelihood, stated: Observables, fits: Sequence[tuple[Likelihood, FloatArray]]
+    profile: Likelihood,
+    stated: Observables,
+    fits: Sequence[tuple[Likelihood, FloatArray]],
+    *,
+    per_file: bool = False,
 ) -> MarginalLikelihood:
     """Average a likelihood over its extra noise.
 
@@ -203,6 +213,8 @@ def marginal_likelihood(
         The same data with the stated errors.
     fits : sequence of (Likelihood, (n_dim,) float array)
         Best fits of every model that will be weighed: nodes cover the noise each asks for.
+    per_file : bool
+        The noise of every file is unknown by itself (files must not share errors).
 
     Notes
     -----
@@ -210,7 +222,12 @@ def marginal_likelihood(
     prior of a scale, from the stated error to `MOST_INFLATION` times that.
     """
     differences = [residual_of(likelihood, theta) for likelihood, theta in fits]
-    terms = [with_nodes(t, differences) for t in _terms(stated.unflagged())]
+    data = stated.unflagged()
+    everywhere = np.ones(data.covariance.size, dtype=bool)
+    files = [(f.source, f.of_kind("vis2") | f.of_kind("cp")) for f in files_of(data)]
+    parts = files if per_file and len(files) > 1 else [("", everywhere)]
+    found = [replace(t, source=name) for name, here in parts for t in _terms(data, here)]
+    terms = [with_nodes(t, differences) for t in found]
     return MarginalLikelihood(profile, terms)
 
 
@@ -222,25 +239,40 @@ def residual_of(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     return np.asarray(difference)
 
 
-def _terms(stated: Observables) -> list[NoiseTerm]:
-    return [_term(stated, *parts) for parts in kinds_of(stated)]
+def files_share_errors(stated: Observables) -> bool:
+    """Whether errors of different files are correlated, as shared calibrators make them."""
+    data = stated.unflagged()
+    if isinstance(data.covariance, DiagonalCovariance):
+        return False
+    number = np.empty(data.covariance.size, dtype=np.intp)
+    for k, file in enumerate(files_of(data)):
+        number[file.of_kind("vis2") | file.of_kind("cp")] = k
+    return any(len(np.unique(number[b.index])) > 1 for b in as_blocks(data.covariance))
 
 
-def kinds_of(stated: Observables) -> list[tuple[str, BoolArray, dict[str, float]]]:
+def _terms(stated: Observables, here: BoolArray) -> list[NoiseTerm]:
+    return [_term(stated, *parts) for parts in kinds_of(stated, here)]
+
+
+def kinds_of(
+    stated: Observables, here: BoolArray | None = None
+) -> list[tuple[str, BoolArray, dict[str, float]]]:
     """Name, mask (n_data,) and typical errors of data that share their noise.
 
-    One entry for each kind of observable, or one for both where the file correlates them.
+    One entry for each kind of observable, or one for both where the file correlates them; of
+    all data, or only of those ``here`` (n_data,).
     """
+    here = np.ones(stated.covariance.size, dtype=bool) if here is None else here
     n = stated.n_vis2
     vis2 = np.arange(stated.covariance.size) < n
-    kinds = {"vis2": vis2, "closure_phase_rad": ~vis2}
+    kinds = {"vis2": vis2 & here, "closure_phase_rad": ~vis2 & here}
     typical = {
         name: float(np.sqrt(np.median(stated.covariance.variance[which])))
         for name, which in kinds.items()
         if which.any()
     }
     if len(typical) == 2 and not _separate(stated, n):
-        return [(BOTH, vis2 | ~vis2, typical)]
+        return [(BOTH, here, typical)]
     return [(name, kinds[name], {name: typical[name]}) for name in typical]
 
 
@@ -256,7 +288,7 @@ def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, f
     n = stated.n_vis2
     part = stated.select(which[:n], which[n:])
     blocks = as_blocks(part.covariance)
-    noisy = as_blocks(add_noise(part, ExtraNoise(**typical)).covariance)
+    noisy = as_blocks(add_noise(part, _amount(typical)).covariance)
     pairs = [(a.index, b.matrix - a.matrix) for a, b in zip(blocks, noisy, strict=True)]
     white = part.covariance.whitening
     turn, share = _diagonal(white @ _sparse(pairs, part.covariance.size) @ white.T)
@@ -267,6 +299,10 @@ def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, f
     )
     whitening, log_det = csr_array(turn @ white @ place), part.covariance.logdet()
     return NoiseTerm(kind, whitening, share, typical, log_det, part.degrees_of_freedom)
+
+
+def _amount(typical: dict[str, float]) -> ExtraNoise:
+    return ExtraNoise(typical.get("vis2", 0.0), typical.get("closure_phase_rad", 0.0))
 
 
 def _sparse(blocks: Sequence[tuple[IntArray, FloatArray]], size: int) -> csr_array:

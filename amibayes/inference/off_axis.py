@@ -26,19 +26,34 @@ class OffAxis:
     flux: FloatArray
 
     def at(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Response of visibility and flux, (n_samples, n) each."""
-        powers = powers_at(east_mas * MAS, north_mas * MAS)
-        return np.exp(self.fringe @ powers), np.exp((self.flux @ powers).real)
+        """Response of visibility and flux, (n_samples, n) each, at places (n,).
+
+        Moving places are (n_samples, n), here and below.
+        """
+        powers = powers_at(*_radians(east_mas, north_mas))
+        fringe, flux = (_sum(c, powers, east_mas) for c in (self.fringe, self.flux))
+        return np.exp(fringe), np.exp(flux.real)
 
     def slopes(
         self, east_mas: FloatArray, north_mas: FloatArray
     ) -> tuple[tuple[ComplexArray, ComplexArray], tuple[FloatArray, FloatArray]]:
         """Derivatives of both logarithms by east and north, per mas, (n_samples, n) each."""
-        east, north = slopes_at(east_mas * MAS, north_mas * MAS)
-        return (
-            (self.fringe @ east * MAS, self.fringe @ north * MAS),
-            ((self.flux @ east).real * MAS, (self.flux @ north).real * MAS),
-        )
+        slopes = slopes_at(*_radians(east_mas, north_mas))
+        fringe = [_sum(self.fringe, s, east_mas) * MAS for s in slopes]
+        flux = [_sum(self.flux, s, east_mas).real * MAS for s in slopes]
+        return (fringe[0], fringe[1]), (flux[0], flux[1])
+
+
+def _radians(east_mas: FloatArray, north_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return (east_mas * MAS).ravel(), (north_mas * MAS).ravel()
+
+
+def _sum(coefficients: FloatArray, powers: ComplexArray, like: FloatArray) -> ComplexArray:
+    """Polynomials of each sample, (n_samples, n), at places shaped like (n,) or (n_samples, n)."""
+    if like.ndim == 1:
+        return np.asarray(coefficients @ powers)
+    at_own = powers.reshape(len(powers), *like.shape)
+    return np.asarray(np.einsum("sk,ksn->sn", coefficients, at_own))
 
 
 def off_axis_of(data: Observables, first: IntArray, sign: FloatArray) -> OffAxis | None:

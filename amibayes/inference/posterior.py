@@ -248,7 +248,7 @@ def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray
         density = prior.log_density(x)
         inside = np.isfinite(density)
         if inside.any():
-            density[inside] += likelihood.log_prob(physical(x[inside], 1))
+            density[inside] += likelihood.log_prob(physical(x[inside], likelihood.model))
         return density
 
     return log_posterior
@@ -344,14 +344,14 @@ def _posterior(
     converged: bool,
 ) -> Posterior:
     times = _times(sampler)
-    time = _longest(times)
+    time, model = _longest(times), result.likelihood.model
     burn = sampler.iteration // 3
     thin = max(1, int(0.5 * time)) if np.isfinite(time) else 1
     return Posterior(
         names=result.likelihood.parameters,
-        samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), 1),
+        samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), model),
         log_prob=sampler.get_log_prob(discard=burn, thin=thin, flat=True),
-        chain=physical(sampler.get_chain(), 1),
+        chain=physical(sampler.get_chain(), model),
         chain_log_prob=sampler.get_log_prob(),
         autocorrelation_time=time,
         n_steps=sampler.iteration,

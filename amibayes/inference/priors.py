@@ -41,6 +41,10 @@ class Prior:
         Distribution of the contrast over its range.
     position_form : {"area", "separation"}
         Uniform in area, or uniform in separation and position angle.
+    n_contrasts : int
+        Contrasts of each companion, one per band: independent, each with that distribution.
+    fastest_mas_yr : float
+        Where companions move, their rates along east and north are uniform within so much of 0.
     """
 
     inner_mas: float
@@ -50,6 +54,8 @@ class Prior:
     nuisance: tuple[tuple[float, float], ...] = ()
     contrast_form: ContrastForm = "log-uniform"
     position_form: PositionForm = "area"
+    n_contrasts: int = 1
+    fastest_mas_yr: float = 0.0
 
     def __post_init__(self) -> None:
         _check("separation", self.inner_mas, self.outer_mas, least=0.0)
@@ -66,7 +72,15 @@ class Prior:
         """The forms in words."""
         place = {"area": "uniform in area", "separation": "uniform in separation and angle"}
         contrast = {"log-uniform": "log-uniform in contrast", "uniform": "uniform in contrast"}
-        return f"{place[self.position_form]}, {contrast[self.contrast_form]}"
+        words = f"{place[self.position_form]}, {contrast[self.contrast_form]}"
+        if self.n_contrasts > 1:
+            words += f" ({self.n_contrasts} bands, independently)"
+        return words + (", uniform in rate" if self.fastest_mas_yr > 0.0 else "")
+
+    @property
+    def width(self) -> int:
+        """Number of parameters of each companion, as `BinaryModel.width`."""
+        return 2 + self.n_contrasts + 2 * (self.fastest_mas_yr > 0.0)
 
     def contrast_cdf(self, contrast: FloatArray) -> FloatArray:
         """Probability of a fainter companion, any shape."""
@@ -87,11 +101,15 @@ class Prior:
         return float(np.log(self.contrast_max / self.contrast_min))
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        """Log-density of (east_mas, north_mas, ln contrast)…, nuisance…, (n, n_dim) → (n,)."""
+        """Log-density of (east_mas, north_mas, ln contrast)…, nuisance…, (n, n_dim) → (n,).
+
+        Further contrasts (ln) and rates of a companion follow its first contrast.
+        """
         n_pairs = x.shape[1] - len(self.nuisance)
         density = np.zeros(len(x))
-        for k in range(0, n_pairs, 3):
+        for k in range(0, n_pairs, self.width):
             density = density + self._log_companion(x[:, k : k + 3])
+            density = density + self._log_rest(x[:, k + 3 : k + self.width])
         for k, (low, high) in enumerate(self.nuisance, start=n_pairs):
             inside = (x[:, k] >= low) & (x[:, k] <= high)
             density = np.where(inside, density - np.log(high - low), -np.inf)
@@ -106,11 +124,25 @@ class Prior:
             place = np.log(np.pi * (self.outer_mas**2 - self.inner_mas**2))
         else:
             place = np.log(2.0 * np.pi * (self.outer_mas - self.inner_mas) * safe)
+        return np.where(inside, self._log_bright(ln_c) - place, -np.inf)
+
+    def _log_bright(self, ln_c: FloatArray) -> FloatArray | float:
+        """Log-density in ln contrast, inside the range."""
         if self.contrast_form == "log-uniform":
-            bright = -np.log(self._log_range)
-        else:
-            bright = ln_c - np.log(self.contrast_max - self.contrast_min)
-        return np.where(inside, bright - place, -np.inf)
+            return float(-np.log(self._log_range))
+        return np.asarray(ln_c - np.log(self.contrast_max - self.contrast_min))
+
+    def _log_rest(self, x: FloatArray) -> FloatArray:
+        """Log-density of further contrasts and of rates, (n, width − 3) → (n,)."""
+        density = np.zeros(len(x))
+        low, high = np.log(self.contrast_min), np.log(self.contrast_max)
+        for k in range(self.n_contrasts - 1):
+            inside = (x[:, k] >= low) & (x[:, k] <= high)
+            density = np.where(inside, density + self._log_bright(x[:, k]), -np.inf)
+        for k in range(self.n_contrasts - 1, self.width - 3):
+            inside = np.abs(x[:, k]) <= self.fastest_mas_yr
+            density = np.where(inside, density - np.log(2.0 * self.fastest_mas_yr), -np.inf)
+        return density
 
     def from_cube(self, cube: FloatArray) -> FloatArray:
         """Turn uniform numbers (n, n_dim) into parameter sets with contrast as a flux ratio."""
@@ -118,10 +150,13 @@ class Prior:
         n_pairs = cube.shape[1] - len(self.nuisance)
         power = 2 if self.position_form == "area" else 1
         low, high = self.inner_mas**power, self.outer_mas**power
-        for k in range(0, n_pairs, 3):
+        for k in range(0, n_pairs, self.width):
             rho = (low + (high - low) * cube[:, k]) ** (1.0 / power)
             theta[:, k], theta[:, k + 1] = offset(rho, 360.0 * cube[:, k + 1])
-            theta[:, k + 2] = self._contrast_at(cube[:, k + 2])
+            bright = slice(k + 2, k + 2 + self.n_contrasts)
+            theta[:, bright] = self._contrast_at(cube[:, bright])
+            rates = slice(bright.stop, k + self.width)
+            theta[:, rates] = self.fastest_mas_yr * (2.0 * cube[:, rates] - 1.0)
         for k, (least, most) in enumerate(self.nuisance, start=n_pairs):
             theta[:, k] = least + (most - least) * cube[:, k]
         return theta
@@ -133,7 +168,7 @@ class Prior:
 
     def draw(self, rng: np.random.Generator, n: int, companions: int = 1) -> FloatArray:
         """Draw parameter sets (n, n_dim), contrast as a flux ratio."""
-        return self.from_cube(rng.random((n, 3 * companions + len(self.nuisance))))
+        return self.from_cube(rng.random((n, self.width * companions + len(self.nuisance))))
 
 
 @dataclass(frozen=True)
@@ -147,7 +182,13 @@ class PriorSetting:
 
 def default_prior(likelihood: Likelihood, inner_mas: float, outer_mas: float) -> Prior:
     """The prior of the field that was searched."""
-    return Prior(inner_mas, outer_mas, nuisance=tuple(nuisance_bounds(likelihood)))
+    return Prior(
+        inner_mas,
+        outer_mas,
+        nuisance=tuple(nuisance_bounds(likelihood)),
+        n_contrasts=likelihood.model.n_contrasts,
+        fastest_mas_yr=likelihood.model.fastest_mas_yr,
+    )
 
 
 def parse_setting(text: str) -> PriorSetting:

@@ -83,8 +83,8 @@ def recover(
     single : (n_nuisance,) float array
         The fit without a companion.
     theta : (n, 3) float array
-        east_mas, north_mas, contrast of each trial. Trials at one place are cheapest side
-        by side.
+        east_mas, north_mas, contrast (the same in every band, at rest) of each trial. Trials
+        at one place are cheapest side by side.
     threshold : float
         Statistic that counts as a detection.
     rng : numpy.random.Generator
@@ -346,7 +346,8 @@ def _between_lattice_points(
 
 def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
     """Whitened change of the data by companions (n, 3) on top of the fit without one."""
-    full = np.hstack([theta, np.broadcast_to(single, (len(theta), len(single)))])
+    whole = likelihood.model.tied(theta)
+    full = np.hstack([whole, np.broadcast_to(single, (len(theta), len(single)))])
     alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
     change = likelihood.predict(full) - alone
     closure = change[likelihood.samples.squares.shape[0] :]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from amibayes.freedom import Freedom
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.positive import best_positive
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
@@ -144,15 +145,36 @@ def _search_each(
     entries, weighted = entries.astype(np.float32), weighted.astype(np.float32)
     each = np.arange(data.shape[1])
     best, where = np.zeros(len(each), dtype=np.float32), np.zeros(len(each), dtype=np.intp)
-    for index, templates in bank.chunks():
-        t = templates.astype(np.float32)
-        norm = entries @ (t[first] * t[second])
-        score = weighted @ t / np.sqrt(np.maximum(norm, 1e-12))[whose]
+    pairs = first, second
+    for index, templates in bank.by_band():
+        score = _scores(templates.astype(np.float32), weighted, entries, whose, pairs)
         top = score.argmax(axis=1)
         value = score[each, top]
         better = value > best
         best[better], where[better] = value[better], index[top[better]]
     return Searched(np.asarray(best, dtype=float) ** 2, where, chi2)
+
+
+def _scores(
+    templates: NDArray[np.float32],
+    weighted: NDArray[np.float32],
+    entries: NDArray[np.float32],
+    whose: IntArray,
+    pairs: tuple[IntArray, IntArray],
+) -> NDArray[np.float32]:
+    """Root of the gain in χ² of data sets (n) by templates (n_bands, p, m), (n, m)."""
+    first, second = pairs
+    norms = [np.sqrt(np.maximum(entries @ (t[first] * t[second]), 1e-12)) for t in templates]
+    match = [weighted @ t / norm[whose] for t, norm in zip(templates, norms, strict=True)]
+    if len(match) == 1:
+        return np.asarray(match[0])
+    shared = {}
+    for b in range(len(match)):
+        for a in range(b):
+            t, s = templates[a], templates[b]
+            product = entries @ (0.5 * (t[first] * s[second] + t[second] * s[first]))
+            shared[a, b] = (product / (norms[a] * norms[b]))[whose]
+    return np.asarray(np.sqrt(np.maximum(best_positive(match, shared)[1], 0.0)))
 
 
 def profiled(gain: FloatArray, chi2: FloatArray, n_data: float) -> FloatArray:

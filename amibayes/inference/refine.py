@@ -72,15 +72,18 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
 
 def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: float) -> Mode:
     """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
-    n_pairs = 3 * likelihood.model.companions
+    model = likelihood.model
+    n_pairs = model.width * model.companions
     bounds = np.empty((len(seed), 2))
     bounds[:n_pairs] = seed[:n_pairs, None] + box.fringe_mas * np.array([-1.0, 1.0])
-    bounds[2:n_pairs:3] = 0.0, MAX_CONTRAST
+    bounds[model.contrast_columns] = 0.0, MAX_CONTRAST
+    bounds[model.rate_columns] = -model.fastest_mas_yr, model.fastest_mas_yr
     bounds[n_pairs:] = np.array(nuisance_bounds(likelihood)).reshape(-1, 2)
     theta, deviance = seed, np.inf
     for _ in range(MOST_ROUNDS):
         scale = _natural_scale(likelihood, theta, box)
-        limits = [x for k in range(0, n_pairs, 3) for x in _field_limits(seed, box, scale, k)]
+        places = range(0, n_pairs, model.width)
+        limits = [x for k in places for x in _field_limits(seed, box, scale, k)]
         before = deviance
         theta, deviance = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
         if deviance > before - SETTLED:
@@ -91,9 +94,11 @@ def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: 
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
     """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
     length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
-    n_pairs = 3 * likelihood.model.companions
+    model = likelihood.model
     widest = np.full(len(theta), 1.0)
-    widest[:n_pairs], widest[2:n_pairs:3] = 0.3 * box.fringe_mas, 0.3
+    widest[: model.width * model.companions] = 0.3 * box.fringe_mas
+    widest[model.contrast_columns] = 0.3
+    widest[model.rate_columns] = 0.5 * model.fastest_mas_yr
     return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
 
 
@@ -125,8 +130,10 @@ def global_check(
     start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
-    contrast = np.clip(best_at(position)[0], 0.0, MAX_CONTRAST)
-    return refine(likelihood, np.concatenate([position, [contrast], single]), box, deviance_single)
+    seed = np.concatenate([position, best_at(position)[0], single])
+    bright = likelihood.model.contrast_columns
+    seed[bright] = np.clip(seed[bright], 0.0, MAX_CONTRAST)
+    return refine(likelihood, seed, box, deviance_single)
 
 
 def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:

@@ -13,6 +13,7 @@ from amibayes.inference.bank import Grid
 from amibayes.inference.detection import candid_n_sigma
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.robust import Frame, Robustness, frame_of
+from amibayes.inference.samples import YEAR_DAYS
 from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import (
     FloatArray,
@@ -123,12 +124,15 @@ class SearchResult:
         Distinct solutions left standing, best first.
     grid : Grid
     bank_contrast, bank_sigma : (n_grid,) float array
-        Best linear contrast and its error at every position.
+        Best linear contrast and its error at every position, the same in every band.
     global_check : Mode
         What the independent global optimiser found.
     warnings : tuple of str
     robustness : Robustness, optional
         How a robust search treated the data; ``likelihood`` has outliers' errors stretched.
+    joint_gain : (n_grid,) float array, optional
+        Gain in χ² at every position where bands have contrasts of their own or the companion
+        moves; otherwise it follows from the two above.
     """
 
     likelihood: Likelihood
@@ -146,6 +150,7 @@ class SearchResult:
     global_check: Mode
     warnings: tuple[str, ...] = ()
     robustness: Robustness | None = None
+    joint_gain: FloatArray | None = None
 
     @property
     def delta_chi2(self) -> float:
@@ -171,7 +176,25 @@ class SearchResult:
     @property
     def bank_gain(self) -> FloatArray:
         """Gain in χ² at every position of the grid, for positive contrast."""
+        if self.joint_gain is not None:
+            return self.joint_gain
         return np.where(self.bank_contrast > 0, (self.bank_contrast / self.bank_sigma) ** 2, 0.0)
+
+    @property
+    def contrasts(self) -> dict[str, tuple[float, float]]:
+        """Contrast and its 1σ error of every band with its own; empty where all share one."""
+        model = self.likelihood.model
+        sigma = np.sqrt(np.diag(self.theta_covariance))
+        columns = zip(model.bands, model.contrast_columns, strict=False)
+        return {band: (float(self.theta[k]), float(sigma[k])) for band, k in columns}
+
+    def position_at(self, mjd: float) -> tuple[float, float]:
+        """East and north of the companion, mas, predicted for a date."""
+        model, (east, north) = self.likelihood.model, self.theta[:2]
+        if model.moves:
+            moved = self.theta[model.rate_columns] * (mjd - model.reference_mjd) / YEAR_DAYS
+            east, north = east + moved[0], north + moved[1]
+        return float(east), float(north)
 
     def nuisance(self, name: str) -> float:
         """Value of the diameter or background in the best fit, free or fixed."""

@@ -80,13 +80,13 @@ def search_robust(
 
 
 def _as_noise(frame: Frame, variance: FloatArray, scale: FloatArray) -> ExtraNoise:
-    amounts = [
+    vis2, closure = (
         float(np.sqrt(np.median(variance[m]) * max(np.median(scale[m]) ** 2 - 1.0, 0.0)))
         if m.any()
         else 0.0
         for m in (frame.vis2, ~frame.vis2)
-    ]
-    return ExtraNoise(*amounts)
+    )
+    return ExtraNoise(vis2, closure)
 
 
 class _Work:

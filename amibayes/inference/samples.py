@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,8 @@ from amibayes.observables import Observables
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
+
+YEAR_DAYS = 365.25
 
 SAME_POINT = 1e-9
 """Points nearer than this fraction of the longest baseline are one (float32 files differ more)."""
@@ -34,6 +38,10 @@ class Samples:
         Closure phase = legs · phase; entries are ±1.
     off_axis : OffAxis, optional
         Response of the extraction to light off the axis; 1 where there is none.
+    bands : (n,) int array, optional
+        Number of each point's band, where bands are told apart.
+    mjd : (n,) float array, optional
+        Date of each point, where dates are told apart.
     """
 
     u: FloatArray
@@ -42,6 +50,8 @@ class Samples:
     squares: csr_array
     legs: csr_array
     off_axis: OffAxis | None = None
+    bands: IntArray | None = None
+    mjd: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.u)
@@ -51,9 +61,31 @@ class Samples:
         """Length of the spatial frequency, cycles per radian."""
         return np.asarray(np.hypot(self.u, self.v))
 
+    @property
+    def band(self) -> IntArray:
+        """Number of each point's band, 0 where they are not told apart, (n,)."""
+        return np.zeros(len(self), dtype=np.intp) if self.bands is None else self.bands
 
-def samples_of(observables: Observables) -> Samples:
-    """Collect the points of unflagged observables; opposite points are conjugate, hence one."""
+    def years(self, reference_mjd: float) -> FloatArray:
+        """Julian years of each point since a date, (n,)."""
+        if self.mjd is None:
+            raise ValueError("these samples do not know their dates")
+        return np.asarray((self.mjd - reference_mjd) / YEAR_DAYS)
+
+
+def samples_of(
+    observables: Observables, band_of_setup: IntArray | None = None, *, dated: bool = False
+) -> Samples:
+    """Collect the points of unflagged observables; opposite points are conjugate, hence one.
+
+    Parameters
+    ----------
+    observables : Observables
+    band_of_setup : (n_setups,) int array, optional
+        Keeps equal points of different bands apart.
+    dated : bool
+        Keep equal points of different dates apart.
+    """
     data = observables.unflagged()
     v2, cp = data.vis2, data.closure_phase
     u3 = np.concatenate([cp.u_m, -cp.u_m.sum(axis=1, keepdims=True)], axis=1)
@@ -62,7 +94,11 @@ def samples_of(observables: Observables) -> Samples:
     band = np.concatenate([v2.band_m, np.repeat(cp.band_m, 3)])
     u = np.concatenate([v2.u_m[:, 0], u3.ravel()]) / wavelength
     v = np.concatenate([v2.v_m[:, 0], v3.ravel()]) / wavelength
-    first, index, sign = _distinct(u, v, band / wavelength)
+    setup = np.concatenate([v2.setup, np.repeat(cp.setup, 3)])
+    mjd = np.concatenate([v2.mjd, np.repeat(cp.mjd, 3)])
+    bands = None if band_of_setup is None else band_of_setup[setup]
+    labels = ([] if bands is None else [bands]) + ([mjd] if dated else [])
+    first, index, sign = _distinct(u, v, band / wavelength, labels)
     n, n2, n3 = len(first), len(v2), len(cp)
     rows = np.repeat(np.arange(n3), 3)
     legs = csr_array((sign[n2:], (rows, index[n2:])), shape=(n3, n))
@@ -74,16 +110,18 @@ def samples_of(observables: Observables) -> Samples:
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
         off_axis_of(data, first, orientation),
+        None if bands is None else bands[first],
+        mjd[first] if dated else None,
     )
 
 
 def _distinct(
-    u: FloatArray, v: FloatArray, band: FloatArray
+    u: FloatArray, v: FloatArray, band: FloatArray, labels: Sequence[NDArray[Any]]
 ) -> tuple[IntArray, IntArray, FloatArray]:
     scale = SAME_POINT * np.hypot(u, v).max(initial=1e-300)
     grid = np.stack([np.rint(u / scale), np.rint(v / scale)], axis=1)
     lead = np.where(grid[:, 0] != 0, grid[:, 0], grid[:, 1])
     sign = np.where(lead < 0, -1.0, 1.0)
-    key = np.column_stack([grid * sign[:, None], np.rint(band * 1e9)])
+    key = np.column_stack([grid * sign[:, None], np.rint(band * 1e9), *labels])
     _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return first, index.ravel(), sign

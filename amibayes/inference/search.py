@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from amibayes.errors import DataError, UsageError
-from amibayes.inference.bank import Grid, TemplateBank, make_grid
+from amibayes.inference.bank import Grid, Survey, make_grid
+from amibayes.inference.joint_bank import bank_of, rates_per_axis
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import Box, fit_single, global_check, refine, single_likelihood
 from amibayes.inference.results import Mode, SearchResult, companion_of
@@ -105,10 +107,12 @@ def look_inside(result: SearchResult) -> float | None:
 
 def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
     """Largest gain in χ² at the positions of a grid, and the separation where it is, mas."""
-    bank = TemplateBank(result.likelihood, grid, result.single_theta)
-    residuals = single_likelihood(result.likelihood).residuals(result.single_theta)[:, 0]
-    contrast, sigma = bank.scan(residuals)
-    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+    likelihood = result.likelihood
+    # A moving companion is looked for at rest there: a first look has no time for more.
+    still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0))
+    bank = bank_of(still, grid, result.single_theta)
+    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
+    gain = bank.survey(residuals).gain
     best = int(gain.argmax())
     return float(gain[best]), float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
 
@@ -153,7 +157,8 @@ def search(
     inner, outer = separation_mas or default_separation(likelihood)
     fringe = resolution_mas(likelihood)
     step = fringe / GRID_STEPS_PER_FRINGE
-    _refuse_huge(inner, outer, step, likelihood.observables.source)
+    per_place = rates_per_axis(likelihood)
+    _refuse_huge(inner, outer, step / per_place, likelihood.observables.source)
     grid = make_grid(inner, outer, step)
     if not len(grid):
         raise UsageError(
@@ -162,17 +167,17 @@ def search(
             remedy="widen the range",
         )
     single, deviance_single = fit_single(likelihood)
-    bank = TemplateBank(likelihood, grid, single)
+    bank = bank_of(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
-    contrast, sigma = bank.scan(residuals)
+    survey = bank.survey(residuals)
     box = Box(inner, outer, fringe)
-    seeds = _seeds(likelihood, grid, contrast, sigma, single, box)
+    seeds = _seeds(likelihood, grid, survey, single, box)
     found = [refine(likelihood, theta, box, deviance_single) for theta in seeds]
     check = global_check(likelihood, bank, box, single, deviance_single)
     modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
     theta = np.array(modes[0].theta)
     # Without a companion there is nothing whose errors could be told.
-    absent = theta[2] <= 0.0
+    absent = not (theta[likelihood.model.contrast_columns] > 0.0).any()
     covariance = np.full((len(theta),) * 2, np.nan) if absent else likelihood.errors(theta)
     return SearchResult(
         likelihood=likelihood,
@@ -185,10 +190,11 @@ def search(
         ndof=likelihood.n_independent - len(likelihood.parameters),
         modes=modes,
         grid=grid,
-        bank_contrast=contrast,
-        bank_sigma=sigma,
+        bank_contrast=survey.contrast,
+        bank_sigma=survey.sigma,
         global_check=check,
         warnings=_doubts(modes, aliases, found, check),
+        joint_gain=None if likelihood.model.width == 3 else survey.gain,
     )
 
 
@@ -211,26 +217,29 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
 def _seeds(
     likelihood: Likelihood,
     grid: Grid,
-    contrast: FloatArray,
-    sigma: FloatArray,
+    survey: Survey,
     single: FloatArray,
     box: Box,
 ) -> FloatArray:
     """Starting points (n, n_dim): peaks of the linear map, and of the exact one if bright."""
-    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
-    best = peaks(grid, gain, box.fringe_mas)
-    seeds = _thetas(grid, best, contrast[best], single)
-    if contrast[best].max(initial=0.0) < BRIGHT:
+    best = peaks(grid, survey.gain, box.fringe_mas)
+    rest = np.broadcast_to(single, (len(best), len(single)))
+    places = grid.east_mas[best], grid.north_mas[best]
+    seeds = np.column_stack([*places, survey.bounded(best), rest])
+    if survey.contrasts[best].max(initial=0.0) < BRIGHT:
         return seeds
     chi2, brightness = _exact_map(likelihood, grid, single)
     best = peaks(grid, chi2.max() - chi2, box.fringe_mas)
-    return np.vstack([seeds, _thetas(grid, best, brightness[best], single)])
+    return np.vstack([seeds, _thetas(likelihood, grid, best, brightness[best], single)])
 
 
-def _thetas(grid: Grid, at: IntArray, contrast: FloatArray, single: FloatArray) -> FloatArray:
+def _thetas(
+    likelihood: Likelihood, grid: Grid, at: IntArray, contrast: FloatArray, single: FloatArray
+) -> FloatArray:
+    """Parameter sets (n, n_dim) of companions at rest, of one contrast in every band."""
     rest = np.broadcast_to(single, (len(at), len(single)))
-    bounded = np.clip(contrast, 0.0, 1.0)
-    return np.column_stack([grid.east_mas[at], grid.north_mas[at], bounded, rest])
+    three = np.column_stack([grid.east_mas[at], grid.north_mas[at], np.clip(contrast, 0.0, 1.0)])
+    return np.hstack([likelihood.model.tied(three), rest])
 
 
 def _exact_map(
@@ -242,7 +251,10 @@ def _exact_map(
     chi2 = np.array(
         [
             np.concatenate(
-                [likelihood.chi2(_thetas(grid, p, np.full(len(p), c), single)) for p in pieces]
+                [
+                    likelihood.chi2(_thetas(likelihood, grid, p, np.full(len(p), c), single))
+                    for p in pieces
+                ]
             )
             for c in BRIGHT_CONTRASTS
         ]

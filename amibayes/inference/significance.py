@@ -86,6 +86,8 @@ class Significance:
         Number of independent data less the nuisance parameters.
     degrees : float
         Degrees of freedom of the t distribution of the data; infinite for a Gaussian.
+    n_contrasts : int
+        Number of bands with a contrast of their own.
     """
 
     statistic: float
@@ -98,6 +100,7 @@ class Significance:
     field: FloatArray | None = None
     n_free: int = 0
     degrees: float = np.inf
+    n_contrasts: int = 1
 
     @property
     def n_draws(self) -> int:
@@ -140,10 +143,16 @@ class Significance:
 
         One side of a normal deviate (Δχ²), or of Student's t with the scale free or the
         covariance estimated: exact for one linear parameter, so it needs no draws. The
-        covariance's own error is that of the t distribution of the data.
+        covariance's own error is that of the t distribution of the data. Of several bands each
+        contrast is positive half of the time (exact where they are independent); of a motion it
+        is at one rate.
         """
         x = np.asarray(statistic, dtype=float)
         count = self.n_free if self.free_scale else self.n_free + self.degrees
+        if self.n_contrasts > 1:
+            k = np.arange(1, self.n_contrasts + 1)
+            each = [_beyond(x, int(number), count) for number in k]
+            return np.tensordot(stats.binom.pmf(k, self.n_contrasts, 0.5), each, axes=1)
         if not np.isfinite(count):
             return np.asarray(stats.norm.sf(np.sqrt(x)))
         return np.asarray(stats.t.sf(np.sqrt((count - 1) * np.expm1(x / count)), count - 1))
@@ -158,6 +167,14 @@ class Significance:
             "generalised Pareto law of the largest draws": (x, pareto_survival(self.null, x)),
             "extreme-value law of blocks' maxima": (x, extreme_value_survival(self.null, x)),
         }
+
+
+def _beyond(x: FloatArray, dof: int, count: float) -> FloatArray:
+    """Probability that the gain by ``dof`` parameters, of either sign, exceeds x."""
+    if not np.isfinite(count):
+        return np.asarray(stats.chi2.sf(x, dof))
+    ratio = np.expm1(x / count) * (count - dof) / dof
+    return np.asarray(stats.f.sf(ratio, dof, count - dof))
 
 
 def bank_statistic(
@@ -185,8 +202,7 @@ def statistic_field(
     Its maximum is that of `bank_statistic`.
     """
     white = bounded(bank, white[:, None], frame)[:, 0]
-    contrast, sigma = bank.scan(white)
-    gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+    gain = bank.survey(white).gain
     chi2 = np.full(len(gain), float((bank.project(white) ** 2).sum()))
     return twice_log_ratio(bank, gain, chi2, free_scale=free_scale)
 
@@ -337,6 +353,7 @@ def significance(
         free_scale,
         n_free=bank.n_data - bank.n_nuisance,
         degrees=np.inf if bank.freedom is None else bank.freedom.degrees,
+        n_contrasts=bank.n_contrasts,
     )
 
 

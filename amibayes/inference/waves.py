@@ -1,4 +1,4 @@
-"""Cosines and sines over rows of a lattice, from factors made once per axis."""
+"""Waves over a lattice of positions, by products of factors made once per axis."""
 
 from __future__ import annotations
 
@@ -19,11 +19,28 @@ class Waves:
 
     Sums of angles become products of factors made once per axis. The half angles are moved
     off zero by `NUDGE`, so that sin(x)/x needs no special case.
+
+    Parameters
+    ----------
+    samples : Samples
+    axis : (n,) float array
+        Coordinates of the lattice along east and along north, mas.
+    smearing : bool
+    turn : (n_samples,) float array, optional
+        Angle added to every position's, such as that of a motion since a date.
     """
 
-    def __init__(self, samples: Samples, axis: FloatArray, smearing: bool) -> None:
+    def __init__(
+        self,
+        samples: Samples,
+        axis: FloatArray,
+        smearing: bool,
+        turn: FloatArray | None = None,
+    ) -> None:
         self._smearing = smearing
         angles = [2.0 * np.pi * MAS * np.outer(f, axis) for f in (samples.u, samples.v)]
+        if turn is not None:
+            angles[1] += turn[:, None]
         self._east, self._north = [(np.cos(a), np.sin(a)) for a in angles]
         half = [0.5 * samples.relative_band[:, None] * a for a in angles]
         half[1] += NUDGE
@@ -31,7 +48,7 @@ class Waves:
         self._work = np.empty((4, len(samples) * min(WIDTH, len(axis))))
 
     def __call__(self, columns: slice, row: int) -> tuple[FloatArray, FloatArray]:
-        """Cosine and sine, (n_samples, n_columns), of some columns of one row."""
+        """Cosine and sine, (n_samples, n_columns) each; overwritten by the next call."""
         width = columns.stop - columns.start
         shape = (4, len(self._half_east[0]), width)
         cosine, sine, damping, spare = self._work[:, : shape[1] * width].reshape(shape)

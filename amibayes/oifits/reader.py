@@ -139,7 +139,7 @@ def _chosen_target(
         raise DataError(
             f"holds data of several targets: {listing([t.name for t in alike])}",
             source=oifits.path,
-            remedy="choose one of them",
+            remedy="choose one of them with --target NAME",
         )
     return alike[0].name, found
 

@@ -19,6 +19,8 @@ NAMES = {
     "log_contrast": "ln contrast",
     "diameter_mas": "Diameter (mas)",
     "background": "Background",
+    "east_rate_mas_yr": "East rate (mas/yr)",
+    "north_rate_mas_yr": "North rate (mas/yr)",
     "separation_mas": "Separation (mas)",
     "position_angle_deg": "PA (°)",
     "delta_mag": "Δmag",

@@ -28,6 +28,11 @@ CAPTIONS = {
         "Squared visibilities and closure phases with their errors, the best binary model, and "
         "the residuals in units of the errors.",
     ),
+    "files": (
+        "Residuals of each file",
+        "Reduced χ² of the V² and of the closure phases of each file under the joint fit, with "
+        "the companion and without.",
+    ),
     "coverage": (
         "Coverage",
         "Spatial frequencies that the data sample; they set which positions can be told apart.",

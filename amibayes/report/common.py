@@ -6,10 +6,19 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
 from amibayes.files import sha256
+from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.results import SearchResult
 
 Json = dict[str, Any]
+
+NOISE_KEYS = {
+    "vis2": ("extra_vis2", 1.0),
+    "closure_phase_rad": ("extra_closure_phase_deg", float(np.degrees(1.0))),
+}
+"""Names in ``result.json`` of the kinds of `ExtraNoise`, and their units."""
 
 
 def number(value: float) -> float | None:
@@ -44,4 +53,18 @@ def data_json(result: SearchResult) -> Json:
         "instruments": list(dict.fromkeys(s.insname for s in used.setups)),
         "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
         "separation_mas": [result.grid.inner_mas, result.grid.outer_mas],
+    }
+
+
+def noise_interval(found: NoisePosterior, unit: float) -> Json:
+    """Intervals of the extra noise of one kind of observable."""
+    median, lower, upper = (unit * x for x in found.interval(0.68))
+    _, lower95, upper95 = (unit * x for x in found.interval(0.95))
+    return {
+        "median": median,
+        "lower": lower,
+        "upper": upper,
+        "lower_95": lower95,
+        "upper_95": upper95,
+        "probability_errors_right": found.probability_none,
     }

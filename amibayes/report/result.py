@@ -11,22 +11,23 @@ from amibayes import __version__
 from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
 from amibayes.inference.grid_posterior import GridPosterior
 from amibayes.inference.multiplicity import TwoCompanions
-from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Companion, Mode, SearchResult
 from amibayes.inference.robust import DEGREES, normal_moments
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchReport, calibrator_verdicts
-from amibayes.report.common import Json, data_json, inputs_json, number
+from amibayes.report.common import (
+    NOISE_KEYS,
+    Json,
+    data_json,
+    inputs_json,
+    noise_interval,
+    number,
+)
+from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
 from amibayes.report.limits import limits_json
 from amibayes.units import contrast_to_delta_mag
-
-NOISE_KEYS = {
-    "vis2": ("extra_vis2", 1.0),
-    "closure_phase_rad": ("extra_closure_phase_deg", float(np.degrees(1.0))),
-}
-"""Names in ``result.json`` of the kinds of `ExtraNoise`, and their units."""
 
 QUANTITIES = (
     "separation_mas",
@@ -51,30 +52,29 @@ def result_json(report: SearchReport) -> Json:
         "modes": _modes(report),
         "posterior": None if report.posterior is None else _posterior(report, report.posterior),
         "calibration": _calibration(report),
-        "limits": None if report.limits is None else limits_json(report.limits),
-        "noise": _noise(report),
+        "limits": _limits(report),
+        "noise": _noise(report) | noise_files_json(report),
         "robust": _robust(report.result),
         "evidence": None
         if report.evidence is None
         else evidence_json(report.evidence, report.second_significance),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
-    }
+    } | ({"residuals": residuals_json(report)} if is_joint(report) else {})
 
 
 def _noise(report: SearchReport) -> Json:
     """Extra noise: the most likely, and what the posterior says of it."""
-    found = report.noise_posterior
+    found = report.noise_posterior or {}
+    posterior = {
+        key: noise_interval(found[name], unit)
+        for name, (key, unit) in NOISE_KEYS.items()
+        if name in found
+    }
     return {
         "extra_vis2": report.noise.vis2,
         "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
-        "posterior": None
-        if found is None
-        else {
-            key: _noise_interval(found[name], unit)
-            for name, (key, unit) in NOISE_KEYS.items()
-            if name in found
-        },
+        "posterior": posterior or None,
     }
 
 
@@ -91,19 +91,6 @@ def _robust(result: SearchResult) -> Json | None:
     }
 
 
-def _noise_interval(found: NoisePosterior, unit: float) -> Json:
-    median, lower, upper = (unit * x for x in found.interval(0.68))
-    _, lower95, upper95 = (unit * x for x in found.interval(0.95))
-    return {
-        "median": median,
-        "lower": lower,
-        "upper": upper,
-        "lower_95": lower95,
-        "upper_95": upper95,
-        "probability_errors_right": found.probability_none,
-    }
-
-
 def _fit(result: SearchResult) -> Json:
     c = result.companion
     return {
@@ -115,6 +102,7 @@ def _fit(result: SearchResult) -> Json:
         "chi2r_single": result.chi2_single / result.ndof,
         "chi2r_binary": result.chi2_binary / result.ndof,
         "ndof": result.ndof,
+        **joint_fit_json(result),
         "errors": _errors(c, result),
     }
 
@@ -205,7 +193,7 @@ def _posterior(report: SearchReport, posterior: Posterior) -> Json:
         "mode_method": posterior.mode_method,
         "probability_elsewhere": number(posterior.elsewhere),
         "upper_limit": upper_limit(report),
-        "prior": prior_json(posterior.prior, posterior.names[3:]),
+        "prior": prior_json(posterior.prior, posterior.names[posterior.prior.width :]),
     }
 
 
@@ -227,10 +215,12 @@ def _intervals(found: Posterior | GridPosterior, names: list[str]) -> Json:
 
 def prior_json(prior: Prior, nuisance: tuple[str, ...]) -> Json:
     """State a prior: ranges, forms, and the uniform ranges of the nuisance parameters."""
+    rate = prior.fastest_mas_yr
     return {
         "separation_mas": [prior.inner_mas, prior.outer_mas],
         "contrast": [prior.contrast_min, prior.contrast_max],
         "form": prior.description,
+        **({"rate_mas_yr": [-rate, rate]} if rate else {}),
     } | {name: list(range_) for name, range_ in zip(nuisance, prior.nuisance, strict=True)}
 
 
@@ -289,6 +279,14 @@ def _two(two: TwoCompanions, second: Significance | None) -> Json:
             for c in two.companions
         ],
     }
+
+
+def _limits(report: SearchReport) -> Json | None:
+    if report.limits is None:
+        return None
+    joint = report.result.likelihood.model.width > 3
+    companion = {"companion": "the same contrast in every band, at rest"} if joint else {}
+    return limits_json(report.limits) | companion
 
 
 def _calibration(report: SearchReport) -> Json | None:

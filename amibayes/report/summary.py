@@ -12,6 +12,7 @@ from amibayes.inference.posterior import Posterior
 from amibayes.inference.results import SearchResult
 from amibayes.inference.significance import LEAST_PROBABILITY, Significance
 from amibayes.job import SearchReport
+from amibayes.report.joint import joint_lines
 from amibayes.report.result import upper_limit
 
 EVEN = 0.5
@@ -41,7 +42,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"strength    delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
-    lines += _nuisance_lines(result)
+    lines += [*joint_lines(report), *_nuisance_lines(result)]
     lines += _noise_lines(report)
     if report.posterior is not None:
         lines += _posterior_lines(report.posterior)
@@ -94,7 +95,8 @@ def _power(probability: float) -> str:
 
 def _nuisance_lines(result: SearchResult) -> list[str]:
     lines = []
-    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
+    first = result.likelihood.model.width
+    for k, name in enumerate(result.likelihood.parameters[first:], start=first):
         label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
         error = np.sqrt(result.theta_covariance[k, k])
         lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")
@@ -109,7 +111,11 @@ def _noise_lines(report: SearchReport) -> list[str]:
     names = {"vis2": ("V2", 1.0), "closure_phase_rad": ("deg closure phase", np.degrees(1.0))}
     parts = []
     for name, noise in found.items():
-        label, unit = names[name]
+        if ":" in name and noise.probability_none > EVEN:
+            continue
+        kind, _, source = name.partition(":")
+        label, unit = names[kind]
+        label += f" of {Path(source).name}" if source else ""
         median, low, high = (unit * x for x in noise.interval())
         parts.append(
             f"{median:.2g} +{high - median:.1g} -{median - low:.1g} {label} "
