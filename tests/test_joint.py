@@ -28,9 +28,10 @@ from amibayes.inference.noise import ExtraNoise, FileNoise, add_noise, fit_noise
 from amibayes.inference.noise_marginal import files_share_errors, marginal_likelihood
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import default_prior
+from amibayes.inference.redraw import profiled
 from amibayes.inference.refine import Box, fit_single, refine, single_likelihood
 from amibayes.inference.search import resolution_mas, search
-from amibayes.inference.significance import bank_statistic, null_maxima, profiled, significance
+from amibayes.inference.significance import bank_statistic, null_maxima, significance
 from amibayes.observables import Observables, join
 from amibayes.synthetic import point_source
 from amibayes.units import MAS

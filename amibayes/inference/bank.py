@@ -18,6 +18,7 @@ from scipy.sparse import csr_array
 
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import disc
+from amibayes.inference.scan import Survey
 from amibayes.inference.waves import WIDTH, Waves
 from amibayes.units import MAS, FloatArray
 
@@ -92,39 +93,6 @@ def make_grid(inner_mas: float, outer_mas: float, step_mas: float) -> Grid:
         np.concatenate([columns, -columns]),
         np.concatenate([rows, -rows]),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Survey:
-    """What a scan of one data set found at every position.
-
-    Parameters
-    ----------
-    contrast, sigma : (n_positions,) float array
-        Best contrast, the same in every band and at rest, and its error.
-    gain : (n_positions,) float array
-        Largest gain in χ², for positive contrasts.
-    tail : (n_positions, width − 2) float array
-        Contrasts and rates that gain so much.
-    n_contrasts : int
-    """
-
-    contrast: FloatArray
-    sigma: FloatArray
-    gain: FloatArray
-    tail: FloatArray
-    n_contrasts: int = 1
-
-    @property
-    def contrasts(self) -> FloatArray:
-        """Contrasts of the largest gain, (n_positions, n_contrasts)."""
-        return self.tail[:, : self.n_contrasts]
-
-    def bounded(self, at: IntArray) -> FloatArray:
-        """Contrasts, cut off at 0 and 1, and rates at some positions."""
-        tail = self.tail[at]
-        tail[:, : self.n_contrasts] = np.clip(tail[:, : self.n_contrasts], 0.0, 1.0)
-        return tail
 
 
 class TemplateBank:

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.inference.bank import Grid, IntArray, MatchedFilter, Survey, TemplateBank
+from amibayes.inference.bank import Grid, IntArray, MatchedFilter, TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.positive import best_positive
+from amibayes.inference.scan import Survey
 from amibayes.units import MAS, FloatArray
 
 RATE_STEPS_PER_FRINGE = 4

@@ -10,6 +10,7 @@ set is one more matrix product, of the products of t's elements with the entries
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,8 +158,8 @@ def _search_each(
 
 def _scores(
     templates: NDArray[np.float32],
-    weighted: NDArray[np.float32],
-    entries: NDArray[np.float32],
+    weighted: NDArray[Any],
+    entries: NDArray[Any],
     whose: IntArray,
     pairs: tuple[IntArray, IntArray],
 ) -> NDArray[np.float32]:

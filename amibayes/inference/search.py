@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from amibayes.errors import DataError, UsageError
-from amibayes.inference.bank import Grid, Survey, make_grid
+from amibayes.inference.bank import Grid, make_grid
 from amibayes.inference.joint_bank import bank_of, rates_per_axis
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import Box, fit_single, global_check, refine, single_likelihood
 from amibayes.inference.results import Mode, SearchResult, companion_of
+from amibayes.inference.scan import Survey
 from amibayes.units import MAS, FloatArray
 
 IntArray = NDArray[np.intp]
