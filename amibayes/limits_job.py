@@ -23,8 +23,9 @@ from amibayes.job import SearchOptions
 from amibayes.mass_table import MassTable
 from amibayes.observables import Observables
 from amibayes.parallel import Executor, Journals, Progress
-from amibayes.pipeline import search_field, weigh
+from amibayes.pipeline import search_field
 from amibayes.preparing import Clock, Prepared, Stage, prepare
+from amibayes.weighing import weigh
 
 Kinds = tuple[str, ...]
 

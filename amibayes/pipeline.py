@@ -10,12 +10,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from amibayes.cautions import search_cautions
-from amibayes.inference.bank import TemplateBank
 from amibayes.inference.by_file import files_of
 from amibayes.inference.evidence import Evidence, weigh_models
 from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
 from amibayes.inference.joint import joint_likelihood
-from amibayes.inference.joint_bank import bank_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.limits import detection_limit
 from amibayes.inference.model import BinaryModel
@@ -30,8 +28,7 @@ from amibayes.inference.noise_marginal import (
 from amibayes.inference.posterior import Posterior, sample
 from amibayes.inference.priors import Prior, default_prior, edit_prior
 from amibayes.inference.refine import single_likelihood
-from amibayes.inference.results import SearchResult, judging
-from amibayes.inference.robust import Frame
+from amibayes.inference.results import SearchResult
 from amibayes.inference.robust_noise import student_likelihood
 from amibayes.inference.robust_search import search_robust
 from amibayes.inference.search import (
@@ -41,17 +38,11 @@ from amibayes.inference.search import (
     resolves_stars,
     search,
 )
-from amibayes.inference.significance import (
-    Significance,
-    bank_statistic,
-    significance,
-    statistic_field,
-)
 from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
-from amibayes.parallel import Executor, Journal, Progress
+from amibayes.parallel import Executor, Progress
 from amibayes.preparing import Clock, Stage, prepare
-from amibayes.units import FloatArray
+from amibayes.weighing import weigh, weigh_second
 
 MOST_NOISE_SAMPLES = 2000
 """Samples of the posterior that the noise is averaged over."""
@@ -335,77 +326,3 @@ def _counts(options: SearchOptions) -> tuple[int, ...]:
     if options.companions is None:
         return (0, 1) if options.posterior else ()
     return options.companions
-
-
-def weigh(
-    result: SearchResult,
-    options: SearchOptions,
-    rng: np.random.Generator,
-    executor: Executor | None,
-    progress: Progress | None,
-    journal: Journal | None = None,
-) -> Significance:
-    """Weigh the search; unless errors are to be trusted, by a statistic free of their scale.
-
-    Whether noise was added depends on the data, and a false companion can hide that it
-    should have been: a statistic that does not know the scale needs no such decision.
-    """
-    likelihood, frame = judging(result)
-    bank = bank_of(likelihood, result.grid, result.single_theta)
-    residuals = single_likelihood(likelihood).residuals(result.single_theta)
-    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, journal)
-    weight = run.judge(bank, residuals, options, rng)
-    field = statistic_field(bank, residuals[:, 0], free_scale=run.free_scale, frame=frame)
-    return replace(weight, field=field)
-
-
-def weigh_second(
-    result: SearchResult,
-    options: SearchOptions,
-    rng: np.random.Generator,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
-) -> Significance:
-    """Weigh what the first companion leaves: the chance that noise alone gives a second one.
-
-    All that the first companion can do by moving or brightening is projected out, of the
-    data and of the null sets.
-    """
-    likelihood, frame = judging(result)
-    bank = bank_of(likelihood, result.grid, result.single_theta, beside=result.theta)
-    residuals = likelihood.residuals(result.theta)
-    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, None)
-    return run.judge(bank, residuals, options, rng)
-
-
-@dataclass(frozen=True)
-class _Nulls:
-    """How null searches are run."""
-
-    frame: Frame | None
-    free_scale: bool
-    executor: Executor | None
-    progress: Progress | None
-    journal: Journal | None
-
-    def judge(
-        self,
-        bank: TemplateBank,
-        residuals: FloatArray,
-        options: SearchOptions,
-        rng: np.random.Generator,
-    ) -> Significance:
-        """Place the statistic of residuals (n_data, 1) among null searches."""
-        statistic = bank_statistic(bank, residuals, free_scale=self.free_scale, frame=self.frame)
-        return significance(
-            bank,
-            float(statistic[0]),
-            options.null_draws,
-            rng,
-            options.alpha,
-            free_scale=self.free_scale,
-            frame=self.frame,
-            executor=self.executor,
-            progress=self.progress,
-            journal=self.journal,
-        )

@@ -45,6 +45,7 @@ LAYERS = [
     "joining",
     "cautions",
     "preparing",
+    "weighing",
     "pipeline",
     "limits_job",
     "validation",

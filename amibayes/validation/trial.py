@@ -21,12 +21,13 @@ from amibayes.instrument import load_instrument
 from amibayes.job import SearchOptions
 from amibayes.observables import Observables
 from amibayes.parallel import child_seeds
-from amibayes.pipeline import search_field, weigh
+from amibayes.pipeline import search_field
 from amibayes.scene import Point, Scene
 from amibayes.simulation import Detector, Exposure, draw_maps, simulate
 from amibayes.spectrum import g2v
 from amibayes.units import MAS, FloatArray, position_angle_deg
 from amibayes.validation.plan import FIELD_MAS, MAGNITUDE, RANGES, Setting, ValidationPlan
+from amibayes.weighing import weigh
 
 RANKED = ("east_mas", "north_mas", "ln_contrast")
 """Quantities whose ranks must be uniform; the position angle is circular."""
