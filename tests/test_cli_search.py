@@ -53,7 +53,7 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> str:
 
 KEYS = {
     "amibayes", "seed", "inputs", "data", "fit", "significance", "modes", "posterior",
-    "calibration", "limits", "noise", "evidence", "warnings", "timing_s",
+    "calibration", "limits", "noise", "robust", "evidence", "warnings", "timing_s",
 }  # fmt: skip
 
 
