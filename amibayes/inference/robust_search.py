@@ -64,7 +64,7 @@ def search_robust(
             source=likelihood.observables.source,
             remedy="leave --robust out",
         )
-    work = _Work(likelihood, separation_mas, free_scale)
+    work = RobustFits(likelihood, separation_mas, free_scale)
     plain = search(likelihood, separation_mas)
     alone = single_likelihood(likelihood)
     starts = [
@@ -89,8 +89,16 @@ def _as_noise(frame: Frame, variance: FloatArray, scale: FloatArray) -> ExtraNoi
     return ExtraNoise(vis2, closure)
 
 
-class _Work:
-    """Alternates weights and fits."""
+class RobustFits:
+    """Weights and fits in turn.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the stated errors.
+    separation_mas : (inner, outer), optional
+    free_scale : bool
+    """
 
     def __init__(
         self,
@@ -114,30 +122,32 @@ class _Work:
         """Search, and again with new weights until the place holds."""
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MOST_SEARCHES):
-            result = search(self._weighted(stretch), self.field)
-            stretch = self._steps(result, stretch)
+            result = search(self.weighted(stretch), self.field)
+            grid = result.grid
+            box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
+            stretch, _ = self.steps(result.theta, box)
             moved = np.hypot(*(result.theta[:2] - place))
             place = result.theta[:2]
             if moved < SETTLED * resolution_mas(self.likelihood):
                 break
-        result = search(self._weighted(stretch), self.field)
+        result = search(self.weighted(stretch), self.field)
         _, weights, residuals, scale = self._stretch(self.likelihood.residuals(result.theta)[:, 0])
         return result, weights, residuals, scale
 
-    def _weighted(self, stretch: FloatArray) -> Likelihood:
+    def weighted(self, stretch: FloatArray) -> Likelihood:
+        """The Gaussian likelihood of stretched errors (n_data,)."""
         return Likelihood(reweighted(self.likelihood.observables, stretch), self.likelihood.model)
 
-    def _steps(self, result: SearchResult, stretch: FloatArray) -> FloatArray:
-        """Weights and fit in turn, near one place."""
-        grid, theta = result.grid, result.theta
-        box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
+    def steps(self, theta: FloatArray, box: Box) -> tuple[FloatArray, FloatArray]:
+        """Weights and fit in turn, near one place: stretch of the errors, and the fit."""
+        stretch = np.ones(self.likelihood.observables.covariance.size)
         for _ in range(MOST_STEPS):
             before = stretch
             stretch = self._stretch(self.likelihood.residuals(theta)[:, 0])[0]
+            theta = np.array(refine(self.weighted(stretch), theta, box, 0.0).theta)
             if np.abs(np.log(stretch / before)).max() < SETTLED:
                 break
-            theta = np.array(refine(self._weighted(stretch), theta, box, 0.0).theta)
-        return stretch
+        return stretch, theta
 
     def _stretch(self, white: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Stretch of the errors, weights, residuals and scales (n_data,) of whitened residuals."""
