@@ -54,6 +54,9 @@ LADDER = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 61)])
 
 HALVINGS = 40
 
+COARSE, FINE, NEGLIGIBLE = 81, 161, 30.0
+"""Nodes of the integrals over contrast, and how far in ln L from the best one nothing counts."""
+
 SPREAD = (0.16, 0.5, 0.84)
 """Quantiles over the position angle."""
 
@@ -229,17 +232,26 @@ def _excess(problem: _Problem) -> Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def _exact_posterior(problem: _Problem, places: FloatArray) -> FloatArray:
-    """Quantile of the contrast's posterior between 0 and 1, by the trapezoidal rule."""
-    nodes = np.linspace(0.0, 1.0, 20 * len(LADDER)) ** 2
-    r = problem.residuals[:, None]
-    log_like = np.array(
-        [
-            -0.5 * ((r - problem.signal(np.full(len(places), c), places)) ** 2).sum(axis=0)
-            for c in nodes
-        ]
-    )
+    """Quantile of the contrast's posterior between 0 and 1, by the trapezoidal rule.
+
+    A coarse ladder finds the range of contrasts that counts at every place, a fine one
+    integrates it.
+    """
+    coarse = np.linspace(0.0, 1.0, COARSE) ** 2
+    log_like = _log_likelihood(problem, np.tile(coarse[:, None], len(places)), places)
+    counts = log_like > log_like.max(axis=0) - NEGLIGIBLE
+    first, last = counts.argmax(axis=0), COARSE - 1 - counts[::-1].argmax(axis=0)
+    low, high = coarse[np.maximum(first - 1, 0)], coarse[np.minimum(last + 1, COARSE - 1)]
+    nodes = np.linspace(low, high, FINE)
+    log_like = _log_likelihood(problem, nodes, places)
     density = np.exp(log_like - log_like.max(axis=0))
-    mass = np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(nodes)[:, None], axis=0)
+    mass = np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(nodes, axis=0), axis=0)
     mass = np.vstack([np.zeros(len(places)), mass / mass[-1]])
     level = stats.norm.cdf(problem.sigmas)
-    return np.array([np.interp(level, column, nodes) for column in mass.T])
+    return np.array([np.interp(level, *pair) for pair in zip(mass.T, nodes.T, strict=True)])
+
+
+def _log_likelihood(problem: _Problem, contrast: FloatArray, places: FloatArray) -> FloatArray:
+    """Logarithm of the likelihood, but for a constant, of contrasts (k, n) at places (n, 2)."""
+    r = problem.residuals[:, None]
+    return np.array([-0.5 * ((r - problem.signal(c, places)) ** 2).sum(axis=0) for c in contrast])
