@@ -10,8 +10,12 @@ from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.posterior import Posterior, modes_to_sample
 from amibayes.inference.results import SearchResult
 from amibayes.inference.significance import Significance
+from amibayes.inference.whiteness import channel_correlation
 from amibayes.observables import Observables
 from amibayes.vetting import Vetting, doubts
+
+NOTABLE, SURE = 0.2, 5.0
+"""Correlation between channels that is worth a warning, and its size in chance errors."""
 
 MOST_NAMED = 3
 """Outliers that a warning names."""
@@ -115,6 +119,18 @@ def _joint_cautions(result: SearchResult) -> list[str]:
     return found
 
 
+def _correlated(result: SearchResult) -> list[str]:
+    """Say where channels err together: errors alone count them as independent."""
+    correlation, n_pairs = channel_correlation(result)
+    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
+        return []
+    return [
+        f"residuals of neighbouring channels are correlated by {correlation:.2f}, which the "
+        "covariance does not have: the false-alarm probabilities, of a second companion above "
+        "all, and the errors are smaller than they ought to be"
+    ]
+
+
 def search_cautions(
     observables: Observables,
     result: SearchResult,
@@ -139,6 +155,7 @@ def search_cautions(
             f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
         )
     found += _outliers(result)
+    found += _correlated(result)
     if posterior is not None and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:
