@@ -28,7 +28,7 @@ from amibayes.inference.noise import ExtraNoise, FileNoise, add_noise, fit_noise
 from amibayes.inference.noise_marginal import files_share_errors, marginal_likelihood
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import default_prior
-from amibayes.inference.redraw import profiled
+from amibayes.inference.redraw import _search_each, _without_nuisance, profiled, search_many
 from amibayes.inference.refine import Box, fit_single, refine, single_likelihood
 from amibayes.inference.search import resolution_mas, search
 from amibayes.inference.significance import bank_statistic, null_maxima, significance
@@ -519,3 +519,16 @@ def test_second_companion_with_contrasts_of_two_filters(rng) -> None:
     truth = [120.0, -90.0, 0.05, 0.04, -60.0, 200.0, 0.02, 0.03]
     errors = np.sqrt(np.diag(both.theta_covariance))
     assert np.abs((both.theta - truth) / errors).max() < 5.0
+
+
+@pytest.mark.parametrize("model", [BinaryModel(), BinaryModel(background="free")])
+def test_covariances_drawn_anew_search_all_bands(model, rng) -> None:
+    """With the unit matrix for every estimate the search of many is that of one covariance."""
+    data = join(NULLS["two filters"][0])
+    likelihood = joint_likelihood(Likelihood(data, model))
+    bank = bank_of(likelihood, make_grid(*FIELD, 60.0), np.zeros(model.n_nuisance))
+    noise = rng.standard_normal((bank.n_data, 5))
+    unit = np.broadcast_to(np.eye(bank.n_data), (5, bank.n_data, bank.n_data))
+    inverse = _without_nuisance(unit, bank.nuisance_basis)
+    found = _search_each(bank, noise, inverse, np.arange(5))
+    np.testing.assert_allclose(found.gain, search_many(bank, noise).gain, rtol=1e-4)
