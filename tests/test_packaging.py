@@ -54,7 +54,9 @@ def callables() -> Iterator[tuple[str, object]]:
                     yield f"{name}.{attribute}", function
 
 
-@pytest.mark.parametrize(("name", "function"), list(callables()), ids=lambda x: str(x)[:60])
+@pytest.mark.parametrize(
+    ("name", "function"), [pytest.param(*pair, id=pair[0]) for pair in callables()]
+)
 def test_every_public_argument_and_result_has_a_type(name: str, function: object) -> None:
     signature = inspect.signature(function)
     bare = [
