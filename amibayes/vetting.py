@@ -132,12 +132,13 @@ def vet(
         raise DataError("no calibrator given", remedy="give at least one")
     data = [c.unflagged() for c in calibrators]
     compare = not calibrated and len(data) > 1
-    agreement, dropped = _compared(data, alpha) if compare else ([None] * len(data), set())
+    leave_out = _LeaveOut(data)
+    agreement, dropped = _compared(leave_out, alpha) if compare else ([None] * len(data), set())
     streams = np.random.SeedSequence(seed).spawn(len(data))
     verdicts = []
     for k, stream in enumerate(streams):
-        others = [data[j] for j in range(len(data)) if j != k and j not in dropped]
-        left = _against(data[k], others) if compare and others else data[k]
+        others = [j for j in range(len(data)) if j != k and j not in dropped]
+        left = leave_out.rest(k, others) if compare and others else data[k]
         # Alone and uncalibrated, the instrument's own closure phases would pass for a companion.
         judged = left if calibrated or (compare and others) else None
         verdict = Vetted(
@@ -161,36 +162,55 @@ def _against(one: Observables, others: Sequence[Observables]) -> Observables:
     return calibrate(one, others, method=method, clip=None).observables.unflagged()
 
 
-def _compared(data: Sequence[Observables], alpha: float) -> tuple[list[float | None], set[int]]:
+class _LeaveOut:
+    """Each calibrator calibrated with some of the others: made once, however often asked for."""
+
+    def __init__(self, data: Sequence[Observables]) -> None:
+        self.data = data
+        self._made: dict[tuple[int, ...], Observables] = {}
+
+    def rest(self, one: int, others: Sequence[int]) -> Observables:
+        """What the others leave of one."""
+        key = (one, *others)
+        if key not in self._made:
+            self._made[key] = _against(self.data[one], [self.data[j] for j in others])
+        return self._made[key]
+
+    def agreement(self, one: int, others: Sequence[int]) -> float:
+        """Probability of `_chance` of one with the others."""
+        return _chance(self.rest(one, others), len(others))
+
+
+def _compared(leave_out: _LeaveOut, alpha: float) -> tuple[list[float | None], set[int]]:
     """Leave-one-out probabilities, the worst calibrator dropped before the rest are redone."""
+    data = leave_out.data
     probability: list[float | None] = [None] * len(data)
     dropped: set[int] = set()
     while len(data) - len(dropped) > 2:
         rest = [k for k in range(len(data)) if k not in dropped]
         for k in rest:
-            probability[k] = _agreement(data[k], [data[j] for j in rest if j != k])
+            probability[k] = leave_out.agreement(k, [j for j in rest if j != k])
         worst = min(rest, key=lambda k: probability[k] or 0.0)
         if (probability[worst] or 0.0) >= alpha:
             return probability, dropped
         dropped.add(worst)
     first, second = (k for k in range(len(data)) if k not in dropped)
-    probability[first] = probability[second] = _agreement(data[first], [data[second]])
+    probability[first] = probability[second] = leave_out.agreement(first, [second])
     return probability, dropped
 
 
-def _agreement(one: Observables, others: Sequence[Observables]) -> float:
+def _chance(left: Observables, n_others: int) -> float:
     """Probability of a χ² of the leave-one-out prediction as large as this.
 
     The scatter that the prediction allows for is known from n(J − 1) numbers of J others:
     the ratio follows F, not χ² (conservative where the stated errors dominate).
     """
-    left = _against(one, others)
     expected = np.concatenate([np.ones(left.n_vis2), np.zeros(left.n_closure_phases)])
     white = left.covariance.whiten(left.data - expected)
     chi2, n = float((white**2).sum()), left.n_independent
-    if len(others) == 1:
+    if n_others == 1:
         return chi2_survival(chi2, n, left.degrees_of_freedom)
-    known = min(left.degrees_of_freedom, n * (len(others) - 1))
+    known = min(left.degrees_of_freedom, n * (n_others - 1))
     return float(stats.f.sf(chi2 / n, n, known))
 
 

@@ -129,7 +129,7 @@ ESTIMATED = {
 @pytest.mark.parametrize("name", list(ESTIMATED))
 def test_probability_is_uniform_in_2000_null_sets_of_estimated_covariance(name: str) -> None:
     rng = np.random.default_rng([4, list(ESTIMATED).index(name)])
-    p = estimated(2000, rng, *ESTIMATED[name], step_mas=35.0)
+    p = estimated(2000, rng, *ESTIMATED[name], step_mas=47.0, draws=400)
     for column in p.T:
         check(column, 0.01)
 

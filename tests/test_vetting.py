@@ -16,7 +16,7 @@ from amibayes.errors import DataError
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.noise import ExtraNoise, add_noise
 from amibayes.oifits import write_oifits
-from amibayes.vetting import _agreement, vet
+from amibayes.vetting import _LeaveOut, vet
 
 FIELD = (50.0, 400.0)
 
@@ -71,7 +71,8 @@ def test_leave_one_out_probability_of_good_calibrators() -> None:
     p = []
     for _ in range(40):
         data = [calibrator(rng, name=f"c{k}", scatter=2.0) for k in range(3)]
-        p += [_agreement(data[k], data[:k] + data[k + 1 :]) for k in range(3)]
+        leave_out = _LeaveOut(data)
+        p += [leave_out.agreement(k, [j for j in range(3) if j != k]) for k in range(3)]
     low = int((np.array(p) < 0.05).sum())
     # The three probabilities of a set share data; their counts spread by up to √3 more.
     assert low <= stats.binom.isf(1e-4, 40, 0.05) * 3
