@@ -21,10 +21,11 @@ class Peer:
 
     name: str
     requirement: str
+    also: tuple[str, ...] = ()
 
 
 PEERS = (
-    Peer("amical", "amical"),
+    Peer("amical", "amical", ("threadpoolctl",)),
     Peer("virgil", "virgil-astro[pipeline]==0.4.1"),
     Peer("fouriever", "fouriever"),
     Peer("pmoired", "pmoired"),
@@ -42,7 +43,7 @@ def python_of(peer: Peer, folder: Path) -> Path:
     if not (home / "installed").exists():
         commands = [
             [sys.executable, "-m", "venv", str(home)],
-            [str(python), "-m", "pip", "install", "-q", peer.requirement],
+            [str(python), "-m", "pip", "install", "-q", peer.requirement, *peer.also],
         ]
         for command in commands:
             done = subprocess.run(command, capture_output=True, text=True)
@@ -61,8 +62,15 @@ def version_of(peer: Peer, folder: Path) -> str:
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def measure(peer: Peer, folder: Path, *arguments: str, timeout_s: float = 900) -> dict[str, float]:
-    """Run a peer's job and return its CPU seconds by name.
+def measure(peer: Peer, folder: Path, *arguments: str) -> dict[str, float]:
+    """Run a peer's job and return its CPU seconds by name; see `run`."""
+    said = run(peer, folder, str(JOBS / f"with_{peer.name}.py"), *arguments)
+    lines = [line.split() for line in said.splitlines() if line.startswith("cpu_s ")]
+    return {name: float(seconds) for _, name, seconds in lines}
+
+
+def run(peer: Peer, folder: Path, *arguments: str, timeout_s: float = 900) -> str:
+    """Run a peer's Python and return what it prints.
 
     Raises
     ------
@@ -70,7 +78,7 @@ def measure(peer: Peer, folder: Path, *arguments: str, timeout_s: float = 900) -
         Where it is not to be had, or fails.
     """
     python = python_of(peer, folder)
-    command = [str(python), str(JOBS / f"with_{peer.name}.py"), *arguments]
+    command = [str(python), *arguments]
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     environment |= {"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg", "JAX_PLATFORMS": "cpu"}
     environment["PATH"] = f"{python.parent}{os.pathsep}{environment['PATH']}"
@@ -83,5 +91,4 @@ def measure(peer: Peer, folder: Path, *arguments: str, timeout_s: float = 900) -
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise MissingPeerError(f"{peer.name} failed: {reason}")
-    lines = [line.split() for line in done.stdout.splitlines() if line.startswith("cpu_s ")]
-    return {name: float(seconds) for _, name, seconds in lines}
+    return done.stdout
