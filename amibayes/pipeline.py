@@ -15,7 +15,7 @@ from amibayes.inference.evidence import Evidence, weigh_models
 from amibayes.inference.grid_posterior import GridPosterior, affordable, grid_posterior
 from amibayes.inference.joint import joint_likelihood
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.limits import detection_limit
+from amibayes.inference.limits import DetectionLimit, detection_limit
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.multiplicity import TwoCompanions, search_second
 from amibayes.inference.noise import ExtraNoise, search_with_noise
@@ -38,6 +38,7 @@ from amibayes.inference.search import (
     resolves_stars,
     search,
 )
+from amibayes.inference.significance import Significance
 from amibayes.job import SearchOptions, SearchReport
 from amibayes.observables import Observables
 from amibayes.parallel import Executor, Progress
@@ -101,11 +102,7 @@ def search_companion(
         if options.null_draws:
             with clock.stage("significance"):
                 weight = weigh(result, options, streams[0], executor, progress)
-        if options.limits and weight is not None:
-            with clock.stage("limits"):
-                limits = detection_limit(
-                    result, weight, streams[2], executor=executor, progress=progress
-                )
+            limits = _limits(result, weight, options, streams[2], clock, (executor, progress))
         prior = _prior(result, options)
         two = _second(result, options, clock)
         if two is not None and weight is not None:
@@ -138,6 +135,20 @@ def search_companion(
         second,
         clock.seconds,
     )
+
+
+def _limits(
+    result: SearchResult,
+    weight: Significance,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    clock: Clock,
+    work: tuple[Executor | None, Progress | None],
+) -> DetectionLimit | None:
+    if not options.limits:
+        return None
+    with clock.stage("limits"):
+        return detection_limit(result, weight, rng, executor=work[0], progress=work[1])
 
 
 def _second(result: SearchResult, options: SearchOptions, clock: Clock) -> TwoCompanions | None:

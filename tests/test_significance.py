@@ -16,12 +16,11 @@ from amibayes.inference.significance import (
     Significance,
     bank_statistic,
     clopper_pearson,
-    extreme_value_survival,
     null_maxima,
-    pareto_survival,
     significance,
     statistic_field,
 )
+from amibayes.inference.tails import extreme_value_survival, pareto_survival
 
 
 def kernel_bank(step_mas: float) -> TemplateBank:

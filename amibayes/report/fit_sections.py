@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from amibayes.inference.significance import LEAST_PROBABILITY
+from amibayes.inference.tails import LEAST_PROBABILITY
 from amibayes.report.page import Column, Fact, Figure, Section, Table
 from amibayes.report.statement import false_alarm, field
 from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain

@@ -10,7 +10,8 @@ from amibayes.inference.evidence import Evidence
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.posterior import Posterior
 from amibayes.inference.results import SearchResult
-from amibayes.inference.significance import LEAST_PROBABILITY, Significance
+from amibayes.inference.significance import Significance
+from amibayes.inference.tails import LEAST_PROBABILITY
 from amibayes.job import SearchReport
 from amibayes.report.joint import joint_lines
 from amibayes.report.result import upper_limit
