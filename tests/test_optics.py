@@ -334,5 +334,8 @@ def test_fringe_field_is_the_fringe_model_anywhere(name: str, filter_name: str) 
         quick = field.basis(shape, centre).matrix
         # The interpolation is good to 1e-8.
         assert np.abs(quick - exact).max() < 2e-8 * exact.max()
+        coefficients = np.random.default_rng(5).standard_normal(exact.shape[1])
+        image = field.image(coefficients, shape, centre)
+        np.testing.assert_allclose(image.ravel(), quick @ coefficients, atol=1e-12 * image.max())
     again = fringe_field(load_instrument(name, filter=filter_name), channels, 49, rotation_rad=0.01)
     assert again is field

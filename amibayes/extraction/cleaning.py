@@ -17,7 +17,7 @@ from amibayes.units import FloatArray, read_only
 
 BoolArray = NDArray[np.bool_]
 
-SAMPLE = 100
+SAMPLE = 64
 """Integrations, evenly over the cube, that the reference is the median of."""
 
 MOST_BAD = 0.2

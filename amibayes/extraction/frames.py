@@ -169,13 +169,13 @@ def _chunks(file: Source) -> Iterator[Cube]:
 def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     view, reference = bench.view, bench.reference
     bad = cube.bad
-    images = np.where(bad, 0.0, cube.images)
+    images = np.where(bad, 0.0, cube.images) if bad.any() else cube.images
     bad |= reference.outliers(images, bad, bench.options.outlier)
     part = np.s_[:, view.rows, view.columns]
     n = cube.n_integrations
     pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
     never = bench.fit.weight == 0.0
-    count = missing[:, ~never].sum(axis=1)
+    count = np.count_nonzero(missing & ~never, axis=1)
     hopeless = count > MOST_BAD * missing.shape[1]
     missing = (missing | never) & ~hopeless[:, None]
     filled, coefficients, residual, extra_bad = _filled(bench, pixels, missing)

@@ -138,7 +138,7 @@ def _slope(view: View, fit: FringeFit, coefficients: FloatArray, name: str) -> F
     """Derivative (n_pixels,) of the fitted image by one of the parameters."""
     step = np.zeros(4)
     step[PARAMETERS.index(name)] = STEP
-    moved = _moved(view, step).basis().matrix @ coefficients[:-1]
+    moved = _moved(view, step).image(coefficients[:-1]).ravel()
     return np.asarray((moved - fit.design[:, :-1] @ coefficients[:-1]) / STEP)
 
 

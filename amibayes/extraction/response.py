@@ -22,10 +22,13 @@ from amibayes.response import EXPONENTS, IS_PHASE, powers_at
 from amibayes.units import FloatArray
 
 RADII, FARTHEST = 7, 0.95
-ANGLES = 7
+ANGLES, NEAR_ANGLES = 7, 9
 
 REACH_PX = (0.3, 1.5)
 """Pointing errors that the response to the star itself is measured for, at least and most."""
+
+COARSER = 0.75
+"""A response need not be known to better than the interpolation's 1e-6 at this sampling."""
 
 SMALLEST = 1e-3
 """Responses are not followed below this."""
@@ -51,7 +54,7 @@ def star_image(view: View) -> StarImage:
     instrument = view.instrument
     mask = instrument.mask.rotated(view.rotation_rad)
     shortest = float(view.channels.wavelength_m.min())
-    over = fine_sampling(instrument.pixel_scale_rad * mask.extent_m / shortest)
+    over = fine_sampling(COARSER * instrument.pixel_scale_rad * mask.extent_m / shortest)
     reach = FARTHEST * instrument.field_rad / instrument.pixel_scale_rad
     size = fine_size(max(view.shape), over, reach + max(abs(c) for c in view.centre_px))
     turned = instrument.with_mask(mask)
@@ -101,7 +104,7 @@ def pointing_response(star: StarImage, sampling: Sampling, shift_px: FloatArray)
     have none.
     """
     reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
-    angle = 2.0 * np.pi * np.arange(2 * ANGLES) / (2 * ANGLES)
+    angle = 2.0 * np.pi * np.arange(NEAR_ANGLES) / NEAR_ANGLES
     place = _places(reach * np.array([0.35, 0.75, 1.4]), angle)
     flux, samples = star.measured(sampling, place)
     turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)

@@ -11,7 +11,7 @@ from amibayes.cube import Cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import Channels, Instrument, load_instrument
-from amibayes.optics import FringeBasis, fringe_field, psf
+from amibayes.optics import FringeBasis, FringeField, fringe_field, psf
 from amibayes.spectrum import Blackbody
 from amibayes.units import FloatArray
 
@@ -68,11 +68,17 @@ class View:
 
     def basis(self) -> FringeBasis:
         """Make the fringe model of this image."""
+        return self._field().basis(self.shape, self.centre_px)
+
+    def image(self, coefficients: FloatArray) -> FloatArray:
+        """Image (n_y, n_x) of coefficients of the fringe model."""
+        return self._field().image(coefficients, self.shape, self.centre_px)
+
+    def _field(self) -> FringeField:
         reach = max(self.shape) + 2.0 * max(abs(c) for c in self.centre_px)
-        field = fringe_field(
+        return fringe_field(
             self.instrument, self.channels, int(np.ceil(reach)), rotation_rad=self.rotation_rad
         )
-        return field.basis(self.shape, self.centre_px)
 
     def axes_px(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates x (n_x,) and y (n_y,) of the pixels, from the star."""

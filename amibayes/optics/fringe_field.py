@@ -56,15 +56,37 @@ class FringeField:
         columns = np.concatenate([waves[:1].real, 2.0 * waves[1:].real, -2.0 * waves[1:].imag])
         return FringeBasis(columns.reshape(len(columns), -1).T, shape)
 
+    def image(
+        self, coefficients: FloatArray, shape: tuple[int, int], centre_px: tuple[float, float]
+    ) -> FloatArray:
+        """Sum (n_y, n_x) of the columns of `basis` with coefficients (1 + 2·n_baselines,)."""
+        n = len(self.hills) - 1
+        weight = np.concatenate(
+            [coefficients[:1], 2.0 * coefficients[1 : 1 + n] + 2j * coefficients[1 + n :]]
+        )
+        along_y, along_x = self._operators(shape, centre_px)
+        half = (along_y * weight[:, None, None]) @ self.hills
+        # Waves side by side: their sum is one product of real matrices.
+        left = np.concatenate([half.real, -half.imag]).swapaxes(0, 1).reshape(shape[0], -1)
+        right = np.concatenate([along_x.real, along_x.imag]).swapaxes(0, 1).reshape(shape[1], -1)
+        return np.asarray(left @ right.T)
+
     def waves(self, shape: tuple[int, int], centre_px: tuple[float, float]) -> ComplexArray:
         """Envelope and fringes averaged over the pixels, (1 + n_baselines, n_y, n_x)."""
+        along_y, along_x = self._operators(shape, centre_px)
+        return np.asarray(along_y @ self.hills @ along_x.swapaxes(1, 2))
+
+    def _operators(
+        self, shape: tuple[int, int], centre_px: tuple[float, float]
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Matrices along y and along x."""
         along_y, along_x = (
             self._operator(size, centre, frequency)
             for size, centre, frequency in zip(
                 shape, centre_px[::-1], self.frequency_px.T[::-1], strict=True
             )
         )
-        return np.asarray(along_y @ self.hills @ along_x.swapaxes(1, 2))
+        return along_y, along_x
 
     def _operator(self, n_pixels: int, centre_px: float, frequency: FloatArray) -> ComplexArray:
         """Matrices (n_waves, n_pixels, k) from the samples of a hill to pixels of the wave."""
