@@ -39,7 +39,7 @@ from amibayes.units import FloatArray
 MOST_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
-SMOOTH_SHARE, SMOOTH_FLOOR = 0.9, 0.01
+SMOOTH_SHARE, SMOOTH_FLOOR = 0.83, 0.01
 """How far the weights follow the envelope only, and its least value in units of its peak."""
 
 JITTER_SLACK = 0.01
