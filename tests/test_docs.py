@@ -70,6 +70,15 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+def test_every_page_stands_in_a_table_of_contents() -> None:
+    listed = {DOCS / "index.md"}
+    for page in PAGES:
+        for tree in re.findall(r"^```{toctree}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+            entries = [e for e in tree.split() if not e.startswith(":")]
+            listed |= {(page.parent / f"{entry}.md").resolve() for entry in entries}
+    assert not set(PAGES) - listed
+
+
 @pytest.mark.parametrize("page", [p for p in PAGES if "_generated/" in p.read_text()], ids=str)
 def test_pictures_are_those_that_a_script_makes(page: Path) -> None:
     scripts = {"tutorial": "tutorial.py", "gallery": "gallery.py", "statistics": "figures.py"}
