@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick", action="store_true", help="48 stars, two minutes at most (the default)"
     )
-    size.add_argument("--full", action="store_true", help="1440 stars, an hour of one core")
+    size.add_argument("--full", action="store_true", help="480 stars, twenty minutes of one core")
     common.add_seed_option(parser)
     common.add_parallel_options(parser)
     parser.add_argument(

@@ -71,7 +71,7 @@ FULL = ValidationPlan(
         Setting("F430M", 14, 40, 2),
         Setting("F480M", 19, 120, 1),
     ),
-    180,
-    900,
+    60,
+    300,
     2000,
 )
