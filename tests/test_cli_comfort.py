@@ -194,6 +194,7 @@ def test_a_missing_or_old_package_is_a_fault() -> None:
     assert numbers("") == ()
 
 
+@pytest.mark.slow
 def test_demo_runs_the_loop_and_finds_the_truth(tmp_path: Path, capsys) -> None:
     out = tmp_path / "demo"
     assert run("demo", "--out", str(out), "--json") == 0

@@ -115,9 +115,9 @@ def test_other_endings(error, said, monkeypatch, capsys) -> None:
     ("limit", "more", "file"),
     [
         (0, (), "posterior.h5"),
-        (200_000, (), "posterior.h5"),
+        pytest.param(200_000, (), "posterior.h5", marks=pytest.mark.slow),
         (30_000, ("--no-posterior",), ".png"),
-        (700_000, ("--no-posterior",), "report.html"),
+        pytest.param(700_000, ("--no-posterior",), "report.html", marks=pytest.mark.slow),
     ],
 )
 def test_a_full_disk(limit: int, more, file: str, target: Path, tmp_path: Path) -> None:
