@@ -463,6 +463,7 @@ def test_scatter_is_found_and_the_target_has_it_too(rng: np.random.Generator) ->
     assert weighted.observables.errors[0].mean() < found.observables.errors[0].mean()
 
 
+@pytest.mark.slow
 def test_dependence_on_charge_level(rng: np.random.Generator) -> None:
     """A response that grows with charge, and a target beyond the calibrators."""
     instrument = Instrument(rng, sigma=1e-3)

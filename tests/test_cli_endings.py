@@ -214,6 +214,7 @@ def test_a_run_that_is_stopped(number, workers, pause, target: Path, tmp_path: P
     whole(out)
 
 
+@pytest.mark.slow
 def test_two_runs_in_one_folder(target: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     first = start("search", target, *LONG, "--out", out)

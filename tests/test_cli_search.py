@@ -94,6 +94,7 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
     assert second["posterior"] is None
 
 
+@pytest.mark.slow
 def test_json_on_standard_output_is_the_file_and_the_seed_decides(target, tmp_path, capsys) -> None:
     words = (target, "--separation", "50:400", "--null-draws", 500, "--json", "--no-limits")
     results = []
@@ -203,6 +204,7 @@ def test_default_field_is_widened_to_a_companion_outside_it(data: Path, tmp_path
     assert result["fit"]["diameter_mas"] > 0.5
 
 
+@pytest.mark.slow
 def test_too_few_null_draws_say_nothing(target, tmp_path, capsys) -> None:
     words = (target, "--separation", "50:400", "--null-draws", 100, "--no-posterior", "--json")
     assert run(*words, "--out", tmp_path / "out") == 0
@@ -211,6 +213,7 @@ def test_too_few_null_draws_say_nothing(target, tmp_path, capsys) -> None:
     assert any("100 null draws cannot tell" in w for w in result["warnings"])
 
 
+@pytest.mark.slow
 def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     other = tmp_path / "other.oifits"
@@ -284,6 +287,7 @@ def test_a_field_that_leaves_the_companion_out_is_warned_of(
         assert float(beyond[0].split("near ")[1].split(" mas")[0]) == pytest.approx(133.1, abs=15)
 
 
+@pytest.mark.slow
 def test_noise_alone_is_no_reason_to_look_elsewhere(tmp_path, capsys) -> None:
     path = tmp_path / "none.oifits"
     for seed in range(5):

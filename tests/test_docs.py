@@ -97,6 +97,7 @@ def keys_of(content: object) -> set[str]:
     return set(content).union(*nested)
 
 
+@pytest.mark.slow
 def test_every_key_of_the_result_is_explained() -> None:
     data = ROOT / "examples" / "data"
     options = SearchOptions(null_draws=1000, separation_mas=(94.0, 200.0))

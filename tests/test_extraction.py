@@ -281,6 +281,7 @@ def test_one_and_two_integrations(niriss: Instrument) -> None:
     assert 0.7 < np.median(ratio) < 1.4
 
 
+@pytest.mark.slow
 def test_files_of_one_exposure_are_one(niriss: Instrument) -> None:
     images = with_photons(binary_images(niriss, jittered(12, 10), (0.0, 0.0), 0.0), 11)
     halves = [replace(cube_of(part, niriss)) for part in (images[:6], images[6:])]

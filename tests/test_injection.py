@@ -87,6 +87,7 @@ def test_injected_light_brings_its_noise_and_its_errors() -> None:
         star.with_companion(5000.0, 0.0, 0.1)
 
 
+@pytest.mark.slow
 def test_the_example_finds_more_the_brighter_they_are(capsys) -> None:
     shares = runpy.run_path(str(SCRIPT))["main"]()
     assert len(capsys.readouterr().out.strip().split("\n")) == 3

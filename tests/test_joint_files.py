@@ -100,6 +100,7 @@ def test_tied_contrast_and_summary(files, tmp_path) -> None:
     assert any("NIRISS_4.82um 0.0" in line and "--contrast tied" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_whole_joint_job_with_posterior_evidence_and_limits(files, tmp_path, capsys) -> None:
     words = (*files[:2], "--separation", "100:250", "--null-draws", "1000", "--json")
     assert run(*words, "--companions", "0,1,2", "--out", tmp_path / "a") == 0

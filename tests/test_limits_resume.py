@@ -94,6 +94,7 @@ def killed_and_resumed(target: Path, out: Path, kills: int, seed: int) -> dict[s
     return contents(out)
 
 
+@pytest.mark.slow
 def test_killed_twice_and_resumed_the_same_bytes(target, whole, tmp_path) -> None:
     assert killed_and_resumed(target, tmp_path / "out", 2, seed=1) == whole
 

@@ -72,6 +72,7 @@ def test_honest_errors_get_no_extra_noise() -> None:
     assert hits <= 4
 
 
+@pytest.mark.slow
 def test_search_of_noisy_data_has_a_reduced_chi2_of_one_and_fair_errors() -> None:
     """Pulls of 40 companions in data whose errors are four times too small; 5 sigma."""
     rng = np.random.default_rng(5)

@@ -105,26 +105,27 @@ def test_piece_that_kills_its_workers_is_one_line(
 
 
 class _Late:
-    """A future that ends just when the patience of one look does."""
+    """A future that is not there at the first look, or never because its piece failed."""
 
-    def __init__(self) -> None:
+    def __init__(self, status: str) -> None:
+        self.status = status
         self._looks = 0
 
-    def done(self) -> bool:
-        return self._looks > 0
-
-    def result(self, timeout: float | None) -> int:
+    def result(self, timeout: float) -> int:
         self._looks += 1
-        if timeout is not None:
-            raise TimeoutError
+        if self._looks == 1:
+            raise TimeoutError("not yet")
         return 7
 
 
-def test_piece_that_ends_when_patience_does_is_no_error() -> None:
+def test_a_timeout_of_the_piece_is_raised_and_one_of_ours_is_not() -> None:
     executor = object.__new__(DaskExecutor)
     executor._distributed = type("distributed", (), {"KilledWorker": RuntimeError})
     executor._alone = lambda since: None
-    assert executor._result(_Late()) == 7
+    assert executor._result(_Late("pending")) == 7
+    assert executor._result(_Late("finished")) == 7
+    with pytest.raises(TimeoutError, match="not yet"):
+        executor._result(_Late("error"))
 
 
 def test_scheduler_that_does_not_answer_is_one_line() -> None:

@@ -66,6 +66,7 @@ def search_chi2(data, companion) -> float:
     return float(Likelihood(data).chi2(theta)[0]) / (data.n_independent - 3)
 
 
+@pytest.mark.slow
 def test_pulls_of_200_binaries_are_standard_normal() -> None:
     """Mean 0 ± 1/√n, width 1 ± 1/√2n; bounds of 5 sigma, 1e-5 false failures for all."""
     n = 200

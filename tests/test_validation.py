@@ -165,6 +165,7 @@ def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
     assert not list(tmp_path.glob("*/piece-*.npz"))
 
 
+@pytest.mark.slow
 def test_command_writes_page_pictures_and_numbers(small, tmp_path, monkeypatch, capsys) -> None:
     import json
 

@@ -49,6 +49,7 @@ def test_companion_of_one_among_four_is_found_and_only_that_one_is_dropped(rng) 
     assert bad.companion.companion.separation_mas == pytest.approx(134.0, abs=15.0)
 
 
+@pytest.mark.slow
 def test_resolved_calibrator_is_named(rng) -> None:
     data = [calibrator(rng, name=f"good{k}") for k in range(3)]
     model = BinaryModel(diameter_mas=30.0)
@@ -112,6 +113,7 @@ def test_one_raw_calibrator_is_kept_unjudged_and_none_is_refused(rng) -> None:
         vet([])
 
 
+@pytest.mark.slow
 def test_search_drops_the_bad_calibrator_unless_told_not_to(rng, tmp_path: Path, capsys) -> None:
     target = tmp_path / "target.oifits"
     write_oifits(target, calibrator(rng, (0.0, 0.0, 0.0)))

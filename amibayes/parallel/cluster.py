@@ -93,18 +93,22 @@ class DaskExecutor:
 
     def _result(self, future: Any) -> Any:
         alone_since: float | None = None
+        look_s = 1.0
         while True:
-            settled = future.done()
+            # A finished piece whose worker is gone before its result was fetched is computed
+            # again, so that no look may last forever; but a long result has its time.
+            failed = future.status == "error"
             try:
-                return future.result(timeout=None if settled else 1.0)
+                return future.result(timeout=look_s)
             except TimeoutError:
-                if settled:  # the piece's own error, not our impatience
+                if failed:  # the piece's own error, not our impatience
                     raise
             except self._distributed.KilledWorker as error:
                 raise self._lost("a piece killed its worker again and again") from error
             except CancelledError as error:
                 raise self._lost("the dask scheduler went away") from error
             alone_since = self._alone(alone_since)
+            look_s = min(1.5 * look_s, PATIENCE_S)
 
     def _alone(self, since: float | None) -> float | None:
         """Give the time since which there is no worker; give up when it is too long."""
