@@ -16,8 +16,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from amibayes import __version__
 
 NEEDED = {
-    "numpy": "2.0", "scipy": "1.13", "astropy": "6.0", "emcee": "3.1.4", "nlopt": "2.7.1",
-    "corner": "2.2.2", "matplotlib": "3.9", "h5py": "3.10", "jinja2": "3.1", "tqdm": "4.66",
+    "numpy": "2.0", "scipy": "1.13", "astropy": "6.1", "emcee": "3.1.4", "nlopt": "2.8",
+    "corner": "2.2.2", "matplotlib": "3.9", "h5py": "3.11", "jinja2": "3.1", "tqdm": "4.66",
     "threadpoolctl": "3.2",
 }  # fmt: skip
 """Packages that amibayes needs, with the oldest version of each (a test holds it to pyproject)."""

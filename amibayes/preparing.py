@@ -51,15 +51,14 @@ class Prepared:
     ----------
     observables : Observables
         All targets together.
-    parts, references : tuple of Observables
-        Each target (by date, whatever the order given) and each calibrator as read.
+    references : tuple of Observables
+        Each calibrator as read.
     calibration : Calibration, optional
     vetting : Vetting, optional
     cautions : tuple of str
     """
 
     observables: Observables
-    parts: tuple[Observables, ...]
     references: tuple[Observables, ...] = ()
     calibration: Calibration | None = None
     vetting: Vetting | None = None
@@ -95,7 +94,7 @@ def prepare(
     )
     vetting, calibration, observables = _calibrated(parts, references, options, rng, clock)
     cautions = (*vetting_cautions(vetting), *joined)
-    return Prepared(observables, tuple(parts), tuple(references), calibration, vetting, cautions)
+    return Prepared(observables, tuple(references), calibration, vetting, cautions)
 
 
 def read(path: str | Path, options: SearchOptions) -> Observables:

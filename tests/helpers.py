@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
@@ -60,3 +61,13 @@ def simulated(
         vis2=replace(sheet.vis2, value=vis2),
         closure_phase=replace(sheet.closure_phase, value=closure + shift_closure),
     )
+
+
+def error_of(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a command left on standard error, with nothing on standard output."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.strip().split("\n")
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("amibayes")
+    return lines[0]

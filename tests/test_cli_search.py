@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from helpers import niriss, simulated
+from helpers import error_of, niriss, simulated
 
 from amibayes.cli import main
 from amibayes.oifits import read_oifits, write_oifits
@@ -40,15 +40,6 @@ def run(*words: object) -> int:
         return main(["search", *map(str, words)])
     except SystemExit as stop:
         return int(stop.code or 0)
-
-
-def error_of(capsys: pytest.CaptureFixture[str]) -> str:
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    lines = captured.err.strip().split("\n")
-    assert len(lines) == 1, captured.err
-    assert lines[0].startswith("amibayes")
-    return lines[0]
 
 
 KEYS = {

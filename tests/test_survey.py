@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
-from helpers import niriss, simulated
+from helpers import error_of, niriss, simulated
 from PIL import Image
 
 from amibayes.cli import main
@@ -29,15 +29,6 @@ def run(*words: object) -> int:
         return main(list(map(str, words)))
     except SystemExit as stop:
         return int(stop.code or 0)
-
-
-def error_of(capsys: pytest.CaptureFixture[str]) -> str:
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    lines = captured.err.strip().split("\n")
-    assert len(lines) == 1, captured.err
-    assert lines[0].startswith("amibayes")
-    return lines[0]
 
 
 @pytest.fixture

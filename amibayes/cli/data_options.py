@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from amibayes.cli import common
 from amibayes.errors import UsageError
@@ -115,15 +116,38 @@ def add_joint(group: argparse._ActionsContainer) -> None:
     )
 
 
-def refuse_idle_rate(arguments: argparse.Namespace) -> None:
-    """Refuse a largest rate without a motion.
+def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what `add_model`, `add_joint`, `add_data`, images and seed say to `SearchOptions`.
 
     Raises
     ------
     UsageError
+        For a largest rate without a motion, or a way to combine calibrators without any.
     """
     if arguments.fastest and not arguments.motion:
         raise UsageError("needs a motion", source="--fastest", remedy="give --motion")
+    if arguments.calibration and not arguments.cal:
+        raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
+    return {
+        "separation_mas": arguments.separation,
+        "diameter": arguments.diameter,
+        "background": arguments.background,
+        "smearing": arguments.smearing,
+        "closure_covariance": arguments.closure_covariance,
+        "calibration": arguments.calibration,
+        "clip": arguments.clip,
+        "keep_all": arguments.keep_all,
+        "insname": arguments.insname,
+        "target": arguments.target,
+        "contrast": arguments.contrast,
+        "motion": arguments.motion,
+        "fastest_mas_yr": arguments.fastest,
+        "extra_noise": arguments.extra_noise,
+        "robust": arguments.robust,
+        "file_noise": arguments.file_noise,
+        "seed": arguments.seed,
+        "images": common.image_options_of(arguments),
+    }
 
 
 def add_observables(

@@ -203,7 +203,6 @@ def _measure(
     content = limits_report_json(report, request)
     _write(report, content, folder)
     journals.remove()
-    _remove_if_empty(folder / JOURNAL)
     return content
 
 
@@ -218,38 +217,13 @@ def _write(report: LimitsReport, content: object, folder: Path) -> None:
     write_json(folder / RESULT, content)
 
 
-def _remove_if_empty(folder: Path) -> None:
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
-
-
 def _options(arguments: argparse.Namespace) -> LimitsOptions:
     from amibayes.job import SearchOptions
     from amibayes.limits_job import LimitsOptions
 
-    data_options.refuse_idle_rate(arguments)
-    if arguments.calibration and not arguments.cal:
-        raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
     search = SearchOptions(
-        separation_mas=arguments.separation,
-        diameter=arguments.diameter,
-        background=arguments.background,
-        smearing=arguments.smearing,
-        closure_covariance=arguments.closure_covariance,
-        calibration=arguments.calibration,
-        clip=arguments.clip,
-        keep_all=arguments.keep_all,
-        insname=arguments.insname,
-        target=arguments.target,
-        contrast=arguments.contrast,
-        motion=arguments.motion,
-        fastest_mas_yr=arguments.fastest,
-        extra_noise=arguments.extra_noise,
-        robust=arguments.robust,
-        file_noise=arguments.file_noise,
+        **data_options.search_settings(arguments),
         null_draws=_null_draws(arguments),
-        seed=arguments.seed,
-        images=common.image_options_of(arguments),
     )
     return LimitsOptions(
         search=search,

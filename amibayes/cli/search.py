@@ -160,35 +160,15 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
 def _options(arguments: argparse.Namespace) -> SearchOptions:
     from amibayes.job import SearchOptions
 
-    data_options.refuse_idle_rate(arguments)
-    if arguments.calibration and not arguments.cal:
-        raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
     return SearchOptions(
-        separation_mas=arguments.separation,
+        **data_options.search_settings(arguments),
         observables=arguments.observables,
-        diameter=arguments.diameter,
-        background=arguments.background,
-        smearing=arguments.smearing,
-        closure_covariance=arguments.closure_covariance,
-        calibration=arguments.calibration,
-        clip=arguments.clip,
-        keep_all=arguments.keep_all,
-        insname=arguments.insname,
-        target=arguments.target,
-        contrast=arguments.contrast,
-        motion=arguments.motion,
-        fastest_mas_yr=arguments.fastest,
-        extra_noise=arguments.extra_noise,
-        robust=arguments.robust,
-        file_noise=arguments.file_noise,
         null_draws=arguments.null_draws,
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,
         companions=arguments.companions,
         evidence_method=arguments.evidence_method,
         prior=tuple(arguments.prior),
-        seed=arguments.seed,
-        images=common.image_options_of(arguments),
     )
 
 

@@ -90,8 +90,6 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
                 take(path, shutter, executor, program.history, told, journals)
             done.append(described(shot, shutter, path))
     journals.remove()
-    if not any((folder / JOURNAL).iterdir()):
-        (folder / JOURNAL).rmdir()
     return done
 
 

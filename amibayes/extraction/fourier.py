@@ -185,15 +185,8 @@ def _matched(view: View, patches: _Patches, level: _Levels, basis: FloatArray) -
     matrix = np.column_stack([level.flux, operator.real, operator.imag])
     seen = basis.T @ matrix
     scale = np.abs(seen).max(axis=0)
-    return Sampling(
-        np.linalg.solve((seen / scale).T, (matrix / scale).T).T,
-        np.arange(n),
-        np.ones(n),
-        mask.triangle_baselines,
-        np.arange(len(mask.triangles)),
-        view.frequency_px,
-        np.ones(n, dtype=complex),
-    )
+    alone = np.linalg.solve((seen / scale).T, (matrix / scale).T).T
+    return Sampling.one_each(alone, mask, view.frequency_px)
 
 
 def _own(patches: _Patches, level: _Levels, basis: FloatArray) -> ComplexArray:

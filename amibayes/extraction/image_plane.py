@@ -125,16 +125,7 @@ def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> Fri
 def fringe_sampling(fit: FringeFit, view: View) -> Sampling:
     """Coefficients of the fit as flux and one complex sample per baseline."""
     mask = view.instrument.mask
-    n = mask.n_baselines
-    return Sampling(
-        fit.inverse[:, : 1 + 2 * n],
-        np.arange(n),
-        np.ones(n),
-        mask.triangle_baselines,
-        np.arange(len(mask.triangles)),
-        view.frequency_px,
-        np.ones(n, dtype=complex),
-    )
+    return Sampling.one_each(fit.inverse[:, : 1 + 2 * mask.n_baselines], mask, view.frequency_px)
 
 
 def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None) -> FloatArray:

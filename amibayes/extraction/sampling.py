@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.instrument import Mask
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray, read_only
 
@@ -55,6 +56,20 @@ class Sampling:
     def __post_init__(self) -> None:
         for name in ("matrix", "weight", "frequency_px"):
             read_only(self, name)
+
+    @classmethod
+    def one_each(cls, matrix: FloatArray, mask: Mask, frequency_px: FloatArray) -> Sampling:
+        """Sampling of one complex sample per baseline, which a point source makes 1."""
+        n = mask.n_baselines
+        return cls(
+            matrix,
+            np.arange(n),
+            np.ones(n),
+            mask.triangle_baselines,
+            np.arange(len(mask.triangles)),
+            frequency_px,
+            np.ones(n, dtype=complex),
+        )
 
     @property
     def n_samples(self) -> int:

@@ -70,9 +70,7 @@ class Journal:
 
     def remove(self) -> None:
         """Forget all pieces of this job; a folder of journals that is empty then goes too."""
-        shutil.rmtree(self.path, ignore_errors=True)
-        with suppress(OSError):
-            self.path.parent.rmdir()
+        _forget(self.path)
 
     def _file(self, index: int) -> Path:
         return self.path / f"piece-{index:06d}.npz"
@@ -102,8 +100,14 @@ class Journals:
         return Journals(self.path, part, resume=self._resume)
 
     def remove(self) -> None:
-        """Forget all jobs of this run."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Forget all jobs of this run; a folder of journals that is empty then goes too."""
+        _forget(self.path)
+
+
+def _forget(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    with suppress(OSError):
+        path.parent.rmdir()
 
 
 def digest(*inputs: Any) -> str:
