@@ -90,72 +90,145 @@ def search_companion(
         Where the request makes no sense.
     """
     options = options or SearchOptions()
-    streams = [np.random.default_rng(k) for k in np.random.SeedSequence(options.seed).spawn(6)]
-    clock = Clock(announce)
-    weight, second, posterior, limits = None, None, None, None
+    run = _Run(options, Clock(announce), _streams(options.seed), executor, progress, chain, resume)
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
-        ready = prepare(targets, calibrators, options, streams[3], clock)
-        observables = ready.observables
-        with clock.stage("search"):
-            result, noise, widened = search_field(observables, options)
-        if options.null_draws:
-            with clock.stage("significance"):
-                weight = weigh(result, options, streams[0], executor, progress)
-            limits = _limits(result, weight, options, streams[2], clock, (executor, progress))
+        return run.report(targets, calibrators)
+
+
+def _streams(seed: int) -> dict[str, np.random.Generator]:
+    """Independent random numbers for every stage that draws some."""
+    stages = ("significance", "posterior", "limits", "calibration", "evidence", "second")
+    seeds = np.random.SeedSequence(seed).spawn(len(stages))
+    return {s: np.random.default_rng(k) for s, k in zip(stages, seeds, strict=True)}
+
+
+@dataclass(frozen=True)
+class _Run:
+    """One run of the main job: what all of its stages share, and the stages in their order."""
+
+    options: SearchOptions
+    clock: Clock
+    streams: dict[str, np.random.Generator]
+    executor: Executor | None
+    progress: Progress | None
+    chain: str | Path | None
+    resume: bool
+
+    def report(
+        self, targets: Sequence[str | Path], calibrators: Sequence[str | Path]
+    ) -> SearchReport:
+        """Tell the whole story, from the files to the evidence."""
+        options = self.options
+        ready = prepare(targets, calibrators, options, self.streams["calibration"], self.clock)
+        with self.clock.stage("search"):
+            result, noise, widened = search_field(ready.observables, options)
+        weight = self.weighed(result)
+        limits = self.limits(result, weight)
         prior = _prior(result, options)
-        two = _second(result, options, clock)
-        if two is not None and weight is not None:
-            with clock.stage("significance of the second"):
-                second = weigh_second(result, options, streams[5], executor, progress)
-        averaged, two = noise_averaged(result, two, observables, options)
-        grid = _integrated(averaged, prior, options, clock)
-        if options.posterior:
-            onward = _Chain(chain, resume, progress)
-            posterior = _sampled(averaged, prior, grid, streams[1], onward, clock)
-        evidence = _compared(averaged, two, prior, grid, options, streams[4], clock)
-    cautions = search_cautions(observables, result, noise, weight, posterior)
-    return SearchReport(
-        options,
-        tuple(str(p) for p in targets),
-        tuple(str(p) for p in calibrators),
-        observables,
-        ready.calibration,
-        ready.references,
-        ready.vetting,
-        result,
-        noise,
-        weight,
-        posterior,
-        limits,
-        (*ready.cautions, *widened, *cautions),
-        grid,
-        evidence,
-        _noise_posterior(averaged, posterior),
-        second,
-        clock.seconds,
-    )
+        two, second = self.second(result)
+        averaged, two = noise_averaged(result, two, ready.observables, options)
+        grid = self.integrated(averaged, prior)
+        posterior = self.sampled(averaged, prior, grid)
+        evidence = self.compared(averaged, two, prior, grid)
+        cautions = search_cautions(ready.observables, result, noise, weight, posterior)
+        return SearchReport(
+            options=options,
+            targets=tuple(str(p) for p in targets),
+            calibrators=tuple(str(p) for p in calibrators),
+            observables=ready.observables,
+            calibration=ready.calibration,
+            references=ready.references,
+            vetting=ready.vetting,
+            result=result,
+            noise=noise,
+            significance=weight,
+            posterior=posterior,
+            limits=limits,
+            warnings=(*ready.cautions, *widened, *cautions),
+            grid=grid,
+            evidence=evidence,
+            noise_posterior=_noise_posterior(averaged, posterior),
+            second_significance=second,
+            timing_s=self.clock.seconds,
+        )
 
+    def weighed(self, result: SearchResult) -> Significance | None:
+        """Weigh the best companion against noise; None without null draws."""
+        if not self.options.null_draws:
+            return None
+        with self.clock.stage("significance"):
+            rng = self.streams["significance"]
+            return weigh(result, self.options, rng, self.executor, self.progress)
 
-def _limits(
-    result: SearchResult,
-    weight: Significance,
-    options: SearchOptions,
-    rng: np.random.Generator,
-    clock: Clock,
-    work: tuple[Executor | None, Progress | None],
-) -> DetectionLimit | None:
-    if not options.limits:
-        return None
-    with clock.stage("limits"):
-        return detection_limit(result, weight, rng, executor=work[0], progress=work[1])
+    def limits(self, result: SearchResult, weight: Significance | None) -> DetectionLimit | None:
+        """Measure the detection limits; None where unwanted or without null draws."""
+        if weight is None or not self.options.limits:
+            return None
+        with self.clock.stage("limits"):
+            rng = self.streams["limits"]
+            return detection_limit(
+                result, weight, rng, executor=self.executor, progress=self.progress
+            )
 
+    def second(self, result: SearchResult) -> tuple[TwoCompanions | None, Significance | None]:
+        """Search for a second companion where two are to be compared, and weigh it."""
+        if 2 not in _counts(self.options):
+            return None, None
+        with self.clock.stage("second companion"):
+            two = search_second(result)
+        if not self.options.null_draws:
+            return two, None
+        with self.clock.stage("significance of the second"):
+            rng = self.streams["second"]
+            return two, weigh_second(result, self.options, rng, self.executor, self.progress)
 
-def _second(result: SearchResult, options: SearchOptions, clock: Clock) -> TwoCompanions | None:
-    if 2 not in _counts(options):
-        return None
-    with clock.stage("second companion"):
-        return search_second(result)
+    def integrated(self, result: SearchResult, prior: Prior) -> GridPosterior | None:
+        """Integrate the posterior over a grid where something needs it and it is cheap enough."""
+        wanted = self.options.posterior or _counts(self.options)
+        if not wanted or not affordable(result.likelihood, prior):
+            return None
+        with self.clock.stage("integrate"):
+            return grid_posterior(result.likelihood, prior)
+
+    def sampled(
+        self, result: SearchResult, prior: Prior, grid: GridPosterior | None
+    ) -> Posterior | None:
+        """Sample the posterior; None where it is not wanted."""
+        if not self.options.posterior:
+            return None
+        with self.clock.stage("posterior"):
+            return sample(
+                result,
+                prior,
+                self.streams["posterior"],
+                path=self.chain,
+                resume=self.resume,
+                grid=grid,
+                progress=self.progress,
+            )
+
+    def compared(
+        self,
+        result: SearchResult,
+        two: TwoCompanions | None,
+        prior: Prior,
+        grid: GridPosterior | None,
+    ) -> Evidence | None:
+        """Weigh the asked numbers of companions against each other."""
+        counts = _counts(self.options)
+        if not counts:
+            return None
+        with self.clock.stage("evidence"):
+            return weigh_models(
+                result,
+                prior,
+                self.streams["evidence"],
+                companions=counts,
+                grid=grid,
+                two=two,
+                method=self.options.evidence_method,
+            )
 
 
 def noise_averaged(
@@ -202,35 +275,6 @@ def _noise_posterior(
     if posterior is None or not isinstance(averaged.likelihood, MarginalLikelihood):
         return None
     return averaged.likelihood.noise_posterior(posterior.samples[:MOST_NOISE_SAMPLES])
-
-
-@dataclass(frozen=True)
-class _Chain:
-    """Where the chain of a posterior is kept, and who is told how far it is."""
-
-    path: str | Path | None
-    resume: bool
-    progress: Progress | None
-
-
-def _sampled(
-    result: SearchResult,
-    prior: Prior,
-    grid: GridPosterior | None,
-    rng: np.random.Generator,
-    chain: _Chain,
-    clock: Clock,
-) -> Posterior:
-    with clock.stage("posterior"):
-        return sample(
-            result,
-            prior,
-            rng,
-            path=chain.path,
-            resume=chain.resume,
-            grid=grid,
-            progress=chain.progress,
-        )
 
 
 def search_field(
@@ -294,42 +338,6 @@ def _prior(result: SearchResult, options: SearchOptions) -> Prior:
     likelihood = result.likelihood
     prior = default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas)
     return edit_prior(prior, options.prior, single_likelihood(likelihood).parameters)
-
-
-def _integrated(
-    result: SearchResult, prior: Prior, options: SearchOptions, clock: Clock
-) -> GridPosterior | None:
-    """Integrate the posterior over a grid where something needs it and it is cheap enough."""
-    wanted = options.posterior or _counts(options)
-    if not wanted or not affordable(result.likelihood, prior):
-        return None
-    with clock.stage("integrate"):
-        return grid_posterior(result.likelihood, prior)
-
-
-def _compared(
-    result: SearchResult,
-    two: TwoCompanions | None,
-    prior: Prior,
-    grid: GridPosterior | None,
-    options: SearchOptions,
-    rng: np.random.Generator,
-    clock: Clock,
-) -> Evidence | None:
-    """Weigh the asked numbers of companions against each other."""
-    counts = _counts(options)
-    if not counts:
-        return None
-    with clock.stage("evidence"):
-        return weigh_models(
-            result,
-            prior,
-            rng,
-            companions=counts,
-            grid=grid,
-            two=two,
-            method=options.evidence_method,
-        )
 
 
 def _counts(options: SearchOptions) -> tuple[int, ...]:

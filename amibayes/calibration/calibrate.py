@@ -7,29 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array, triu
 
-from amibayes.calibration.freedom import calibrated_freedom, response_freedom
+from amibayes.calibration.applying import apply_response
+from amibayes.calibration.freedom import response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, foreign, keys_of
 from amibayes.calibration.transfer import (
     Diameter,
     Transfer,
     on_one_branch,
-    sparse_covariance,
     transfer_of,
-    wrapped,
 )
 from amibayes.calibration.weighted import Response, clipped, weighted_response
 from amibayes.errors import DataError
-from amibayes.observables import BoolArray, CovarianceKind, Observables, join
-from amibayes.oifits.correlations import Pairs, given_covariance
+from amibayes.observables import Observables, join
 from amibayes.units import FloatArray
 
 Method = Literal["hierarchical", "weighted"]
-
-FAINTEST = 3.0
-"""A calibrator's V² below this many of its errors divides nothing: the ratio has no moments."""
 
 
 @dataclass(frozen=True)
@@ -151,25 +145,20 @@ def calibrate(
         Where calibrators are none, too few, the target itself, or have nothing in common.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
-    calibrators = list(calibrators)
-    chosen = _method(method, parts, calibrators)
+    chosen = _method(method, parts, calibrators := list(calibrators))
     _refuse_same(parts, calibrators)
     target = join(parts)
     keys = keys_of(target, window_days)
-    diameters = _diameters(diameters_mas, calibrators)
-    seen = [transfer_of(c, keys, d) for c, d in zip(calibrators, diameters, strict=True)]
+    seen = _transfers(calibrators, keys, diameters_mas)
     serving = _serving(target, calibrators, seen, chosen)
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
-    kept = on_one_branch([seen[j] for j in serving], keys.n_vis2)
-    kept = kept if clip is None else clipped(kept, keys, clip)
-    notes = tuple(n for j in serving if (n := foreign(calibrators[j], keys)))
-    if chosen == "weighted":
-        response = weighted_response(kept, keys)
-    else:
-        response = hierarchical_response(kept, keys, rng or np.random.default_rng(1), covariate)
-    response = replace(response, freedom=response_freedom([calibrators[j] for j in serving], kept))
+    used = [calibrators[j] for j in serving]
+    kept = _consistent([seen[j] for j in serving], keys, clip)
+    response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate)
+    response = replace(response, freedom=response_freedom(used, kept))
+    notes = tuple(note for calibrator in used if (note := foreign(calibrator, keys)))
     return Calibration(
-        _calibrated(target, keys, response, calibrators, notes),
+        apply_response(target, keys, response, calibrators, notes),
         chosen,
         _uses(calibrators, seen, dict(zip(serving, kept, strict=True))),
         *_tau(response),
@@ -207,6 +196,34 @@ def _refuse_same(parts: list[Observables], calibrators: list[Observables]) -> No
                     remedy="give every observation once",
                 )
         before.append((calibrator, "another calibrator"))
+
+
+def _transfers(
+    calibrators: list[Observables],
+    keys: Keys,
+    diameters_mas: Sequence[float | Diameter] | None,
+) -> list[Transfer]:
+    """What each calibrator, freed of its disc, says of the response."""
+    diameters = _diameters(diameters_mas, calibrators)
+    return [transfer_of(c, keys, d) for c, d in zip(calibrators, diameters, strict=True)]
+
+
+def _consistent(serving: list[Transfer], keys: Keys, clip: float | None) -> list[Transfer]:
+    """Calibrators with closure phases on one branch, without what stands off the others'."""
+    kept = on_one_branch(serving, keys.n_vis2)
+    return kept if clip is None else clipped(kept, keys, clip)
+
+
+def _response(
+    method: Method,
+    kept: list[Transfer],
+    keys: Keys,
+    rng: np.random.Generator,
+    covariate: FloatArray | None,
+) -> Response:
+    if method == "weighted":
+        return weighted_response(kept, keys)
+    return hierarchical_response(kept, keys, rng, covariate)
 
 
 def _diameters(
@@ -275,108 +292,6 @@ def _covariate(
             remedy="leave the charge levels out",
         )
     return np.asarray(covariate / np.abs(covariate).max())
-
-
-def _calibrated(
-    target: Observables,
-    keys: Keys,
-    response: Response,
-    calibrators: list[Observables],
-    notes: tuple[str, ...],
-) -> Observables:
-    """Apply the response to the target."""
-    error = np.sqrt(response.covariance.diagonal())
-    usable = response.known.copy()
-    usable[: keys.n_vis2] &= (response.value > FAINTEST * error)[: keys.n_vis2]
-    keep = usable[keys.key]
-    if not keep.any():
-        raise DataError(
-            "nothing is left: the V² of the calibrators are lost in their errors",
-            source=target.source,
-            remedy="use brighter calibrators",
-        )
-    used = target.select(*_on_entries(target, keep)).unflagged()
-    key, sign = keys.key[keep], keys.sign[keep]
-    value, target_slope, response_slope = _values(used, key, sign, response)
-    spread = coo_array((response_slope, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
-    own = diags_array(target_slope)
-    by_target = csr_array(own @ sparse_covariance(used.covariance) @ own)
-    by_response = csr_array(spread @ response.covariance @ spread.T)
-    kind = _kind(target, calibrators, keys)
-    made = _rebuilt(target, keep, value, csr_array(by_target + by_response), kind, keys, notes)
-    freedom = calibrated_freedom(
-        made.covariance, by_target, used.freedom, by_response, response.freedom
-    )
-    return replace(made, freedom=freedom)
-
-
-def _values(
-    used: Observables, key: np.ndarray, sign: np.ndarray, response: Response
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Calibrated data and their derivatives by the target's datum and by the response."""
-    n, data, m = used.n_vis2, used.data, response.value[key]
-    value = np.concatenate([data[:n] / m[:n], wrapped(data[n:] - (sign * m)[n:])])
-    by_target, by_response = np.ones(len(data)), -sign.astype(float)
-    by_target[:n] = 1.0 / m[:n]
-    by_response[:n] = -data[:n] / m[:n] ** 2
-    return value, by_target, by_response
-
-
-def _on_entries(target: Observables, keep: BoolArray) -> tuple[BoolArray, BoolArray]:
-    """A mask of the unflagged data as masks of all V² and closure phases."""
-    vis2, closure = ~target.vis2.flag, ~target.closure_phase.flag
-    vis2[vis2] = keep[: target.n_vis2]
-    closure[closure] = keep[target.n_vis2 :]
-    return vis2, closure
-
-
-def _rebuilt(
-    target: Observables,
-    keep: BoolArray,
-    value: FloatArray,
-    covariance: csr_array,
-    kind: CovarianceKind,
-    keys: Keys,
-    notes: tuple[str, ...],
-) -> Observables:
-    """The target with calibrated values; what could not be calibrated is flagged."""
-    vis2_kept, closure_kept = _on_entries(target, keep)
-    vis2, closure = target.vis2.value.copy(), target.closure_phase.value.copy()
-    n = int(vis2_kept.sum())
-    vis2[vis2_kept], closure[closure_kept] = value[:n], value[n:]
-    new_vis2 = replace(target.vis2, value=vis2, flag=~vis2_kept)
-    new_closure = replace(target.closure_phase, value=closure, flag=~closure_kept)
-    upper = triu(covariance, 1).tocoo()
-    used = upper.data != 0
-    pairs = Pairs(
-        upper.row[used].astype(np.intp), upper.col[used].astype(np.intp), upper.data[used]
-    )
-    everywhere = np.ones(len(value), dtype=bool)
-    lost = int((~keep).sum())
-    notes = (*notes, *((f"{lost} value(s) without calibrator flagged",) if lost else ()))
-    return replace(
-        target,
-        vis2=new_vis2,
-        closure_phase=new_closure,
-        covariance=given_covariance(
-            covariance.diagonal(),
-            pairs,
-            new_closure.select(closure_kept),
-            covered=everywhere,
-            independent=everywhere & keys.independent,
-        ),
-        covariance_kind=kind,
-        notes=(*target.notes, *notes),
-    )
-
-
-def _kind(target: Observables, calibrators: list[Observables], keys: Keys) -> CovarianceKind:
-    """That of the least certain part; independent errors only where they were asked for."""
-    if keys.independent:
-        return "diagonal"
-    kinds: list[CovarianceKind] = ["assumed", "estimated", "given"]
-    found = [o.covariance_kind for o in (target, *calibrators)]
-    return min([k for k in found if k in kinds] or ["assumed"], key=kinds.index)
 
 
 def _tau(response: Response) -> tuple[float | None, float | None]:

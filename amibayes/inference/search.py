@@ -148,38 +148,21 @@ def search(
     UsageError
         Where the annulus holds no position.
     """
-    if likelihood.n_independent <= len(likelihood.parameters):
-        raise DataError(
-            f"holds {likelihood.n_independent} independent data for "
-            f"{len(likelihood.parameters)} parameters",
-            source=likelihood.observables.source,
-            remedy="free fewer parameters or give more data",
-        )
+    _refuse_underdetermined(likelihood)
     inner, outer = separation_mas or default_separation(likelihood)
-    fringe = resolution_mas(likelihood)
-    step = fringe / GRID_STEPS_PER_FRINGE
-    per_place = rates_per_axis(likelihood)
-    _refuse_huge(inner, outer, step / per_place, likelihood.observables.source)
-    grid = make_grid(inner, outer, step)
-    if not len(grid):
-        raise UsageError(
-            f"no position between {inner:g} and {outer:g} mas on a grid of {grid.step_mas:.3g} mas",
-            source="--separation",
-            remedy="widen the range",
-        )
+    box = Box(inner, outer, resolution_mas(likelihood))
+    grid = _grid(likelihood, box)
     single, deviance_single = fit_single(likelihood)
     bank = bank_of(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
-    box = Box(inner, outer, fringe)
     seeds = _seeds(likelihood, grid, survey, single, box)
     found = [refine(likelihood, theta, box, deviance_single) for theta in seeds]
     check = global_check(likelihood, bank, box, single, deviance_single)
-    modes, aliases = innermost_first(likelihood, distinct_modes([*found, check], fringe), single)
+    every = distinct_modes([*found, check], box.fringe_mas)
+    modes, aliases = innermost_first(likelihood, every, single)
     theta = np.array(modes[0].theta)
-    # Without a companion there is nothing whose errors could be told.
-    absent = not (theta[likelihood.model.contrast_columns] > 0.0).any()
-    covariance = np.full((len(theta),) * 2, np.nan) if absent else likelihood.errors(theta)
+    covariance = _errors(likelihood, theta)
     return SearchResult(
         likelihood=likelihood,
         companion=companion_of(theta, covariance),
@@ -197,6 +180,39 @@ def search(
         warnings=_doubts(modes, aliases, found, check),
         joint_gain=None if likelihood.model.width == 3 else survey.gain,
     )
+
+
+def _refuse_underdetermined(likelihood: Likelihood) -> None:
+    if likelihood.n_independent <= len(likelihood.parameters):
+        raise DataError(
+            f"holds {likelihood.n_independent} independent data for "
+            f"{len(likelihood.parameters)} parameters",
+            source=likelihood.observables.source,
+            remedy="free fewer parameters or give more data",
+        )
+
+
+def _grid(likelihood: Likelihood, box: Box) -> Grid:
+    """Positions of the field, `GRID_STEPS_PER_FRINGE` per fringe."""
+    step = box.fringe_mas / GRID_STEPS_PER_FRINGE
+    finest = step / rates_per_axis(likelihood)
+    _refuse_huge(box.inner_mas, box.outer_mas, finest, likelihood.observables.source)
+    grid = make_grid(box.inner_mas, box.outer_mas, step)
+    if not len(grid):
+        raise UsageError(
+            f"no position between {box.inner_mas:g} and {box.outer_mas:g} mas on a grid of "
+            f"{grid.step_mas:.3g} mas",
+            source="--separation",
+            remedy="widen the range",
+        )
+    return grid
+
+
+def _errors(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Covariance of the parameters; NaN without a companion, whose errors nothing could tell."""
+    if not (theta[likelihood.model.contrast_columns] > 0.0).any():
+        return np.full((len(theta),) * 2, np.nan)
+    return likelihood.errors(theta)
 
 
 def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
