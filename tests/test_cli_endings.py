@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -39,15 +40,21 @@ def start(*words: object, before: tuple[str, ...] = (), **more: object) -> subpr
     """Start the command in a process of its own."""
     command = [*before, sys.executable, "-m", "amibayes", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    # What is started behind a shell's & ignores Ctrl-C, and so would its children.
+    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        preexec_fn=listen,
         **more,  # type: ignore[call-overload]
     )  # fmt: skip
 
 
 def ended(process: subprocess.Popen[str]) -> tuple[int, str]:
     """Exit status, and the one line on standard error."""
-    out, err = process.communicate(timeout=120)
+    try:
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
     assert out == ""
     lines = err.strip().split("\n")
     assert len(lines) == 1, err

@@ -18,17 +18,19 @@ from amibayes.cli.common import METHODS as CLI_METHODS
 from amibayes.cube import Cube, cube_stream, read_cube, write_cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
+from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.extract import make_bench
-from amibayes.extraction.geometry import Geometry, solve_geometry
+from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import fringe_fit
 from amibayes.extraction.per_integration import integrations, series
 from amibayes.extraction.source import Held
+from amibayes.extraction.view import View
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.search import search
 from amibayes.instrument import Instrument, load_instrument
 from amibayes.observables import Observables
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.optics import psf
+from amibayes.optics import fringe_basis, psf
 from amibayes.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
@@ -198,6 +200,42 @@ def test_wrong_pixel_scale_and_rotation_are_found_and_do_no_harm(
         stated = ExtractOptions(method=method, geometry="stated")  # type: ignore[arg-type]
         wrong = extract_all(cube_of(images, niriss), stated)[0].average.vis2
         assert rms(wrong - 1.0) > 3.0 * rms(vis2 - 1.0)
+
+
+@pytest.mark.parametrize(("name", "most"), [("F480M", 0.005), ("F277W", 0.03)])
+def test_slopes_of_the_geometry_are_those_of_the_fringe_model(name: str, most: float) -> None:
+    instrument = load_instrument("niriss", filter=name)
+    channels = instrument.bandpass.channels()
+    view = View(instrument, channels, slice(0, 60), slice(0, 66), (0.3, -0.2))
+    rng, n = np.random.default_rng(31), instrument.mask.n_baselines
+    visibility = np.concatenate([0.6 + 0.4 * rng.random(n), 0.3 * rng.standard_normal(n)])
+    coefficients = np.concatenate([[1.0], visibility])
+
+    def image(scale: float, turn: float, x: float, y: float) -> FloatArray:
+        pixel = instrument.pixel_scale_rad * (1.0 + scale)
+        centre = (view.centre_px[0] + x, view.centre_px[1] + y)
+        basis = fringe_basis(
+            instrument, channels, view.shape,
+            centre_px=centre, pixel_scale_rad=pixel, rotation_rad=turn,
+        )  # fmt: skip
+        return basis.matrix @ coefficients / (1.0 + scale) ** 2
+
+    for slope, step in zip(geometry_slopes(view, coefficients), 1e-4 * np.eye(4), strict=True):
+        exact = (image(*step) - image(*-step)) / 2e-4
+        assert np.linalg.norm(slope - exact) < most * np.linalg.norm(exact)
+
+
+def test_median_and_scatter_are_those_of_numpy() -> None:
+    values = np.random.default_rng(32).standard_normal((6, 5, 4))
+    for missing in (False, True):
+        if missing:
+            values[np.random.default_rng(33).random(values.shape) < 0.4] = np.nan
+            values[:, 0, 0] = np.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            expected = np.nanmedian(values, axis=0)
+            spread = 1.4826 * np.nanmedian(np.abs(values - expected), axis=0)
+        np.testing.assert_array_equal(median_and_scatter(values), [expected, spread])
 
 
 def test_geometry_is_left_as_stated_where_that_is_right_or_the_image_is_faint(

@@ -76,7 +76,8 @@ class Cube:
         self._hold("images", np.asarray(self.images, dtype=float))
         if self.images.ndim != 3:
             raise DataError(f"has {self.images.ndim} axes, not 3", source=self.source)
-        dq = np.zeros(self.images.shape, np.uint32) if self.dq is None else self.dq
+        nothing = np.broadcast_to(np.uint32(0), self.images.shape)
+        dq = nothing if self.dq is None else self.dq
         self._hold("dq", np.asarray(dq, dtype=np.uint32))
         if self.error is not None:
             self._hold("error", np.asarray(self.error, dtype=float))
@@ -108,7 +109,9 @@ class Cube:
     def bad(self) -> NDArray[np.bool_]:
         """(n_int, ny, nx): flagged as not to be used, or without a finite value or error."""
         assert self.dq is not None
-        bad = ((self.dq & DO_NOT_USE) > 0) | ~np.isfinite(self.images)
+        bad = ~np.isfinite(self.images)
+        if self.dq.any():
+            bad |= (self.dq & DO_NOT_USE) > 0
         if self.error is not None:
             bad |= ~(np.isfinite(self.error) & (self.error > 0.0))
         return bad

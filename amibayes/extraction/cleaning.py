@@ -17,8 +17,8 @@ from amibayes.units import FloatArray, read_only
 
 BoolArray = NDArray[np.bool_]
 
-SAMPLE = 64
-"""Integrations, evenly over the cube, that the reference is the median of."""
+SAMPLE, RUN = 64, 4
+"""Integrations that the reference is the median of: short runs, evenly over the cube."""
 
 MOST_BAD = 0.2
 """An integration with a larger fraction of bad pixels is not used."""
@@ -102,10 +102,7 @@ def reference_of(file: Source) -> Reference:
     with np.errstate(invalid="ignore"):
         scaled = images * (np.median(flux) / flux)[:, None, None]
     scaled = np.where(good, scaled, 0.0)
-    # With nothing missing the plain median is five times quicker.
-    median = np.nanmedian if np.isnan(scaled).any() else np.median
-    image = median(scaled, axis=0)
-    spread = TO_SIGMA * median(np.abs(scaled - image), axis=0)
+    image, spread = median_and_scatter(scaled)
     good &= ~_hot(image, good)
     image = _filled(image, good)
     measured = _measured_variance(cube, keep, lit, spread, len(images))
@@ -123,13 +120,35 @@ def reference_of(file: Source) -> Reference:
     return replace(found, sample=np.where(off, np.nan, images))
 
 
+def median_and_scatter(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Median along the first axis, and the standard deviation that the absolute ones tell.
+
+    NaN are left out; where there is nothing else, NaN comes out.
+    """
+    middle = _median(values)
+    return middle, TO_SIGMA * _median(np.abs(values - middle))
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """`numpy.nanmedian` along the first axis, by a sort: many times quicker for few values."""
+    in_order = np.sort(values, axis=0)
+    if not np.isnan(in_order[-1]).any():  # where NaN go
+        n = len(values)
+        return np.asarray(0.5 * (in_order[(n - 1) // 2] + in_order[n // 2]))
+    count = np.count_nonzero(~np.isnan(in_order), axis=0)
+    low, high = (
+        np.take_along_axis(in_order, at[None], axis=0)[0] for at in ((count - 1) // 2, count // 2)
+    )
+    return np.asarray(0.5 * (low + np.where(count == 0, np.nan, high)))
+
+
 def _sample(file: Source) -> Cube:
     """Integrations spread evenly over the cube."""
     n = file.n_integrations
     if n <= SAMPLE:
         return file.read()
-    picks = np.unique(np.linspace(0, n - 1, SAMPLE).astype(int))
-    parts = [file.read(int(i), int(i) + 1) for i in picks]
+    starts = np.linspace(0, n - RUN, SAMPLE // RUN).astype(int)
+    parts = [file.read(int(i), int(i) + RUN) for i in starts]
     stacked: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("images", "error", "dq")

@@ -13,11 +13,22 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from amibayes.cube import Cube
 from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average, average, standing_off
-from amibayes.extraction.cleaning import TO_SIGMA, BoolArray, Reference, reference_of
+from amibayes.extraction.cleaning import (
+    BoolArray,
+    Reference,
+    median_and_scatter,
+    reference_of,
+)
 from amibayes.extraction.fourier import fourier_sampling
 from amibayes.extraction.frames import Bench, Frames, Residual, concatenated, measure, select
 from amibayes.extraction.geometry import Geometry, fit_geometry
-from amibayes.extraction.image_plane import centre_on, fringe_fit, fringe_sampling, shift_of
+from amibayes.extraction.image_plane import (
+    FringeFit,
+    centre_on,
+    fringe_fit,
+    fringe_sampling,
+    shift_of,
+)
 from amibayes.extraction.noise import (
     NoiseModel,
     cropped,
@@ -190,18 +201,14 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     template = file.template
     reference = reference_of(file)
     view = look_at(reference.image, template, options)
-    part = (view.rows, view.columns)
-    image, good = reference.image[part], reference.good[part]
-    view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
-    noise, level, expected = _noise_and_misfit(view, basis, reference)
+    image, good = reference.image[view.part], reference.good[view.part]
+    view, basis, even = centre_on(view, image, good, template.source)
     geometry = Geometry()
     if options.geometry == "fitted":
-        mean = np.pi / 2.0 / len(reference.sample)  # variance of a median
-        fit = fringe_fit(basis, noise.variance * mean + level, good)
-        view, geometry = fit_geometry(view, image, fit)
+        view, geometry = fit_geometry(view, image, _fit_of_median(view, basis, even, reference))
     if not geometry.stated:
-        view, basis = centre_on(view, image, np.full(view.shape, 1.0), good, template.source)
-        noise, level, expected = _noise_and_misfit(view, basis, reference)
+        view, basis, even = centre_on(view, image, good, template.source)
+    noise, level, expected = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
@@ -209,6 +216,19 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         sampling = fourier_sampling(view, basis, options)
     variance = np.where(good, noise.variance, 0.0).ravel()
     return Bench(view, geometry, reference, fit, expected, sampling, variance, options)
+
+
+def _fit_of_median(
+    view: View, basis: FringeBasis, even: FringeFit, reference: Reference
+) -> FringeFit:
+    """Fit of the median image with its own weights, out of one with ``even`` weights."""
+    image, good = reference.image[view.part], reference.good[view.part]
+    left = image - (even.design @ even.solve(image.reshape(1, -1))[0]).reshape(view.shape)
+    noise = cropped(reference.noise, view.part)
+    if not reference.has_errors and len(reference.sample) < 3:
+        noise = noise_model(image, left**2, good)
+    variance = noise.variance * (np.pi / 2.0 / len(reference.sample))  # of a median
+    return fringe_fit(basis, variance + misfit_level(left, variance, good), good)
 
 
 def _fit_variance(
@@ -230,39 +250,37 @@ def _fit_variance(
 
 
 def _noise_and_misfit(
-    view: View, basis: FringeBasis, reference: Reference
+    view: View, fit: FringeFit, reference: Reference
 ) -> tuple[NoiseModel, float, Residual]:
     """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
 
     Where the cube has no errors of its own, the noise is what differs between the
-    residuals: the fits have followed the pointing.
+    residuals: the fits, whose weights are even, have followed the pointing.
     """
-    part = (view.rows, view.columns)
-    image, good = reference.image[part], reference.good[part]
-    sample = reference.sample[(slice(None), *part)]
-    fit = fringe_fit(basis, np.full(view.shape, 1.0), good)
+    image, good = reference.image[view.part], reference.good[view.part]
+    sample = reference.sample[(slice(None), *view.part)]
     missing = np.isnan(sample) | ~good
     pixels = fit.fill(
         np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
     )
     coefficients = fit.solve(pixels)
     residual = pixels - coefficients @ fit.design.T
-    noise = cropped(reference.noise, part)
-    _refuse_another(image, residual.mean(axis=0).reshape(image.shape), noise, good, reference)
+    mean = residual.mean(axis=0).reshape(image.shape)
+    noise = cropped(reference.noise, view.part)
+    _refuse_another(image, mean, noise, good, reference)
     if not reference.has_errors and len(sample) < 3:
         noise = noise_model(image, (residual[0] ** 2).reshape(image.shape), good)
     elif not reference.has_errors:
         _, samples = fringe_sampling(fit, view).split(coefficients)
         spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
         noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
-    level = misfit_level(residual.reshape(sample.shape), good, noise)
+    level = misfit_level(mean, noise.variance / len(sample), good)
     return noise, level, _expected(residual, image, noise)
 
 
 def _expected(residual: FloatArray, image: FloatArray, noise: NoiseModel) -> Residual:
     """Robust mean and scatter of the residuals (n, n_pixels) of some integrations."""
-    middle = np.median(residual, axis=0)
-    spread = TO_SIGMA * np.median(np.abs(residual - middle), axis=0)
+    middle, spread = median_and_scatter(residual)
     # A scatter of few integrations may be small by chance: its surroundings have a say.
     around = np.sqrt(uniform_filter(spread.reshape(image.shape) ** 2, 5)).ravel()
     slack = JITTER_SLACK * maximum_filter(np.abs(image), 3).ravel()

@@ -84,6 +84,13 @@ class Residual:
     mean: SingleArray
     scatter: SingleArray
 
+    def standing_off(self, residual: SingleArray, limit: float) -> BoolArray:
+        """Pixels (n, n_pixels) of which more is left than ``limit`` scatters from the mean."""
+        reach = np.float32(limit) * self.scatter
+        off = residual - self.mean
+        np.abs(off, out=off)
+        return np.asarray(off > reach)
+
 
 @dataclass(frozen=True, eq=False)
 class Bench:
@@ -118,11 +125,6 @@ class Bench:
     def bias(self) -> tuple[float, FloatArray]:
         """What noise adds to flux² and to the power of every baseline."""
         return self.sampling.bias(self.variance)
-
-    @property
-    def fits(self) -> bool:
-        """Whether what is measured is the fit itself."""
-        return self.options.method == "fringes"
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
@@ -167,34 +169,22 @@ def _chunks(file: Source) -> Iterator[Cube]:
 
 
 def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
-    view, reference = bench.view, bench.reference
-    bad = cube.bad
-    images = np.where(bad, 0.0, cube.images) if bad.any() else cube.images
-    bad |= reference.outliers(images, bad, bench.options.outlier)
-    part = np.s_[:, view.rows, view.columns]
-    n = cube.n_integrations
-    pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
-    never = bench.fit.weight == 0.0
-    count = np.count_nonzero(missing & ~never, axis=1)
-    hopeless = count > MOST_BAD * missing.shape[1]
-    missing = (missing | never) & ~hopeless[:, None]
-    filled, coefficients, residual, extra_bad = _filled(bench, pixels, missing)
-    numbers = coefficients[:, :-1] if bench.fits else filled @ bench.sampling.matrix
-    flux, samples = bench.sampling.split(numbers)
-    shift = _shift(bench, samples)
+    pixels, misfit, n_bad = _cleaned(bench, cube)
+    flux, samples = bench.sampling.apply(pixels)
     own, extra = bench.bias
-    mjd = np.full(n, np.nan) if cube.mjd is None else cube.mjd
+    n = cube.n_integrations
+    hopeless = n_bad > MOST_BAD * pixels.shape[1]
     reason = np.where(hopeless, "too many bad pixels", np.where(flux > 0.0, "", "no light"))
     return (
         Frames(
             flux,
-            shift,
+            shift_of(bench.view, bench.sampling.fringes(samples)),
             bench.sampling.power(samples) - extra,
             flux**2 - own,
             bench.sampling.bispectrum(samples),
-            _share(residual, filled),
-            count + extra_bad,
-            mjd,
+            misfit,
+            n_bad,
+            np.full(n, np.nan) if cube.mjd is None else cube.mjd,
             np.zeros(n, dtype=int),
             np.zeros(n, dtype=int),
             reason.astype("U60"),
@@ -203,41 +193,48 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
-def _share(residual: SingleArray, pixels: FloatArray) -> FloatArray:
-    """Root of the ratio of the sums of squares, (n,)."""
-    left, whole = (np.einsum("np,np->n", a, a) for a in (residual, pixels))
-    return np.asarray(np.sqrt(left / np.maximum(whole, 1e-300)))
+def _cleaned(bench: Bench, cube: Cube) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
-
-def _filled(
-    bench: Bench, pixels: FloatArray, missing: BoolArray
-) -> tuple[FloatArray, FloatArray, SingleArray, IntArray]:
-    """Fill missing pixels, and those that the fit then shows to be wrong.
+    Only where the fit of an integration leaves something that it does not of others is it
+    looked for: what stands off the reference, and then what a fit without that leaves.
 
     Returns
     -------
-    filled : (n, n_pixels) array
-    coefficients : (n, n_coefficients) array
-    residual : (n, n_pixels) array
-    count : (n,) int array
-        Pixels found wrong.
+    pixels : (n, n_pixels) array
+    misfit : (n,) array
+        Residual as a share of the image, rms.
+    n_bad : (n,) int array
+        Pixels left out, of those that are ever used.
     """
-    fit, expected = bench.fit, bench.expected
-    filled = fit.fill(pixels, missing)
-    coefficients = fit.solve(filled)
-    residual = fit.residual(filled, coefficients)
-    wrong = np.abs(residual - expected.mean) > bench.options.outlier * expected.scatter
-    wrong &= ~missing
-    hit = np.flatnonzero(wrong.any(axis=1))
+    view, n, limit = bench.view, cube.n_integrations, bench.options.outlier
+    bad = cube.bad
+    images = np.where(bad, 0.0, cube.images) if bad.any() else cube.images
+    part = np.s_[:, view.rows, view.columns]
+    pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
+    filled, residual = _filled(bench.fit, pixels, missing)
+    hit = np.flatnonzero(bench.expected.standing_off(residual, limit).any(axis=1))
     if len(hit):
-        filled[hit] = fit.fill(pixels[hit], missing[hit] | wrong[hit])
-        coefficients[hit] = fit.solve(filled[hit])
-        residual[hit] = fit.residual(filled[hit], coefficients[hit])
-    return filled, coefficients, residual, wrong.sum(axis=1)
+        wrong = missing[hit]
+        wrong |= bench.reference.outliers(images[hit], bad[hit], limit)[part].reshape(wrong.shape)
+        _, left = _filled(bench.fit, pixels[hit], wrong)
+        wrong |= bench.expected.standing_off(left, limit)
+        filled, missing[hit] = np.array(filled), wrong
+        filled[hit], residual[hit] = _filled(bench.fit, pixels[hit], wrong)
+    left, whole = (np.einsum("np,np->n", a, a) for a in (residual, filled))
+    misfit = np.sqrt(left / np.maximum(whole, 1e-300))
+    return filled, misfit, np.count_nonzero(missing & bench.fit.used, axis=1)
 
 
-def _shift(bench: Bench, samples: ComplexArray) -> FloatArray:
-    return shift_of(bench.view, bench.sampling.fringes(samples))
+def _filled(
+    fit: FringeFit, pixels: FloatArray, missing: BoolArray
+) -> tuple[FloatArray, SingleArray]:
+    """Pixels with the missing ones filled, and what the fit leaves of them."""
+    gone = missing | ~fit.used
+    if gone.any():
+        hopeless = np.count_nonzero(missing & fit.used, axis=1) > MOST_BAD * missing.shape[1]
+        pixels = fit.fill(pixels, gone & ~hopeless[:, None])
+    return pixels, fit.residual(pixels)
 
 
 def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.str_]:

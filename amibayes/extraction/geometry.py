@@ -18,14 +18,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amibayes.extraction.fine_image import fine_image
 from amibayes.extraction.image_plane import FringeFit
 from amibayes.extraction.view import View
 from amibayes.units import FloatArray
 
-PARAMETERS = ("scale", "rotation", "x", "y")
-
-STEP = 1e-3
-"""Relative scale and angle (radians) whose effect is taken for the derivatives."""
+STEP_PX = 0.03
+"""Displacement whose effect is taken for the derivatives; they are good to a percent."""
 
 LARGEST = 0.02
 """Beyond this the header is not a little wrong: nothing is fitted."""
@@ -33,8 +32,11 @@ LARGEST = 0.02
 CONSTRAINED = 3e-3
 """A fit with larger errors says less than the header does."""
 
-ENOUGH = 0.05
-"""Steps below this many standard deviations change nothing."""
+SHRINKS = 0.02
+"""Every step is at most so much of the one before: the slopes are that good."""
+
+ENOUGH, ENOUGH_SIGMA = 2e-5, 0.05
+"""Steps below this, or so many standard deviations, change nothing."""
 
 MOST_STEPS = 4
 
@@ -100,9 +102,8 @@ def solve_geometry(
     None where the image does not tell them.
     """
     pixels = image.reshape(1, -1)
-    start = fit.solve(pixels)[0]
     # The place of the envelope is fitted too, but the fringes say where the star is.
-    slopes = np.stack([_slope(view, fit, start, name) for name in PARAMETERS])
+    slopes = geometry_slopes(view, fit.solve(pixels)[0, :-1])
     slopes -= fit.solve(slopes) @ fit.design.T
     covariance = np.linalg.pinv((slopes * fit.weight) @ slopes.T)
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -114,7 +115,7 @@ def solve_geometry(
         total = total + step
         if np.abs(total[:2]).max() > LARGEST:
             return None
-        if np.all(np.abs(step) < np.maximum(ENOUGH * error, 1e-7)):
+        if np.all(SHRINKS * np.abs(step[:2]) < np.maximum(ENOUGH_SIGMA * error[:2], ENOUGH)):
             break
         design = np.column_stack([_moved(view, total).basis().matrix, np.ones(image.size)])
         residual = _residual(design, fit, pixels)
@@ -134,12 +135,32 @@ def _residual(design: FloatArray, fit: FringeFit, pixels: FloatArray) -> FloatAr
     return np.asarray(pixels[0] - design @ best)
 
 
-def _slope(view: View, fit: FringeFit, coefficients: FloatArray, name: str) -> FloatArray:
-    """Derivative (n_pixels,) of the fitted image by one of the parameters."""
-    step = np.zeros(4)
-    step[PARAMETERS.index(name)] = STEP
-    moved = _moved(view, step).image(coefficients[:-1]).ravel()
-    return np.asarray((moved - fit.design[:, :-1] @ coefficients[:-1]) / STEP)
+def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:
+    """Derivatives of the modelled image by relative scale, rotation, and centre x and y.
+
+    A larger pixel, or a mask turned back, sees the same image from another place; a larger
+    pixel also averages over more of it.
+
+    Parameters
+    ----------
+    view : View
+    coefficients : (1 + 2·n_baselines,) array
+        Of its fringe model.
+
+    Returns
+    -------
+    (4, n_pixels) array
+        To a percent, and but for the flux.
+    """
+    step = STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    here, *sides = fine_image(view, coefficients).moved(step)
+    right, left, up, down = sides
+    by_x, by_y = (left - right) / (2.0 * STEP_PX), (down - up) / (2.0 * STEP_PX)
+    bend = (sum(sides) - 4.0 * here) / STEP_PX**2
+    x, y = view.axes_px()
+    scale = x * by_x + y[:, None] * by_y + bend / 12.0
+    turn = y[:, None] * by_x - x * by_y
+    return np.stack([scale, turn, -by_x, -by_y]).reshape(4, -1)
 
 
 def _moved(view: View, by: FloatArray) -> View:

@@ -52,19 +52,25 @@ class FringeFit:
         """How many baselines."""
         return int(self.design.shape[1]) // 2 - 1
 
+    @cached_property
+    def used(self) -> BoolArray:
+        """(n_pixels,) those that are used at all."""
+        return self.weight > 0.0
+
     def solve(self, pixels: FloatArray) -> FloatArray:
         """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
         return np.asarray(pixels @ self.inverse)
 
-    @cached_property
-    def _model(self) -> SingleArray:
-        return np.ascontiguousarray(self.design.T, dtype=np.float32)
-
-    def residual(self, pixels: FloatArray, coefficients: FloatArray) -> SingleArray:
+    def residual(self, pixels: FloatArray) -> SingleArray:
         """What the fit leaves of images, in single precision: it is looked at, not measured."""
-        model = coefficients.astype(np.float32) @ self._model
-        np.subtract(pixels, model, out=model, dtype=np.float32, casting="same_kind")
-        return np.asarray(model)
+        inverse, model = self._single
+        left = pixels.astype(np.float32)
+        left -= (left @ inverse) @ model
+        return left
+
+    @cached_property
+    def _single(self) -> tuple[SingleArray, SingleArray]:
+        return self.inverse.astype(np.float32), np.ascontiguousarray(self.design.T, np.float32)
 
     def fill(self, pixels: FloatArray, missing: BoolArray) -> FloatArray:
         """Give missing pixels the values that a fit without them predicts.
@@ -79,8 +85,6 @@ class FringeFit:
         (n, n_pixels) array
         """
         frame, pixel = np.nonzero(missing)
-        if not len(frame):
-            return pixels.copy()
         filled = pixels.copy()
         filled[frame, pixel] = 0.0
         count = np.bincount(frame, minlength=len(pixels))
@@ -133,37 +137,52 @@ def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None
     phase = np.angle(samples) / (2.0 * np.pi)
     w = np.ones(phase.shape[1]) if weight is None else weight
     design = view.frequency_px * w[:, None]
-    return np.asarray(-(phase * w) @ np.linalg.pinv(design).T)
+    return np.asarray(-np.linalg.solve(design.T @ design, design.T @ (phase * w).T).T)
 
 
 def centre_on(
-    view: View, image: FloatArray, variance: FloatArray, good: BoolArray, source: str
-) -> tuple[View, FringeBasis]:
+    view: View, image: FloatArray, good: BoolArray, source: str
+) -> tuple[View, FringeBasis, FringeFit]:
     """Move the view's centre to the star, by Gauss–Newton on the phases of its fringes.
 
     Returns
     -------
-    View, FringeBasis
-        The basis is that of the view.
+    View, FringeBasis, FringeFit
+        The basis is that of the view, and the fit's weights are even.
 
     Raises
     ------
     DataError
         Where it does not settle: another mask, filter or pixel scale made the image.
     """
-    pixels = np.where(good, image, 0.0).reshape(1, -1)
+    pixels = np.where(good, image, 0.0)
+    even = np.ones(view.shape)
+    view = _moved(view, _shift_of_transform(view, pixels))
     for _ in range(MOST_STEPS):
         basis = view.basis()
-        flux, samples = fringe_sampling(fringe_fit(basis, variance, good), view).apply(pixels)
+        fit = fringe_fit(basis, even, good)
+        flux, samples = fringe_sampling(fit, view).apply(pixels.reshape(1, -1))
         step = shift_of(view, samples, np.abs(samples[0]))[0]
-        x, y = (float(c) for c in view.centre_px + step)
-        if not flux[0] > 0.0 or max(abs(x), abs(y)) > 0.5 * max(view.shape):
+        if np.hypot(*step) < CONVERGED_PX and flux[0] > 0.0:
+            return view, basis, fit
+        view = _moved(view, step)
+        if not flux[0] > 0.0 or np.abs(view.centre_px).max() > 0.5 * max(view.shape):
             break
-        if np.hypot(*step) < CONVERGED_PX:
-            return view, basis
-        view = replace(view, centre_px=(x, y))
     raise DataError(
         "no fringes of this mask are found in the images",
         source=source,
         remedy="check instrument, filter and pixel scale",
     )
+
+
+def _moved(view: View, by_px: FloatArray) -> View:
+    x, y = (float(c) for c in view.centre_px + by_px)
+    return replace(view, centre_px=(x, y))
+
+
+def _shift_of_transform(view: View, image: FloatArray) -> FloatArray:
+    """Displacement (2,) that the transform of an image tells of: cheap, and nearly right."""
+    (x, y), (u, v) = view.axes_px(), view.frequency_px.T
+    along_x, along_y = (np.exp(-2j * np.pi * np.outer(f, a)) for f, a in ((u, x), (v, y)))
+    samples = np.einsum("by,by->b", along_y, along_x @ (image - np.median(image)).T)
+    return shift_of(view, samples[None], np.abs(samples))[0]

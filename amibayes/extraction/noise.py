@@ -99,7 +99,7 @@ def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:
     return NoiseModel(noise.variance[part], noise.constant, noise.per_signal)
 
 
-def misfit_level(residual: FloatArray, good: BoolArray, noise: NoiseModel) -> float:
+def misfit_level(residual: FloatArray, variance: FloatArray, good: BoolArray) -> float:
     """Mean square of what the fringe model cannot follow, beyond the noise.
 
     Errors of the optics are the same in every integration. As an even variance on top of
@@ -107,10 +107,8 @@ def misfit_level(residual: FloatArray, good: BoolArray, noise: NoiseModel) -> fl
 
     Parameters
     ----------
-    residual : (n, n_y, n_x) array
-        Of integrations fitted by themselves.
+    residual, variance : (n_y, n_x) arrays
+        What a fit leaves of a mean image, and the variance that noise gives it there.
     good : (n_y, n_x) bool array
-    noise : NoiseModel
     """
-    mean = residual.mean(axis=0)[good]
-    return max(float(np.mean(mean**2 - noise.variance[good] / len(residual))), 0.0)
+    return max(float(np.mean(residual[good] ** 2 - variance[good])), 0.0)

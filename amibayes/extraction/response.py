@@ -8,66 +8,39 @@ baseline; the logarithm of that is an even polynomial in the place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from amibayes.extraction.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import View
-from amibayes.optics import psf
 from amibayes.optics.psf import ComplexArray
-from amibayes.optics.sampling import fine_sampling, fine_size, shifted_images
 from amibayes.orientation import Orientation
 from amibayes.response import EXPONENTS, IS_PHASE, powers_at
 from amibayes.units import FloatArray
 
-RADII, FARTHEST = 7, 0.95
+RADII = 7
 ANGLES, NEAR_ANGLES = 7, 9
 
 REACH_PX = (0.3, 1.5)
 """Pointing errors that the response to the star itself is measured for, at least and most."""
 
-COARSER = 0.75
-"""A response need not be known to better than the interpolation's 1e-6 at this sampling."""
-
 SMALLEST = 1e-3
 """Responses are not followed below this."""
 
 
-@dataclass(frozen=True, eq=False)
-class StarImage:
-    """A star's image on cells finer than the pixels, and the view it is of."""
-
-    view: View
-    fine: FloatArray
-    oversample: int
-
-    def measured(self, sampling: Sampling, place_px: FloatArray) -> tuple[FloatArray, ComplexArray]:
-        """Flux and samples of a point of unit flux at places (n, 2) from the centre."""
-        shifts = place_px + np.array(self.view.centre_px)
-        images = shifted_images(self.fine, self.oversample, self.view.shape, shifts)
-        return sampling.apply(images.reshape(len(images), -1))
+def star_image(view: View) -> FineImage:
+    """Make the image, of a point of unit flux, that both responses are measured with."""
+    n = view.instrument.mask.n_baselines
+    return fine_image(view, np.repeat([1.0, 0.0], [1 + n, n]))
 
 
-def star_image(view: View) -> StarImage:
-    """Make the image that both responses are measured with."""
-    instrument = view.instrument
-    mask = instrument.mask.rotated(view.rotation_rad)
-    shortest = float(view.channels.wavelength_m.min())
-    over = fine_sampling(COARSER * instrument.pixel_scale_rad * mask.extent_m / shortest)
-    reach = FARTHEST * instrument.field_rad / instrument.pixel_scale_rad
-    size = fine_size(max(view.shape), over, reach + max(abs(c) for c in view.centre_px))
-    turned = instrument.with_mask(mask)
-    fine = psf(turned, view.channels, size, oversample=over, integrate=False)
-    return StarImage(view, fine, over)
-
-
-def off_axis_response(star: StarImage, sampling: Sampling, orientation: Orientation) -> FloatArray:
+def off_axis_response(star: FineImage, sampling: Sampling, orientation: Orientation) -> FloatArray:
     """Measure the response of flux and of every baseline.
 
     Parameters
     ----------
-    star : StarImage
+    star : FineImage
+        Of unit flux.
     sampling : Sampling
     orientation : Orientation
         How the image lies on the sky.
@@ -81,7 +54,7 @@ def off_axis_response(star: StarImage, sampling: Sampling, orientation: Orientat
     view = star.view
     radius = view.instrument.field_rad * np.linspace(0.12, FARTHEST, RADII)
     place = _places(radius, np.pi * np.arange(ANGLES) / ANGLES)
-    flux, samples = star.measured(sampling, place / view.instrument.pixel_scale_rad)
+    flux, samples = _measured(star, sampling, place / view.instrument.pixel_scale_rad)
     turns = view.uv_m @ place.T / view.wavelength_m
     expected = np.exp(-2j * np.pi * turns) * np.sinc(relative_band(view) * turns)
     ratio = np.vstack([flux, sampling.fringes(samples).T / expected])
@@ -96,7 +69,7 @@ def off_axis_response(star: StarImage, sampling: Sampling, orientation: Orientat
     return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
 
 
-def pointing_response(star: StarImage, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
+def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
     """Visibility (n, n_baselines) that is measured of the star itself at shifts (n, 2).
 
     An image that has moved under an envelope that has not loses V², and its fringes turn.
@@ -106,11 +79,19 @@ def pointing_response(star: StarImage, sampling: Sampling, shift_px: FloatArray)
     reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
     angle = 2.0 * np.pi * np.arange(NEAR_ANGLES) / NEAR_ANGLES
     place = _places(reach * np.array([0.35, 0.75, 1.4]), angle)
-    flux, samples = star.measured(sampling, place)
+    flux, samples = _measured(star, sampling, place)
     turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)
     seen = sampling.fringes(samples) * turn / flux[:, None]
     found = np.linalg.lstsq(_monomials(place / reach), seen, rcond=None)[0]
     return np.asarray(_monomials(shift_px / reach) @ found)
+
+
+def _measured(
+    star: FineImage, sampling: Sampling, place_px: FloatArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Flux and samples of the star at places (n, 2) from the centre."""
+    images = star.moved(place_px)
+    return sampling.apply(images.reshape(len(images), -1))
 
 
 def _monomials(place: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -11,14 +12,15 @@ from amibayes.cube import Cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import Channels, Instrument, load_instrument
-from amibayes.optics import FringeBasis, FringeField, fringe_field, psf
+from amibayes.optics import FringeBasis, fringe_field, psf
 from amibayes.spectrum import Blackbody
 from amibayes.units import FloatArray
 
 LARGEST = 1.25
 """Images wider than this many times the instrument's usual subarray are cropped to it."""
 
-CONVERGED_PX = 2e-3
+CONVERGED_PX = 5e-3
+"""Centres are no better known than this: integrations point by more to either side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,11 @@ class View:
     rotation_rad: float = 0.0
 
     @property
+    def part(self) -> tuple[slice, slice]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+    @property
     def shape(self) -> tuple[int, int]:
         """(n_y, n_x) of the part that is used."""
         return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
@@ -56,29 +63,23 @@ class View:
         """Wavelength whose frequency is the mean of the photons', metres."""
         return float(1.0 / (self.channels.weight @ (1.0 / self.channels.wavelength_m)))
 
-    @property
+    @cached_property
     def uv_m(self) -> FloatArray:
         """(n_baselines, 2) baselines in the image's axes, metres."""
         return self.instrument.mask.rotated(self.rotation_rad).uv_m
 
-    @property
+    @cached_property
     def frequency_px(self) -> FloatArray:
         """(n_baselines, 2) fringe frequencies, cycles per pixel."""
         return np.asarray(self.uv_m * (self.instrument.pixel_scale_rad / self.wavelength_m))
 
     def basis(self) -> FringeBasis:
         """Make the fringe model of this image."""
-        return self._field().basis(self.shape, self.centre_px)
-
-    def image(self, coefficients: FloatArray) -> FloatArray:
-        """Image (n_y, n_x) of coefficients of the fringe model."""
-        return self._field().image(coefficients, self.shape, self.centre_px)
-
-    def _field(self) -> FringeField:
         reach = max(self.shape) + 2.0 * max(abs(c) for c in self.centre_px)
-        return fringe_field(
+        field = fringe_field(
             self.instrument, self.channels, int(np.ceil(reach)), rotation_rad=self.rotation_rad
         )
+        return field.basis(self.shape, self.centre_px)
 
     def axes_px(self) -> tuple[FloatArray, FloatArray]:
         """Coordinates x (n_x,) and y (n_y,) of the pixels, from the star."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
@@ -116,8 +117,7 @@ class _FlatInFrequency:
 
 def instrument_names() -> list[str]:
     """Names of the instruments that come with the package."""
-    folder = resources.files("amibayes.instrument") / "data"
-    return sorted(Path(entry.name).stem for entry in folder.iterdir() if ".toml" in entry.name)
+    return sorted(path.stem for path in _own_folder().glob("*.toml"))
 
 
 def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
@@ -138,7 +138,13 @@ def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
     DataError
         Where the file is wrong: it names the key and the fault.
     """
-    top = read_toml(_path(name))
+    path = _path(name)
+    own = path.parent == _own_folder()
+    return (_remembered if own else _loaded)(path, filter)
+
+
+def _loaded(path: Path, filter: str | None) -> Instrument:
+    top = read_toml(path)
     filters = top.section("filters")
     chosen = _choose(filters, filter)
     instrument = Instrument(
@@ -152,10 +158,18 @@ def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
     return instrument
 
 
+_remembered = lru_cache(maxsize=32)(_loaded)
+"""The package's own files do not change; a cube asks for its instrument several times."""
+
+
+def _own_folder() -> Path:
+    return Path(str(resources.files("amibayes.instrument") / "data"))
+
+
 def _path(name: str | Path) -> Path:
     text = str(name)
     if text.lower() in instrument_names():
-        return Path(str(resources.files("amibayes.instrument") / "data" / f"{text.lower()}.toml"))
+        return _own_folder() / f"{text.lower()}.toml"
     if Path(text).suffix != ".toml" and not Path(text).exists():
         known = ", ".join(instrument_names())
         raise UsageError(

@@ -1,6 +1,6 @@
 """Light through the mask: one model, used by simulation and by extraction."""
 
-from amibayes.optics.fringe_field import FringeField, fringe_field
+from amibayes.optics.fringe_field import FringeField, fringe_field, fringe_image
 from amibayes.optics.fringes import FringeBasis, fringe_basis
 from amibayes.optics.image import ShiftedImage, scene_image
 from amibayes.optics.psf import Wavefront, psf
@@ -14,6 +14,7 @@ __all__ = [
     "Wavefront",
     "fringe_basis",
     "fringe_field",
+    "fringe_image",
     "psf",
     "scene_image",
 ]

@@ -56,21 +56,6 @@ class FringeField:
         columns = np.concatenate([waves[:1].real, 2.0 * waves[1:].real, -2.0 * waves[1:].imag])
         return FringeBasis(columns.reshape(len(columns), -1).T, shape)
 
-    def image(
-        self, coefficients: FloatArray, shape: tuple[int, int], centre_px: tuple[float, float]
-    ) -> FloatArray:
-        """Sum (n_y, n_x) of the columns of `basis` with coefficients (1 + 2·n_baselines,)."""
-        n = len(self.hills) - 1
-        weight = np.concatenate(
-            [coefficients[:1], 2.0 * coefficients[1 : 1 + n] + 2j * coefficients[1 + n :]]
-        )
-        along_y, along_x = self._operators(shape, centre_px)
-        half = (along_y * weight[:, None, None]) @ self.hills
-        # Waves side by side: their sum is one product of real matrices.
-        left = np.concatenate([half.real, -half.imag]).swapaxes(0, 1).reshape(shape[0], -1)
-        right = np.concatenate([along_x.real, along_x.imag]).swapaxes(0, 1).reshape(shape[1], -1)
-        return np.asarray(left @ right.T)
-
     def waves(self, shape: tuple[int, int], centre_px: tuple[float, float]) -> ComplexArray:
         """Envelope and fringes averaged over the pixels, (1 + n_baselines, n_y, n_x)."""
         along_y, along_x = self._operators(shape, centre_px)
@@ -129,14 +114,56 @@ def fringe_field(
     The last few are remembered, by what they are made of.
     """
     size = REACH_STEP_PX * math.ceil(n_pixels / REACH_STEP_PX)
-    mask = instrument.mask
-    numbers = np.concatenate(
-        [
-            *(a.ravel() for a in (mask.holes_m, channels.wavelength_m, channels.weight)),
-            [mask.size_m, mask.orientation_rad, instrument.pixel_scale_rad, rotation_rad],
-        ]
-    )
-    return _remembered(_Recipe(numbers.tobytes(), mask.shape, size, instrument, channels))
+    return _remembered(_Recipe.of(instrument, channels, size, rotation_rad))
+
+
+def fringe_image(
+    instrument: Instrument,
+    channels: Channels,
+    coefficients: FloatArray,
+    n_pixels: int,
+    oversample: int,
+    *,
+    rotation_rad: float = 0.0,
+) -> FloatArray:
+    """Image of coefficients (1 + 2·n_baselines,) of the fringe model, on cells of pixels.
+
+    Returns
+    -------
+    (n_pixels·oversample, n_pixels·oversample) array
+        Photons per cell, by what its centre gets; the star is in the middle.
+
+    Notes
+    -----
+    The last few envelopes are remembered.
+    """
+    recipe = _Recipe.of(instrument, channels, n_pixels, rotation_rad)
+    mask, place = recipe.mask, recipe.cells(oversample)
+    weight = np.array([2.0, 2.0j]) @ coefficients[1:].reshape(2, -1)
+    total = np.zeros((len(place), len(place)))
+    for wavelength, power in zip(channels.wavelength_m, _powers(recipe, oversample), strict=True):
+        x, y = np.exp(2j * np.pi / wavelength * mask.uv_m.T[:, :, None] * place)
+        y *= weight[:, None]
+        # The real part of a sum of waves is one product of real matrices.
+        fringes = np.concatenate([y.real, -y.imag]).T @ np.concatenate([x.real, x.imag])
+        fringes += mask.n_holes * coefficients[0]
+        total += fringes * power
+    return total
+
+
+@lru_cache(maxsize=4)
+def _powers(recipe: _Recipe, oversample: int) -> tuple[FloatArray, ...]:
+    """Photons of one hole per cell, for every wavelength."""
+    place, channels, mask = recipe.cells(oversample), recipe.channels, recipe.mask
+    step = place[1] - place[0]
+    powers = []
+    for wavelength, share in zip(channels.wavelength_m, channels.weight, strict=True):
+        f = place / wavelength
+        power = hole_transform(mask, f[None, :], f[:, None]) ** 2
+        power *= share * step**2 / (wavelength**2 * mask.area_m2)
+        power.flags.writeable = False
+        powers.append(power)
+    return tuple(powers)
 
 
 @dataclass(frozen=True)
@@ -149,15 +176,35 @@ class _Recipe:
     instrument: Instrument = field(compare=False)
     channels: Channels = field(compare=False)
 
+    @classmethod
+    def of(
+        cls, instrument: Instrument, channels: Channels, n_pixels: int, rotation_rad: float
+    ) -> _Recipe:
+        mask = instrument.mask
+        numbers = np.concatenate(
+            [
+                *(a.ravel() for a in (mask.holes_m, channels.wavelength_m, channels.weight)),
+                [mask.size_m, mask.orientation_rad, instrument.pixel_scale_rad, rotation_rad],
+            ]
+        )
+        return cls(numbers.tobytes(), mask.shape, n_pixels, instrument, channels)
+
     @property
-    def rotation_rad(self) -> float:
-        return float(np.frombuffer(self.numbers)[-1])
+    def mask(self) -> Mask:
+        """The mask as it is turned."""
+        return self.instrument.mask.rotated(float(np.frombuffer(self.numbers)[-1]))
+
+    def cells(self, oversample: int) -> FloatArray:
+        """Angles of the middles of cells along an axis."""
+        size = self.n_pixels * oversample
+        step = self.instrument.pixel_scale_rad / oversample
+        return np.asarray(step * (np.arange(size) - 0.5 * (size - 1)))
 
 
 @lru_cache(maxsize=6)
 def _remembered(recipe: _Recipe) -> FringeField:
     pixel, channels = recipe.instrument.pixel_scale_rad, recipe.channels
-    mask = recipe.instrument.mask.rotated(recipe.rotation_rad)
+    mask = recipe.mask
     mean = float(1.0 / (channels.weight @ (1.0 / channels.wavelength_m)))
     over = fine_sampling(_band_limit(mask, channels, mean) * pixel)
     half = (recipe.n_pixels // 2 + 1) * over + HALF_WIDTH + over

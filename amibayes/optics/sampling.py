@@ -84,25 +84,30 @@ def shifted_images(
     one short kernel along an axis serves all of them.
     """
     out = np.empty((len(shift_px), *shape))
-    for image, (x, y) in zip(out, shift_px, strict=True):
-        (first, up), (left, across) = (
-            _kernel(n, size, oversample, s)
-            for n, size, s in zip(shape, fine.shape, (y, x), strict=True)
-        )
-        rows = sliding_window_view(fine, len(up), axis=0)[first::oversample][: shape[0]] @ up
-        columns = sliding_window_view(rows, len(across), axis=1)[:, left::oversample]
-        image[:] = columns[:, : shape[1]] @ across
+    (first, up), (left, across) = (
+        _kernels(n, size, oversample, s)
+        for n, size, s in zip(shape, fine.shape, shift_px.T[::-1], strict=True)
+    )
+    high = sliding_window_view(fine, up.shape[1], axis=0)
+    for k, image in enumerate(out):
+        rows = high[first[k] :: oversample][: shape[0]] @ up[k]
+        wide = sliding_window_view(rows, across.shape[1], axis=1)
+        image[:] = wide[:, left[k] :: oversample][:, : shape[1]] @ across[k]
     return out
 
 
-def _kernel(n_pixels: int, n_fine: int, oversample: int, shift_px: float) -> tuple[int, FloatArray]:
-    """First cell of the first pixel along an axis, and the weights from there on."""
+def _kernels(
+    n_pixels: int, n_fine: int, oversample: int, shift_px: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """First cell (n,) of the first pixel along an axis, and the weights (n, k) from there on."""
     nodes, response = pixel_weights()
-    first = -0.5 * (n_pixels - 1) - shift_px
-    sample, weight = interpolator((first + nodes) * oversample + 0.5 * (n_fine - 1))
-    start = int(sample.min())
-    kernel = np.zeros(int(sample.max()) - start + 1)
-    np.add.at(kernel, sample - start, oversample * response[:, None] * weight)
+    place = -0.5 * (n_pixels - 1) - shift_px[:, None] + nodes
+    sample, weight = interpolator(place * oversample + 0.5 * (n_fine - 1))
+    start = sample.min(axis=(1, 2))
+    at = sample - start[:, None, None]
+    kernel = np.zeros((len(start), int(at.max()) + 1))
+    row = np.arange(len(start))[:, None, None]
+    np.add.at(kernel, (row, at), oversample * response[:, None] * weight)
     return start, kernel
 
 
