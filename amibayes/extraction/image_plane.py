@@ -185,4 +185,4 @@ def _shift_of_transform(view: View, image: FloatArray) -> FloatArray:
     (x, y), (u, v) = view.axes_px(), view.frequency_px.T
     along_x, along_y = (np.exp(-2j * np.pi * np.outer(f, a)) for f, a in ((u, x), (v, y)))
     samples = np.einsum("by,by->b", along_y, along_x @ (image - np.median(image)).T)
-    return shift_of(view, samples[None], np.abs(samples))[0]
+    return np.asarray(shift_of(view, samples[None], np.abs(samples))[0])
