@@ -177,7 +177,7 @@ class Posterior:
                 "InferenceData needs ArviZ", remedy="pip install 'amibayes[arviz]'"
             ) from error
         kept = self.chain[self.n_burn :].swapaxes(0, 1)
-        groups = {
+        groups: dict[str, Any] = {
             "posterior": {name: kept[..., k] for k, name in enumerate(self.names)},
             "sample_stats": {"lp": self.chain_log_prob[self.n_burn :].T},
         }
