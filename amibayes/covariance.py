@@ -198,6 +198,7 @@ class BlockCovariance:
         self.size = size
         self.blocks = tuple(blocks)
         self.whitening, self._colouring, self._logdet = self._assemble()
+        self._unwhitening = self.whitening.T.tocsr()
         self.rank = int(self.whitening.shape[0])
 
     def _alike(self) -> list[list[Block]]:
@@ -242,7 +243,7 @@ class BlockCovariance:
 
     def solve(self, x: FloatArray) -> FloatArray:
         """(Pseudo-)inverse of the covariance times x, (size, …)."""
-        return np.asarray(self.whitening.T @ (self.whitening @ x))
+        return np.asarray(self._unwhitening @ (self.whitening @ x))
 
     def logdet(self) -> float:
         """Logarithm of the determinant of the covariance of the independent combinations."""

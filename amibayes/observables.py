@@ -57,7 +57,7 @@ class Setup:
         Of the target (0 where unknown).
     response : (n_stations, n_stations, n_coefficients) float array, optional
         Logarithm of what the extraction lets through of light off the axis, in
-        `amibayes.response.powers_at` of east and north (radians): of a baseline's
+        `amibayes.response.monomials_at` of east and north (radians): of a baseline's
         visibility, and on the diagonal of the flux.
     """
 

@@ -21,27 +21,30 @@ EXPONENTS = np.array([(d - k, k) for d in (2, 4, 6, 1, 3, 5) for k in range(d + 
 IS_PHASE = np.asarray(EXPONENTS.sum(axis=1) % 2 == 1)
 """Which coefficients are of the phase."""
 
+MODULUS, PHASE = slice(0, int((~IS_PHASE).sum())), slice(int((~IS_PHASE).sum()), len(EXPONENTS))
+"""Where the coefficients of either stand."""
+
 REVERSED = np.where(IS_PHASE, -1.0, 1.0)
 """Times the coefficients: those of the baseline taken the other way round."""
 
-_UNIT = np.where(IS_PHASE, 1j, 1.0)[:, None]
+
+def monomials_at(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Monomials (n_coefficients, n) of two coordinates (n,)."""
+    (a, b), (i, j) = (_powers(c) for c in (first, second)), EXPONENTS.T
+    return np.asarray(a[i] * b[j])
 
 
-def powers_at(first: FloatArray, second: FloatArray) -> ComplexArray:
-    """Monomials (n_coefficients, n) of two coordinates (n,), times i where of the phase."""
-    a, b = (_powers(c) for c in (first, second))
-    return np.asarray(_UNIT * a[EXPONENTS[:, 0]] * b[EXPONENTS[:, 1]])
-
-
-def slopes_at(first: FloatArray, second: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Derivatives of `powers_at` by either coordinate, (n_coefficients, n) each."""
+def slopes_at(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of `monomials_at` by either coordinate, (n_coefficients, n) each."""
     (a, b), (i, j) = (_powers(c) for c in (first, second)), EXPONENTS.T
     return (
-        np.asarray(_UNIT * i[:, None] * a[np.maximum(i - 1, 0)] * b[j]),
-        np.asarray(_UNIT * j[:, None] * a[i] * b[np.maximum(j - 1, 0)]),
+        np.asarray(i[:, None] * a[np.maximum(i - 1, 0)] * b[j]),
+        np.asarray(j[:, None] * a[i] * b[np.maximum(j - 1, 0)]),
     )
 
 
 def _powers(coordinate: FloatArray) -> FloatArray:
-    c = np.asarray(coordinate, dtype=float)
-    return np.stack([c**k for k in range(int(EXPONENTS.max()) + 1)])
+    """All powers of a coordinate (n,) up to the highest, (n_powers, n)."""
+    powers = np.ones((int(EXPONENTS.max()) + 1, len(coordinate)))
+    powers[1:] = coordinate
+    return np.asarray(np.multiply.accumulate(powers, axis=0))

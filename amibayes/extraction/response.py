@@ -15,7 +15,7 @@ from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.orientation import Orientation
-from amibayes.response import EXPONENTS, IS_PHASE, powers_at
+from amibayes.response import EXPONENTS, MODULUS, PHASE, monomials_at
 from amibayes.units import FloatArray
 
 RADII = 7
@@ -48,7 +48,7 @@ def off_axis_response(star: FineImage, sampling: Sampling, orientation: Orientat
     Returns
     -------
     (1 + n_baselines, n_coefficients) array
-        Of ln(response) in `amibayes.response.powers_at` of east and north in radians,
+        Of ln(response) in `amibayes.response.monomials_at` of east and north in radians,
         beyond the smearing over the filter's width (`relative_band`).
     """
     view = star.view
@@ -60,12 +60,11 @@ def off_axis_response(star: FineImage, sampling: Sampling, orientation: Orientat
     ratio = np.vstack([flux, sampling.fringes(samples).T / expected])
     east, north = orientation.to_sky(place).T
     scale = float(np.hypot(east, north).max())
-    powers = powers_at(east / scale, north / scale)
+    monomials = monomials_at(east / scale, north / scale)
     coefficients = np.zeros((len(ratio), len(EXPONENTS)))
     log = np.log(np.maximum(np.abs(ratio), SMALLEST))
-    for part, values in ((~IS_PHASE, log), (IS_PHASE, np.angle(ratio))):
-        basis = (powers.real + powers.imag)[part]
-        coefficients[:, part] = np.linalg.lstsq(basis.T, values.T, rcond=None)[0].T
+    for part, values in ((MODULUS, log), (PHASE, np.angle(ratio))):
+        coefficients[:, part] = np.linalg.lstsq(monomials[part].T, values.T, rcond=None)[0].T
     return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
 
 

@@ -126,6 +126,8 @@ class TemplateBank:
         self._smearing = likelihood.model.smearing
         self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
         self._offset = np.asarray(self._even.matrix @ self._primary)
+        both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
+        self._even_shared, self._odd_shared = both[1:]
         if beside is None:
             self.nuisance_basis = _nuisance_basis(likelihood, nuisance)
         else:
@@ -312,8 +314,8 @@ class TemplateBank:
     def _norm(self, even: FloatArray, odd: FloatArray) -> FloatArray:
         """t·t at positions and their mirror images, (2m,), without the nuisance part."""
         norm = np.einsum("dm,dm->m", even, even) + np.einsum("dm,dm->m", odd, odd)
-        common, i, j = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
-        cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(common) else 0.0 * norm
+        i, j = self._even_shared, self._odd_shared
+        cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(i) else 0.0 * norm
         both = _both(norm, cross)
         if self.nuisance_basis.size:
             basis = self.nuisance_basis

@@ -152,8 +152,8 @@ class Likelihood:
         chi2 = (difference * weighted).sum(axis=0)
         # Reverse mode: fold the data's weights back onto the samples once, so that the
         # gradient costs one product per parameter and no Jacobian of the data.
-        pull = 2.0 * (self.samples.squares.T @ weighted[: self._n2]) * value.conj()
-        pull -= 1j * (self.samples.legs.T @ weighted[self._n2 :]) / (value + NEVER_ZERO)
+        pull = 2.0 * (self.samples.from_squares @ weighted[: self._n2]) * value.conj()
+        pull -= 1j * (self.samples.from_legs @ weighted[self._n2 :]) / (value + NEVER_ZERO)
         gradient = np.einsum("sn,psn->np", pull, slopes).real / self.inflation(chi2)[:, None]
         return self.log_norm - 0.5 * self.deviance(chi2), np.asarray(gradient)
 

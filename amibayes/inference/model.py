@@ -157,7 +157,9 @@ class BinaryModel:
         """Visibility of a point at an offset, averaged over the channel, (n_samples, n)."""
         angle = _angle(samples, east_mas, north_mas)
         wave = np.exp(-1j * angle)
-        return np.asarray(wave * _sinc(angle * _half_band(samples))[0] if self.smearing else wave)
+        if self.smearing:
+            wave *= np.sinc(angle * (_half_band(samples) / np.pi))
+        return np.asarray(wave)
 
     def gradient(self, samples: Samples, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.observables import IntArray, Observables
-from amibayes.response import EXPONENTS, REVERSED, ComplexArray, powers_at, slopes_at
+from amibayes.response import (
+    EXPONENTS,
+    MODULUS,
+    PHASE,
+    REVERSED,
+    ComplexArray,
+    monomials_at,
+    slopes_at,
+)
 from amibayes.units import MAS, FloatArray
 
 
@@ -30,30 +38,39 @@ class OffAxis:
 
         Moving places are (n_samples, n), here and below.
         """
-        powers = powers_at(*_radians(east_mas, north_mas))
-        fringe, flux = (_sum(c, powers, east_mas) for c in (self.fringe, self.flux))
-        return np.exp(fringe), np.exp(flux.real)
+        terms = monomials_at(*_radians(east_mas, north_mas))
+        modulus, phase = (_sum(self.fringe, terms, p, east_mas) for p in (MODULUS, PHASE))
+        flux = np.exp(_sum(self.flux, terms, MODULUS, east_mas))
+        fringe = np.empty(phase.shape, dtype=complex)
+        np.cos(phase, out=fringe.real)
+        np.sin(phase, out=fringe.imag)
+        fringe *= np.exp(modulus)
+        return fringe, flux
 
     def slopes(
         self, east_mas: FloatArray, north_mas: FloatArray
     ) -> tuple[tuple[ComplexArray, ComplexArray], tuple[FloatArray, FloatArray]]:
         """Derivatives of both logarithms by east and north, per mas, (n_samples, n) each."""
         slopes = slopes_at(*_radians(east_mas, north_mas))
-        fringe = [_sum(self.fringe, s, east_mas) * MAS for s in slopes]
-        flux = [_sum(self.flux, s, east_mas).real * MAS for s in slopes]
-        return (fringe[0], fringe[1]), (flux[0], flux[1])
+        modulus = [_sum(self.fringe, s, MODULUS, east_mas) * MAS for s in slopes]
+        phase = [_sum(self.fringe, s, PHASE, east_mas) * MAS for s in slopes]
+        flux = [_sum(self.flux, s, MODULUS, east_mas) * MAS for s in slopes]
+        east, north = (m + 1j * p for m, p in zip(modulus, phase, strict=True))
+        return (east, north), (flux[0], flux[1])
 
 
 def _radians(east_mas: FloatArray, north_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (east_mas * MAS).ravel(), (north_mas * MAS).ravel()
 
 
-def _sum(coefficients: FloatArray, powers: ComplexArray, like: FloatArray) -> ComplexArray:
+def _sum(
+    coefficients: FloatArray, monomials: FloatArray, part: slice, like: FloatArray
+) -> FloatArray:
     """Polynomials of each sample, (n_samples, n), at places shaped like (n,) or (n_samples, n)."""
     if like.ndim == 1:
-        return np.asarray(coefficients @ powers)
-    at_own = powers.reshape(len(powers), *like.shape)
-    return np.asarray(np.einsum("sk,ksn->sn", coefficients, at_own))
+        return np.asarray(coefficients[:, part] @ monomials[part])
+    at_own = monomials[part].reshape(-1, *like.shape)
+    return np.asarray(np.einsum("sk,ksn->sn", coefficients[:, part], at_own))
 
 
 def off_axis_of(data: Observables, first: IntArray, sign: FloatArray) -> OffAxis | None:

@@ -25,6 +25,9 @@ IntArray = NDArray[np.intp]
 MOST_ENTRIES = 6000
 """Entries of an inverse covariance (half of it) past which several data sets share one."""
 
+SMALL = 8
+"""Triangular matrices of this size or less are inverted as they are."""
+
 ELEMENTS_AT_ONCE = 3_000_000
 """Elements of the covariances that are held at once."""
 
@@ -110,7 +113,7 @@ def drawn_estimates(
     factors = np.broadcast_to(np.eye(size), (n, size, size))
     if prior > 0.0:
         drawn = _wishart_factors(n, size, prior + size + 1.0, rng)
-        factors = np.linalg.inv(drawn).swapaxes(1, 2) * np.sqrt(prior)
+        factors = lower_inverse(drawn).swapaxes(1, 2) * np.sqrt(prior)
     scatter = factors @ _wishart_factors(n, size, freedom.scatter, rng)
     total = prior * np.eye(size) + scatter @ scatter.swapaxes(1, 2)
     return np.asarray(factors), np.asarray(total / (freedom.degrees - 2.0))
@@ -120,10 +123,26 @@ def _wishart_factors(n: int, size: int, degrees: float, rng: np.random.Generator
     """Factors (n, size, k) of Wishart matrices; by Bartlett's decomposition where it exists."""
     if degrees <= size:
         return rng.standard_normal((n, size, max(1, round(degrees))))
-    factor = np.tril(rng.standard_normal((n, size, size)), -1)
+    factor = np.zeros((n, size, size))
+    row, column = np.tril_indices(size, -1)
+    factor[:, row, column] = rng.standard_normal((n, len(row)))
     diagonal = np.arange(size)
     factor[:, diagonal, diagonal] = np.sqrt(rng.chisquare(degrees - diagonal, (n, size)))
     return factor
+
+
+def lower_inverse(factor: FloatArray) -> FloatArray:
+    """Inverses of lower triangular matrices (n, size, size): by halves, twice as fast as `inv`."""
+    size = factor.shape[1]
+    if size <= SMALL:
+        return np.asarray(np.linalg.inv(factor))
+    half = size // 2
+    above, below = lower_inverse(factor[:, :half, :half]), lower_inverse(factor[:, half:, half:])
+    inverse = np.zeros_like(factor)
+    inverse[:, :half, :half] = above
+    inverse[:, half:, half:] = below
+    inverse[:, half:, :half] = -(below @ factor[:, half:, :half] @ above)
+    return inverse
 
 
 def _without_nuisance(inverse: FloatArray, basis: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,16 @@ class Samples:
     def frequency(self) -> FloatArray:
         """Length of the spatial frequency, cycles per radian."""
         return np.asarray(np.hypot(self.u, self.v))
+
+    @cached_property
+    def from_squares(self) -> csr_array:
+        """Transpose of ``squares``, (n, n_vis2)."""
+        return self.squares.T.tocsr()
+
+    @cached_property
+    def from_legs(self) -> csr_array:
+        """Transpose of ``legs``, (n, n_closure)."""
+        return self.legs.T.tocsr()
 
     @property
     def band(self) -> IntArray:
