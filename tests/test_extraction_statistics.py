@@ -25,6 +25,8 @@ from amibayes.units import MAS, FloatArray
 
 VIS2, CLOSURE = slice(0, 21), slice(21, 56)
 
+NOISELESS = Detector(flat_error=0.0, photon_noise=False, read_noise_e=0.0)
+
 
 def pair(photons: float, n: int, seed: int, flat_error: float = 0.0) -> list[Cube]:
     """Two exposures of one star on one detector, whose flat is known to ``flat_error``."""
@@ -160,7 +162,7 @@ def test_calibrated_pulls(photons: float, method: str, flat_error: float) -> Non
 )
 def test_scatter_is_near_the_cramer_rao_bound(photons: float) -> None:
     cube = pair(photons, 60, 5)[0]
-    for method, worst in (("fringes", 1.15), ("matched", 1.4)):
+    for method, worst in (("fringes", 1.1), ("matched", 1.4)):
         found = extract_all(cube, ExtractOptions(method=method))[0]  # type: ignore[arg-type]
         ratio = found.average.deviation.std(axis=0, ddof=1) / bound(found, cube)
         for part in (VIS2, CLOSURE):
@@ -196,27 +198,41 @@ def test_bright_stars_are_not_biased(method: str) -> None:
     assert abs(np.mean(np.array(scaled)[:, VIS2])) < 0.6
 
 
-def test_weights_do_not_bias_a_bright_companion() -> None:
-    """Photon noise weighs the pixels: were the weights to follow the fringes, those of a binary
-    and those of its calibrator would differ, and the contrast of 0.4 come out 1 % too small.
+@pytest.mark.parametrize(
+    ("separation", "angle_deg", "contrast"),
+    [(250.0, 34.0, 0.4), (100.0, 10.0, 0.4), (400.0, 37.0, 0.4), (300.0, 70.0, 0.7)],
+)
+def test_bright_companions_are_not_biased(
+    separation: float, angle_deg: float, contrast: float
+) -> None:
+    """Without noise, weighed as photon noise would be: what is left is the method's own.
 
-    Noise alone is worth 0.15 %.
+    Weights that followed the images' own fringes took half a percent off the contrast, and a
+    companion's light that was taken for another pixel scale moved it by 0.2 % of its distance.
+    What remains, up to 0.6 %, is that the centre is not exactly on the brighter star.
     """
-    star, companion = Point(), Point(0.4, 141.0 * MAS, 206.0 * MAS)
-    instrument = load_instrument("niriss", "F430M")
-    detector = Detector(flat_error=0.0, read_noise_e=0.0)
+    angle = np.radians(angle_deg)
+    companion = separation * MAS * np.array([np.sin(angle), np.cos(angle)])
     target, calibrator = (
-        extract_all(
-            simulate(
-                Scene(parts),
-                instrument,
-                Exposure(14, 60, jitter_rad=0.0, dither_rad=0.0),
-                np.random.default_rng(3),
-                detector=detector,
-                count_rate_e_s=1.2e6,
-            )
-        )[0].observables
-        for parts in ((star, companion), (star,))
+        quiet(Scene(parts)) for parts in ((Point(), Point(contrast, *companion)), (Point(),))
     )
-    found = search(Likelihood(calibrate(target, [calibrator]).observables), (200.0, 300.0))
-    assert found.companion.contrast == pytest.approx(0.4, rel=0.006)
+    assert target.benches[0].geometry.stated
+    data = calibrate(target.observables, [calibrator.observables]).observables
+    modes = search(Likelihood(data), (separation - 50.0, separation + 50.0)).modes
+    # The mask's lattice has aliases that fit nearly as well.
+    places = np.array([[m.companion.east_mas, m.companion.north_mas] for m in modes])
+    off = np.hypot(*(places - companion / MAS).T)
+    assert off.min() < 0.25
+    assert modes[int(off.argmin())].companion.contrast == pytest.approx(contrast, rel=0.007)
+
+
+def quiet(scene: Scene) -> Extraction:
+    """Integrations without noise, whose errors are those of photons and read noise."""
+    instrument, exposure = load_instrument("niriss", "F430M"), Exposure(14, 3)
+    settings = {"count_rate_e_s": 1.2e6}
+    noisy, bare = (
+        simulate(scene, instrument, exposure, np.random.default_rng(3), detector=d, **settings)
+        for d in (Detector(flat_error=0.0), NOISELESS)
+    )
+    options = ExtractOptions(covariance="physical")
+    return extract_all(replace(bare, error=noisy.error), options)[0]

@@ -9,7 +9,8 @@ on what either error would do to the fitted image, every coefficient of the fit 
 What matters most is that a target and its calibrator are seen through the same geometry:
 what is left of an error then divides out, whereas noise, or a companion's light, in a
 geometry of its own does not. Small differences from what the file says are therefore not
-believed, and others are rounded.
+believed, nor those that a companion could make that the visibilities leave room for, and
+others are rounded.
 """
 
 from __future__ import annotations
@@ -42,6 +43,9 @@ MOST_STEPS = 4
 
 BELIEVED, SIGNIFICANT = 2.5e-4, 4.0
 """Differences from the stated geometry below this, or so many standard deviations, are left."""
+
+COMPANION = 0.02
+"""A companion's light looks like another scale, by up to this times the rms of |V − 1|."""
 
 ROUNDED = 1e-4
 """Others are multiples of this."""
@@ -89,7 +93,9 @@ def fit_geometry(view: View, image: FloatArray, fit: FringeFit) -> tuple[View, G
     if solved is None:
         return view, Geometry()
     value, error = solved
-    scale, turn = (_believed(float(v), float(e)) for v, e in zip(value, error, strict=True))
+    limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
+    believed = np.where(np.abs(value) < limit, 0.0, ROUNDED * np.round(value / ROUNDED))
+    scale, turn = (float(b) for b in believed)
     found = _moved(view, np.array([scale, turn, 0.0, 0.0])) if scale or turn else view
     return found, Geometry(1.0 + scale, turn, float(error[0]), float(error[1]), True)
 
@@ -122,10 +128,11 @@ def solve_geometry(
     return total[:2], error[:2]
 
 
-def _believed(found: float, error: float) -> float:
-    if abs(found) < max(BELIEVED, SIGNIFICANT * error):
-        return 0.0
-    return ROUNDED * round(found / ROUNDED)
+def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
+    """How far the visibilities of an image are from 1, rms of |V − 1|."""
+    numbers = fit.solve(image.reshape(1, -1))[0, :-1]
+    real, imaginary = numbers[1:].reshape(2, -1) / numbers[0]
+    return float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
 
 
 def _residual(design: FloatArray, fit: FringeFit, pixels: FloatArray) -> FloatArray:
