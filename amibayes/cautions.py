@@ -68,8 +68,7 @@ def _of_covariance(result: SearchResult) -> list[str]:
     return [
         f"the covariance of {p} independent data rests on the scatter of about "
         f"{freedom.scatter + 1.0:.0f} integrations (N/p = {(freedom.scatter + 1.0) / p:.1f}), "
-        "which the expected noise does not describe: errors and false-alarm probability are "
-        "approximate"
+        "which the expected noise does not describe: errors are approximate"
     ]
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array
 
-from amibayes.covariance import Covariance
+from amibayes.covariance import Covariance, sparse_covariance
 
 
 @dataclass(frozen=True)
@@ -77,3 +77,22 @@ def stacked_freedom(parts: Iterable[tuple[int, Freedom | None]]) -> Freedom | No
     given = list(parts)
     p = sum(rank for rank, _ in given)
     return welch_satterthwaite(((n + n**2) / (p + p**2), f) for n, f in given)
+
+
+def stacked_scatter(parts: Iterable[tuple[Covariance, csr_array | None]]) -> csr_array | None:
+    """Covariance by scatter alone of independent data sets laid side by side.
+
+    Parameters
+    ----------
+    parts : iterable of (Covariance, sparse array or None)
+        Each part's covariance, and that by its scatter alone (None: as the first).
+
+    Returns
+    -------
+    sparse array or None
+        None where no part has a scatter of its own.
+    """
+    given = list(parts)
+    if all(scatter is None for _, scatter in given):
+        return None
+    return csr_array(block_diag([sparse_covariance(c) if s is None else s for c, s in given]))

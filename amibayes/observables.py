@@ -10,17 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from astropy.table import QTable
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from amibayes.closure import assumed_covariance, closure_matrix, kernel_basis
-from amibayes.covariance import (
-    Block,
-    BlockCovariance,
-    Covariance,
-    DiagonalCovariance,
-    stack_covariances,
-)
+from amibayes.covariance import Covariance, stack_covariances
 from amibayes.errors import DataError
-from amibayes.freedom import Freedom, stacked_freedom
+from amibayes.freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.notebook import observables_html, observables_table
 from amibayes.units import FloatArray
 
@@ -147,11 +141,13 @@ class Observables:
         What the reader had to decide (tables not used, columns absent, …).
     freedom : Freedom, optional
         Of an estimated covariance; without it the covariance counts as known.
+    scatter : sparse array, optional
+        The covariance as the measured scatter alone has it, without the expected noise.
 
     Raises
     ------
     DataError
-        Where the covariance does not fit the unflagged data, or a value in use is not finite.
+        Where a covariance does not fit the unflagged data, or a value in use is not finite.
     """
 
     vis2: Measurements
@@ -162,13 +158,15 @@ class Observables:
     n_integrations: int | None = None
     notes: tuple[str, ...] = ()
     freedom: Freedom | None = None
+    scatter: csr_array | None = None
 
     def __post_init__(self) -> None:
-        if self.covariance.size != len(self.data):
-            raise DataError(
-                f"a covariance of size {self.covariance.size} for {len(self.data)} data",
-                source=self.source,
-            )
+        sizes = [self.covariance.size, *([] if self.scatter is None else self.scatter.shape)]
+        for size in sizes:
+            if size != len(self.data):
+                raise DataError(
+                    f"a covariance of size {size} for {len(self.data)} data", source=self.source
+                )
         if not np.isfinite(self.data).all():
             raise DataError("a value in use is not finite", source=self.source, remedy="flag it")
 
@@ -228,6 +226,7 @@ class Observables:
             vis2=self.vis2.select(vis2),
             closure_phase=self.closure_phase.select(closure_phase),
             covariance=self.covariance.select(np.flatnonzero(used)),
+            scatter=None if self.scatter is None else self.scatter[used][:, used],
         )
 
     def only(self, kinds: Sequence[str]) -> Observables:
@@ -315,54 +314,6 @@ def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:
     yield from np.split(order, cuts)
 
 
-def kernel_blocks(closure_phase: Measurements, sigma: FloatArray) -> list[Block]:
-    """Covariance blocks of closure phases given by their errors alone, K Σ Kᵀ.
-
-    Parameters
-    ----------
-    closure_phase : Measurements
-        Unflagged.
-    sigma : (n,) float array
-        Errors in radians.
-    """
-    by_topology: dict[bytes, list[IntArray]] = {}
-    for entries in closure_sets(closure_phase):
-        key = closure_phase.stations[entries].tobytes()
-        by_topology.setdefault(key, []).append(entries)
-    blocks = []
-    for sets in by_topology.values():
-        matrix, _ = closure_matrix(closure_phase.stations[sets[0]])
-        basis = kernel_basis(matrix)
-        variance = np.array([sigma[entries] ** 2 for entries in sets])
-        full = assumed_covariance(matrix, variance.T)
-        blocks += [Block(e, c, basis) for e, c in zip(sets, full, strict=True)]
-    return blocks
-
-
-def covariance_of_errors(
-    vis2_error: FloatArray,
-    closure_phase: Measurements,
-    closure_error: FloatArray,
-    kind: CovarianceKind,
-) -> Covariance:
-    """Covariance of data whose file gives errors only.
-
-    Parameters
-    ----------
-    vis2_error : (n_vis2,) float array
-    closure_phase : Measurements
-        Unflagged.
-    closure_error : (n_closure,) float array
-        Radians.
-    kind : {"assumed", "diagonal"}
-        Closures of independent baseline phases, or (the field's habit) independent.
-    """
-    if kind == "diagonal" or not len(closure_phase):
-        return DiagonalCovariance(np.concatenate([vis2_error, closure_error]) ** 2)
-    closures = BlockCovariance(len(closure_error), kernel_blocks(closure_phase, closure_error))
-    return stack_covariances([DiagonalCovariance(vis2_error**2), closures])
-
-
 def join(parts: Sequence[Observables]) -> Observables:
     """Lay independent data sets together for one fit.
 
@@ -380,6 +331,7 @@ def join(parts: Sequence[Observables]) -> Observables:
     ).astype(np.intp)
     kinds: list[CovarianceKind] = ["diagonal", "assumed", "estimated", "given"]
     known = [p.n_integrations for p in parts if p.n_integrations is not None]
+    scatter = stacked_scatter((p.covariance, p.scatter) for p in parts)
     return Observables(
         _concatenate([p.vis2 for p in parts], shifts),
         _concatenate([p.closure_phase for p in parts], shifts),
@@ -389,6 +341,7 @@ def join(parts: Sequence[Observables]) -> Observables:
         min(known) if known else None,
         tuple(n for p in parts for n in p.notes),
         stacked_freedom((p.n_independent, p.freedom) for p in parts),
+        None if scatter is None else scatter[vis2_first][:, vis2_first],
     )
 
 

@@ -7,13 +7,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from amibayes.observables import (
-    CovarianceKind,
-    Measurements,
-    Observables,
-    Setup,
-    covariance_of_errors,
-)
+from amibayes.assumed import covariance_of_errors
+from amibayes.observables import CovarianceKind, Measurements, Observables, Setup
 from amibayes.units import FloatArray
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
+from amibayes.assumed import covariance_of_errors
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import (
     Block,
@@ -17,7 +18,7 @@ from amibayes.covariance import (
     DiagonalCovariance,
     stack_covariances,
 )
-from amibayes.observables import Measurements, Observables, Setup, covariance_of_errors
+from amibayes.observables import Measurements, Observables, Setup
 
 
 def table(name: str, columns: dict[str, tuple[str, Any, str]], **keywords: Any) -> Any:

@@ -14,6 +14,7 @@ from scipy import linalg, stats
 from scipy.sparse import csr_array
 
 from amibayes.calibration import calibrate
+from amibayes.calibration.flagging import flag_by_rule
 from amibayes.cautions import search_cautions
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import dense_covariance, sparse_covariance
@@ -120,6 +121,55 @@ def test_file_keeps_the_freedom(tmp_path: Path) -> None:
     write_oifits(tmp_path / "b.oifits", estimated(None))
     assert read_oifits(tmp_path / "b.oifits").freedom is None
     assert read_oifits(tmp_path / "a.oifits", closure_covariance="diagonal").freedom is None
+
+
+def measured(seed: int = 1) -> Observables:
+    """Data with a scatter of 24 integrations that is not their covariance."""
+    data = estimated(seed=seed)
+    rows = np.random.default_rng([seed, 7]).standard_normal((24, 36))
+    factor = np.asarray(np.linalg.cholesky(basis().T @ data.covariance.dense() @ basis()))
+    spread = basis() @ factor @ rows.T
+    return replace(data, scatter=csr_array(spread @ spread.T / 24.0))
+
+
+def test_scatter_goes_where_the_data_go(tmp_path: Path) -> None:
+    data = measured()
+    assert data.scatter is not None
+    whole = data.scatter.toarray()
+    closures = data.only(("cp",)).scatter
+    np.testing.assert_array_equal(closures.toarray(), whole[21:, 21:])
+    write_oifits(tmp_path / "a.oifits", data)
+    again = read_oifits(tmp_path / "a.oifits")
+    assert again.scatter is not None
+    assert not again.notes
+    scale = np.sqrt(np.outer(whole.diagonal(), whole.diagonal()))
+    np.testing.assert_allclose(again.scatter.toarray() / scale, whole / scale, atol=1e-12)
+    both = join([data, replace(estimated(seed=2), freedom=None)])
+    known = estimated().covariance.dense()
+    assert both.scatter is not None
+    first = np.r_[0:21, 42:77]
+    np.testing.assert_allclose(both.scatter.toarray()[np.ix_(first, first)], whole)
+    second = np.r_[21:42, 77:112]
+    np.testing.assert_allclose(both.scatter.toarray()[np.ix_(second, second)], known)
+    assert join([estimated(), estimated(seed=2)]).scatter is None
+    fewer = flag_by_rule(data, ["station=H1"])
+    used = np.concatenate([~fewer.vis2.flag, ~fewer.closure_phase.flag])
+    np.testing.assert_array_equal(fewer.scatter.toarray(), whole[np.ix_(used, used)])
+
+
+def test_scatter_takes_noise_and_calibration_as_the_covariance_does() -> None:
+    """Where it is the covariance it stays so: known noise added, target and calibrator joined."""
+    target, calibrator = (
+        replace(d, scatter=csr_array(d.covariance.dense()))
+        for d in (estimated(contrast=0.0), estimated(seed=2, contrast=0.0))
+    )
+    noisy = add_noise(target, ExtraNoise(0.01, 0.02))
+    np.testing.assert_allclose(noisy.scatter.toarray(), noisy.covariance.dense(), rtol=1e-9)
+    for others in ([], [estimated(seed=3, contrast=0.0)]):
+        made = calibrate(target, [calibrator, *others], method="weighted", clip=None).observables
+        whole = basis().T @ made.covariance.dense() @ basis()
+        scatter = basis().T @ made.scatter.toarray() @ basis()
+        np.testing.assert_allclose(scatter, whole, rtol=1e-6, atol=1e-12 * whole.max())
 
 
 def test_one_datum_is_the_rule_of_welch(rng) -> None:

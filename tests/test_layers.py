@@ -33,6 +33,7 @@ LAYERS = [
     "covariance",
     "freedom",
     "observables",
+    "assumed",
     "synthetic",
     "oifits",
     "extraction",

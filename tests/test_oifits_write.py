@@ -13,9 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oi_builders import diagonal, random_observables
 
+from amibayes.assumed import covariance_of_errors
 from amibayes.covariance import DiagonalCovariance, dense_covariance
 from amibayes.errors import DataError, RunError, UsageError
-from amibayes.observables import Measurements, Observables, covariance_of_errors, join
+from amibayes.observables import Measurements, Observables, join
 from amibayes.oifits import read_oifits, write_oifits
 
 DEGREE = np.pi / 180

@@ -12,6 +12,7 @@ from weighted_draws import ranks_of
 
 from amibayes.covariance import dense_covariance
 from amibayes.errors import UsageError
+from amibayes.freedom import Freedom
 from amibayes.inference.bank import TemplateBank, make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.noise import add_noise, fit_noise
@@ -124,7 +125,10 @@ def test_outliers_are_named_and_do_not_move_the_companion(rng) -> None:
 
 
 def test_estimated_errors_are_refused(rng) -> None:
-    data = replace(simulated(niriss(), TRUTH, rng), covariance_kind="estimated")
+    data = replace(simulated(niriss(), TRUTH, rng), freedom=Freedom(60.0, 40.0))
+    with pytest.raises(UsageError, match="stated, not estimated"):
+        search_robust(Likelihood(data), FIELD)
+    data = replace(data, freedom=None, covariance_kind="estimated")
     with pytest.raises(UsageError, match="stated, not estimated"):
         search_robust(Likelihood(data), FIELD)
 

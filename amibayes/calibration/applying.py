@@ -67,7 +67,12 @@ def apply_response(
     freedom = calibrated_freedom(
         made.covariance, by_target, used.freedom, by_response, response.freedom
     )
-    return replace(made, freedom=freedom)
+    if used.scatter is None and response.scatter is None:
+        return replace(made, freedom=freedom)
+    by_target = by_target if used.scatter is None else csr_array(own @ used.scatter @ own)
+    if response.scatter is not None:
+        by_response = csr_array(spread @ response.scatter @ spread.T)
+    return replace(made, freedom=freedom, scatter=csr_array(by_target + by_response))
 
 
 def _values(
@@ -127,6 +132,7 @@ def _rebuilt(
         ),
         covariance_kind=kind,
         notes=(*target.notes, *notes),
+        scatter=None,
     )
 
 

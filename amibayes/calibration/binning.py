@@ -163,6 +163,7 @@ def _averaged(
     made = [new for new, _ in averages]
     combine = _stacked([matrix for _, matrix in averages])
     covariance = combine @ sparse_covariance(observables.covariance) @ combine.T
+    scatter = observables.scatter
     upper = triu(covariance, 1).tocoo()
     pairs = Pairs(upper.row.astype(np.intp), upper.col.astype(np.intp), upper.data)
     closure = made[1].select(~made[1].flag)
@@ -179,6 +180,7 @@ def _averaged(
             covered=everywhere,
             independent=everywhere & (observables.covariance_kind == "diagonal"),
         ),
+        scatter=None if scatter is None else csr_array(combine @ scatter @ combine.T),
     )
 
 

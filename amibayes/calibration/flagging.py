@@ -68,6 +68,7 @@ def flag_by_rule(observables: Observables, rules: Sequence[str]) -> Observables:
         vis2=replace(observables.vis2, flag=vis2),
         closure_phase=replace(observables.closure_phase, flag=closure),
         covariance=observables.covariance.select(np.flatnonzero(used)),
+        scatter=None if observables.scatter is None else observables.scatter[used][:, used],
     )
 
 

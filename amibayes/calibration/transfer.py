@@ -29,11 +29,14 @@ class Transfer:
         V² over that of the calibrator's disc; closure phase in radians. 0 where not seen.
     covariance : (n_keys, n_keys) sparse array
     seen : (n_keys,) bool array
+    scatter : (n_keys, n_keys) sparse array, optional
+        The covariance by measured scatter alone; see `amibayes.observables.Observables`.
     """
 
     value: FloatArray
     covariance: csr_array
     seen: BoolArray
+    scatter: csr_array | None = None
 
     @property
     def variance(self) -> FloatArray:
@@ -60,15 +63,19 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
         (weight * scale * found.sign, (found.key, found.entry)),
         shape=(len(keys), calibrator.covariance.size),
     ).tocsr()
+    scatter = calibrator.scatter
     covariance = combine @ sparse_covariance(calibrator.covariance) @ combine.T
+    scatter = None if scatter is None else combine @ scatter @ combine.T
     if diameter[1] > 0:
         by_disc = np.bincount(found.key, weight * value * slope, len(keys)) * diameter[1]
         common = csr_array(by_disc[:, None])
         covariance = covariance + common @ common.T
+        scatter = None if scatter is None else scatter + common @ common.T
     return Transfer(
         np.bincount(found.key, weight * scale * value, len(keys)).astype(float),
         csr_array(covariance),
         np.bincount(found.key, minlength=len(keys)) > 0,
+        None if scatter is None else csr_array(scatter),
     )
 
 

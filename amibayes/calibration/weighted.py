@@ -31,6 +31,8 @@ class Response:
         NaN for a kind that is absent.
     freedom : Freedom, optional
         Of the covariance, where calibrators have estimated ones.
+    scatter : (n_keys, n_keys) sparse array, optional
+        The covariance by the scatter of the calibrators' integrations alone, where it is known.
     """
 
     value: FloatArray
@@ -38,6 +40,7 @@ class Response:
     known: BoolArray
     tau: FloatArray | None = None
     freedom: Freedom | None = None
+    scatter: csr_array | None = None
 
 
 def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:
@@ -110,14 +113,25 @@ def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> Response:
     raw = _inverse(np.array([t.variance for t in transfers]), seen)
     weight = raw / np.where(known, raw.sum(axis=0), 1.0)
     mean = (weight * value).sum(axis=0)
-    covariance = csr_array((len(keys), len(keys)))
-    for w, transfer in zip(weight, transfers, strict=True):
-        covariance = covariance + diags_array(w) @ transfer.covariance @ diags_array(w)
     degrees = np.maximum(seen.sum(axis=0) - 1, 1)
     birge = np.sqrt((raw * (value - mean) ** 2).sum(axis=0) / degrees)
     inflate = kernel_projector(keys, known) @ diags_array(np.maximum(birge, 1.0))
+    scatters = [t.covariance if t.scatter is None else t.scatter for t in transfers]
+    measured = any(t.scatter is not None for t in transfers)
     return Response(
         kernel_projector(keys, known) @ mean,
-        csr_array(inflate @ covariance @ inflate.T),
+        _combined(inflate, weight, [t.covariance for t in transfers]),
         known,
+        scatter=_combined(inflate, weight, scatters) if measured else None,
     )
+
+
+def _combined(
+    inflate: csr_array, weight: FloatArray, covariances: Sequence[csr_array]
+) -> csr_array:
+    """Covariance of a weighted mean whose errors are inflated."""
+    total = sum(
+        (diags_array(w) @ c @ diags_array(w) for w, c in zip(weight, covariances, strict=True)),
+        csr_array(inflate.shape),
+    )
+    return csr_array(inflate @ total @ inflate.T)

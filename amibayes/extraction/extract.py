@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.sparse import csr_array
 
 from amibayes.cube import Cube
 from amibayes.errors import DataError
@@ -349,6 +350,7 @@ def _together(
 
 def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:
     n = int(frames.used.sum())
+    scatter = None if shrunk.carried is None else csr_array(shrunk.scatter / n)
     return observables_of(
         part.bench.view,
         part.template,
@@ -357,6 +359,7 @@ def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Obser
         n_integrations=n if n > 1 else None,
         kind="estimated" if n > 1 else "given",
         freedom=shrunk.carried,
+        scatter=scatter,
         response=part.response,
         mjd=_mjd(frames, part.template),
         integration_s=n * (part.template.integration_time_s or 0.0),

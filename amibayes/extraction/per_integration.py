@@ -51,10 +51,11 @@ def integrations(extraction: Extraction) -> Observables:
                 vis2=_at(mean.vis2, vis2[k], mjd, n),
                 closure_phase=_at(mean.closure_phase, closure[k], mjd, n),
                 covariance=whole,
+                scatter=None,
             )
         )
     # All of them rest on the same scatter: there is no more of it in many than in one.
-    return replace(join(parts), freedom=mean.freedom)
+    return replace(join(parts), freedom=mean.freedom, scatter=None)
 
 
 def _at(table: Measurements, value: FloatArray, mjd: float, n: int) -> Measurements:

@@ -46,6 +46,8 @@ class Shrunk:
         Integrations that were averaged because they are correlated in time; 1 where not.
     correlation : float
         From one integration to the next, over all observables.
+    scatter : (m, m) array
+        Covariance of one integration by the scatter alone.
     """
 
     matrix: FloatArray
@@ -56,9 +58,10 @@ class Shrunk:
     scale_closure: float
     block: int
     correlation: float
+    scatter: FloatArray
 
     def __post_init__(self) -> None:
-        read_only(self, "matrix")
+        read_only(self, "matrix", "scatter")
 
     @property
     def carried(self) -> Freedom | None:
@@ -109,7 +112,8 @@ def shrunk_covariance(
         inner = (np.diag(psi) + white @ white.T) / (freedom - 2.0)
     spread = basis @ lower
     matrix = spread @ inner @ spread.T
-    return Shrunk(matrix, prior, freedom, n - 1.0, *scales, block, correlation)
+    scatter = spread @ (white @ white.T / max(n - 1, 1)) @ spread.T
+    return Shrunk(matrix, prior, freedom, n - 1.0, *scales, block, correlation, scatter)
 
 
 def _scatter_alone(white: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance
@@ -36,6 +37,7 @@ def observables_of(
     n_integrations: int | None,
     kind: CovarianceKind,
     freedom: Freedom | None,
+    scatter: csr_array | None,
     response: FloatArray,
     mjd: float,
     integration_s: float,
@@ -58,6 +60,7 @@ def observables_of(
         n_integrations,
         notes,
         freedom,
+        scatter,
     )
 
 

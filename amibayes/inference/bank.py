@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from amibayes.inference.estimate import estimate_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import disc
 from amibayes.inference.scan import Survey
@@ -132,6 +133,9 @@ class TemplateBank:
             self.nuisance_basis = _nuisance_basis(likelihood, nuisance)
         else:
             self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
+        single = likelihood.with_model(replace(likelihood.model, companions=0))
+        left = single.residuals(nuisance) if beside is None else likelihood.residuals(beside)
+        self.estimate = estimate_of(likelihood.observables, self.project(left[:, 0]))
 
     def __len__(self) -> int:
         return len(self.grid)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
+from scipy.sparse import csr_array
 
 from amibayes.closure import closure_matrix
 from amibayes.covariance import (
@@ -101,8 +102,10 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
     noisy = _with_noise(data, extra)
     if data.freedom is None:
         return noisy
-    share = squared_share(sparse_covariance(data.covariance), noisy.covariance)
-    return replace(noisy, freedom=welch_satterthwaite([(share, data.freedom)]))
+    stated, whole = sparse_covariance(data.covariance), sparse_covariance(noisy.covariance)
+    freedom = welch_satterthwaite([(squared_share(stated, noisy.covariance), data.freedom)])
+    scatter = None if data.scatter is None else csr_array(data.scatter + whole - stated)
+    return replace(noisy, freedom=freedom, scatter=scatter)
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:

@@ -1,35 +1,29 @@
 """Many data sets searched at once: with one covariance, or each with one estimated anew.
 
 A covariance that came from the scatter of N integrations is not the true one. A simulated
-data set therefore gets a true covariance of its own, as far from the expected one as the
-prior of the estimate allows, a scatter drawn with it, and is searched with the estimate
-that they make together. Its templates are never formed: t·C⁻¹t of every template and data
-set is one more matrix product, of the products of t's elements with the entries of C⁻¹.
+data set is therefore another rotation of the integrations (`amibayes.inference.estimate`),
+a mean d and a scatter of its own, and is searched with the estimate that these make. Its
+covariance is that of all rotations less ddᵀ, its inverse another product of rank one: what
+a template makes of it follows from two scalar products.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.freedom import Freedom
 from amibayes.inference.bank import TemplateBank
+from amibayes.inference.estimate import Estimate
 from amibayes.inference.positive import best_positive
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
+Floats32 = NDArray[np.float32]
 
-MOST_ENTRIES = 6000
-"""Entries of an inverse covariance (half of it) past which several data sets share one."""
-
-SMALL = 8
-"""Triangular matrices of this size or less are inverted as they are."""
-
-ELEMENTS_AT_ONCE = 3_000_000
-"""Elements of the covariances that are held at once."""
+LEAST = 1e-6
+"""Share of its covariance that a drawn mean leaves; less can only be a sum of estimates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,102 +66,22 @@ def search_simulated(
     noise : (n_data, n) float array
         Independent unit normals.
     rng : numpy.random.Generator
-        For the covariances.
+        For the estimates.
     signal : (n_data, n) float array, optional
         What is in the data beside noise, whitened by the bank's own covariance.
     """
-    if bank.freedom is None:
+    if bank.estimate is None:
         return search_many(bank, noise if signal is None else noise + signal)
-    size, n = noise.shape
-    sharing = max(1, size * (size + 1) // 2 // MOST_ENTRIES)
-    step = sharing * max(1, ELEMENTS_AT_ONCE // size**2)
-    parts = []
-    for k in range(0, n, step):
-        part = noise[:, k : k + step]
-        whose = np.arange(part.shape[1]) // sharing
-        factors, estimates = drawn_estimates(int(whose[-1]) + 1, size, bank.freedom, rng)
-        data = (factors[whose] @ part.T[:, :, None])[:, :, 0].T
-        data = data if signal is None else data + signal[:, k : k + step]
-        inverse = _without_nuisance(np.asarray(np.linalg.inv(estimates)), bank.nuisance_basis)
-        parts.append(_search_each(bank, data, inverse, whose))
-    names = ("gain", "position", "chi2")
-    return Searched(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
-
-
-def drawn_estimates(
-    n: int, size: int, freedom: Freedom, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """True covariances and their estimates, in units of the bank's own covariance.
-
-    The true one has the inverse-Wishart distribution that was the prior of the estimate
-    (it is the unit matrix where there was none), the scatter a Wishart distribution, and
-    the estimate is the posterior mean of the two.
-
-    Returns
-    -------
-    factors : (n, size, size) float array
-        L of each true covariance LLᵀ.
-    estimates : (n, size, size) float array
-    """
-    prior = max(0.0, freedom.degrees - 2.0 - freedom.scatter)
-    factors = np.broadcast_to(np.eye(size), (n, size, size))
-    if prior > 0.0:
-        drawn = _wishart_factors(n, size, prior + size + 1.0, rng)
-        factors = lower_inverse(drawn).swapaxes(1, 2) * np.sqrt(prior)
-    scatter = factors @ _wishart_factors(n, size, freedom.scatter, rng)
-    total = prior * np.eye(size) + scatter @ scatter.swapaxes(1, 2)
-    return np.asarray(factors), np.asarray(total / (freedom.degrees - 2.0))
-
-
-def _wishart_factors(n: int, size: int, degrees: float, rng: np.random.Generator) -> FloatArray:
-    """Factors (n, size, k) of Wishart matrices; by Bartlett's decomposition where it exists."""
-    if degrees <= size:
-        return rng.standard_normal((n, size, max(1, round(degrees))))
-    factor = np.zeros((n, size, size))
-    row, column = np.tril_indices(size, -1)
-    factor[:, row, column] = rng.standard_normal((n, len(row)))
-    diagonal = np.arange(size)
-    factor[:, diagonal, diagonal] = np.sqrt(rng.chisquare(degrees - diagonal, (n, size)))
-    return factor
-
-
-def lower_inverse(factor: FloatArray) -> FloatArray:
-    """Inverses of lower triangular matrices (n, size, size): by halves, twice as fast as `inv`."""
-    size = factor.shape[1]
-    if size <= SMALL:
-        return np.asarray(np.linalg.inv(factor))
-    half = size // 2
-    above, below = lower_inverse(factor[:, :half, :half]), lower_inverse(factor[:, half:, half:])
-    inverse = np.zeros_like(factor)
-    inverse[:, :half, :half] = above
-    inverse[:, half:, half:] = below
-    inverse[:, half:, :half] = -(below @ factor[:, half:, :half] @ above)
-    return inverse
-
-
-def _without_nuisance(inverse: FloatArray, basis: FloatArray) -> FloatArray:
-    """Inverse covariances (n, p, p) that do not see the directions of a basis (p, k)."""
-    if not basis.size:
-        return inverse
-    seen = inverse @ basis
-    inner = basis.T @ seen
-    return np.asarray(inverse - seen @ np.linalg.solve(inner, seen.swapaxes(1, 2)))
-
-
-def _search_each(
-    bank: TemplateBank, data: FloatArray, inverse: FloatArray, whose: IntArray
-) -> Searched:
-    """Search data sets (p, n) with the inverse covariances (m, p, p) that ``whose`` names."""
-    weighted = (inverse[whose] @ data.T[:, :, None])[:, :, 0]
-    chi2 = np.einsum("np,pn->n", weighted, data)
-    first, second = np.triu_indices(len(data))
-    entries = inverse[:, first, second] * np.where(first == second, 1.0, 2.0)
-    entries, weighted = entries.astype(np.float32), weighted.astype(np.float32)
-    each = np.arange(data.shape[1])
-    best, where = np.zeros(len(each), dtype=np.float32), np.zeros(len(each), dtype=np.intp)
-    pairs = first, second
+    drawn = bank.project(bank.estimate.draw(noise, rng))
+    data = drawn if signal is None else drawn + bank.project(signal)
+    inverse = _Inverse.of(bank.estimate, drawn)
+    weighted = inverse.solve(data)
+    chi2 = (data * weighted).sum(axis=0)
+    rows = weighted.T.astype(np.float32)
+    each = np.arange(len(rows))
+    best, where = np.zeros(len(rows), dtype=np.float32), np.zeros(len(rows), dtype=np.intp)
     for index, templates in bank.by_band():
-        score = _scores(templates.astype(np.float32), weighted, entries, whose, pairs)
+        score = inverse.scores(templates.astype(np.float32), rows)
         top = score.argmax(axis=1)
         value = score[each, top]
         better = value > best
@@ -175,26 +89,65 @@ def _search_each(
     return Searched(np.asarray(best, dtype=float) ** 2, where, chi2)
 
 
-def _scores(
-    templates: NDArray[np.float32],
-    weighted: NDArray[Any],
-    entries: NDArray[Any],
-    whose: IntArray,
-    pairs: tuple[IntArray, IntArray],
-) -> NDArray[np.float32]:
-    """Root of the gain in χ² of data sets (n) by templates (n_bands, p, m), (n, m)."""
-    first, second = pairs
-    norms = [np.sqrt(np.maximum(entries @ (t[first] * t[second]), 1e-12)) for t in templates]
-    match = [weighted @ t / norm[whose] for t, norm in zip(templates, norms, strict=True)]
-    if len(match) == 1:
-        return np.asarray(match[0])
-    shared = {}
-    for b in range(len(match)):
-        for a in range(b):
-            t, s = templates[a], templates[b]
-            product = entries @ (0.5 * (t[first] * s[second] + t[second] * s[first]))
-            shared[a, b] = (product / (norms[a] * norms[b]))[whose]
-    return np.asarray(np.sqrt(np.maximum(best_positive(match, shared)[1], 0.0)))
+@dataclass(frozen=True, eq=False)
+class _Inverse:
+    """Inverse covariances 1 − r rᵀ/s + w_i y_i y_iᵀ of data sets i, in whitened data.
+
+    Parameters
+    ----------
+    common : (n_data,) float array
+        r, the residuals of the data.
+    size : float
+        s.
+    own : (n_data, n) float array
+        y of each data set.
+    weight : (n,) float array
+    """
+
+    common: FloatArray
+    size: float
+    own: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def of(cls, estimate: Estimate, drawn: FloatArray) -> _Inverse:
+        """Of the estimates that go with drawn means (n_data, n), by Sherman and Morrison."""
+        common, prior = estimate.residual, estimate.degrees - 2.0
+        size = prior + float(common @ common)
+        own = drawn - np.outer(common, common @ drawn / size)
+        left = np.maximum(prior - (drawn * own).sum(axis=0), LEAST * prior)
+        return cls(common, size, own, 1.0 / left)
+
+    def solve(self, data: FloatArray) -> FloatArray:
+        """Times data (n_data, n), each data set its own."""
+        shared = data - np.outer(self.common, self.common @ data / self.size)
+        return np.asarray(shared + self.own * (self.weight * (self.own * data).sum(axis=0)))
+
+    def scores(self, templates: Floats32, rows: Floats32) -> Floats32:
+        """Root of the gain in χ² of data sets by templates (n_bands, n_data, m), (n, m).
+
+        Parameters
+        ----------
+        templates : (n_bands, n_data, m) array
+            Of unit norm.
+        rows : (n, n_data) array
+            Data sets times their inverse covariance.
+        """
+        own, weight = self.own.T.astype(np.float32), self.weight.astype(np.float32)[:, None]
+        past = [self.common.astype(np.float32) @ t / np.float32(self.size**0.5) for t in templates]
+        along = [own @ t for t in templates]
+        square = [1.0 - p**2 + weight * a**2 for p, a in zip(past, along, strict=True)]
+        norms = [np.sqrt(np.maximum(s, np.float32(1e-12))) for s in square]
+        match = [rows @ t / norm for t, norm in zip(templates, norms, strict=True)]
+        if len(match) == 1:
+            return np.asarray(match[0])
+        shared = {}
+        for b in range(len(match)):
+            for a in range(b):
+                product = (templates[a] * templates[b]).sum(axis=0) - past[a] * past[b]
+                product = product + weight * along[a] * along[b]
+                shared[a, b] = product / (norms[a] * norms[b])
+        return np.asarray(np.sqrt(np.maximum(best_positive(match, shared)[1], 0.0)))
 
 
 def profiled(gain: FloatArray, chi2: FloatArray, n_data: float) -> FloatArray:

@@ -55,14 +55,15 @@ def search_robust(
     Raises
     ------
     UsageError
-        Where the covariance was estimated from the scatter of integrations: its own error
-        and the weights of data cannot be told apart.
+        Where the covariance was estimated from the scatter of integrations: weights of single
+        data and the errors of that covariance, which all data share, cannot be told apart.
     """
-    if likelihood.observables.covariance_kind == "estimated":
+    data = likelihood.observables
+    if data.covariance_kind == "estimated" or data.freedom is not None:
         raise UsageError(
             "robust residuals need errors that are stated, not estimated from the scatter",
-            source=likelihood.observables.source,
-            remedy="leave --robust out",
+            source=data.source,
+            remedy="leave --robust out: extraction has left out the integrations that stand off",
         )
     work = RobustFits(likelihood, separation_mas, free_scale)
     plain = search(likelihood, separation_mas)

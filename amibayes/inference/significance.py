@@ -4,7 +4,8 @@ The statistic of the data and of every simulated null data set is one and the sa
 largest gain in χ² over the template bank, for positive contrast, nuisance directions
 projected out. In whitened data a null set is a vector of independent unit normals, so ten
 thousand searches are two matrix products. Where the covariance was estimated, a null set
-gets an estimate of its own (see `amibayes.inference.redraw`).
+is another rotation of the integrations, with an estimate of its own (see
+`amibayes.inference.redraw`).
 """
 
 from __future__ import annotations
@@ -264,17 +265,8 @@ def search_drawn(
     """
     if frame is None:
         return search_simulated(bank, noise, rng, signal)
-    white = _spread(bank, noise, rng)
-    white = white if signal is None else white + signal
+    white = noise if signal is None else noise + signal
     return search_many(bank, bounded(bank, white, frame))
-
-
-def _spread(bank: TemplateBank, noise: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Make unit normals (n_data, n) the t distribution that an estimated covariance leaves."""
-    if bank.freedom is None:
-        return noise
-    degrees = bank.freedom.degrees
-    return np.asarray(noise * np.sqrt((degrees - 2.0) / rng.chisquare(degrees, noise.shape[1])))
 
 
 def significance(

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from amibayes.assumed import kernel_blocks
 from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
 from amibayes.errors import DataError
@@ -18,7 +19,6 @@ from amibayes.observables import (
     Measurements,
     closure_sets,
     exposure_labels,
-    kernel_blocks,
 )
 from amibayes.oifits.setups import integers, numbers, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable

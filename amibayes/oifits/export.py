@@ -163,7 +163,12 @@ def _one_object(parts: Sequence[Observables]) -> tuple[Observables, tuple[str, .
     notes += ["correlations left out: the program cannot use them"] if correlated else []
     errors = DiagonalCovariance(whole.covariance.variance)
     plain = replace(
-        whole, covariance=errors, covariance_kind="diagonal", n_integrations=None, freedom=None
+        whole,
+        covariance=errors,
+        covariance_kind="diagonal",
+        n_integrations=None,
+        freedom=None,
+        scatter=None,
     )
     return plain, (*notes, "complex visibilities (OI_VIS) are not written")
 

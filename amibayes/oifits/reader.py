@@ -12,6 +12,7 @@ from amibayes.errors import DataError
 from amibayes.observables import IntArray, Measurements, Observables, Setup
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.rows import Rows, channel_count, read_rows
+from amibayes.oifits.scatter import SCATTER
 from amibayes.oifits.setups import (
     DATA_TABLES,
     Target,
@@ -82,7 +83,9 @@ def observables_of(
     )
     stated = stated_covariance(oifits, content, closure_covariance)
     unused = tuple(
-        f"{t.name or 'unnamed'} {t.extver} is not used" for t in oifits.unused if t.name != RESPONSE
+        f"{t.name or 'unnamed'} {t.extver} is not used"
+        for t in oifits.unused
+        if t.name not in (RESPONSE, SCATTER)
     )
     trailing = (f"{oifits.trailing_bytes} bytes after the last table",)
     return Observables(
@@ -95,6 +98,7 @@ def observables_of(
         (*(n for p in parts for n in p.rows.notes), *stated.notes, *unused)
         + (trailing if oifits.trailing_bytes else ()),
         stated.freedom,
+        stated.scatter,
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from amibayes.covariance import Covariance, DiagonalCovariance
 from amibayes.errors import DataError
@@ -22,6 +23,7 @@ from amibayes.oifits.correlations import (
     oi_corr_pairs,
     trusted_pairs,
 )
+from amibayes.oifits.scatter import scatter_of
 from amibayes.oifits.setups import same
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.units import FloatArray
@@ -75,6 +77,7 @@ class Stated:
     n_integrations: int | None
     freedom: Freedom | None
     notes: tuple[str, ...]
+    scatter: csr_array | None = None
 
 
 def stated_covariance(
@@ -112,7 +115,10 @@ def stated_covariance(
     kind: CovarianceKind = "given" if len(pairs.first) else "assumed"
     if independent[len(independent) - len(closure) :].all() and kind == "assumed":
         kind = "diagonal"
-    return Stated(covariance, said or kind, _integrations(tables), _freedom(tables), notes)
+    freedom = _freedom(tables)
+    index = np.concatenate([c.correlation_index for c in content.both])[~flag]
+    scatter = None if freedom is None else scatter_of(oifits, tables, index, variance[~flag])
+    return Stated(covariance, said or kind, _integrations(tables), freedom, notes, scatter)
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:

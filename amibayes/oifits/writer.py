@@ -27,6 +27,7 @@ from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of
 from amibayes.oifits.off_axis import response_tables
 from amibayes.oifits.rows import T3, VIS2, Kind
+from amibayes.oifits.scatter import scatter_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
 from amibayes.units import DEGREE, FloatArray
@@ -80,6 +81,9 @@ def to_hdus(observables: Observables, header: Mapping[str, HeaderValue]) -> fits
     tables += [_data_table(observables, layout, grid, correlated) for grid in grids]
     if correlated:
         tables.append(_correlation_table(observables, grids))
+    if observables.scatter is not None:
+        variance, index = observables.covariance.variance, _correlation_index(observables, grids)
+        tables.append(scatter_table(observables.scatter, variance, index, CORRNAME))
     tables += response_tables(layout, observables.setups)
     seen: dict[str, int] = {}
     for table in tables:
