@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import NIRISS_HOLES
-from scipy import optimize, stats
+from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
-from amibayes.covariance import DiagonalCovariance
+from amibayes.covariance import DiagonalCovariance, dense_covariance
 from amibayes.errors import DataError, UsageError
+from amibayes.freedom import Freedom
 from amibayes.inference.bands import band_numbers, bands_of, dates
 from amibayes.inference.bank import make_grid
 from amibayes.inference.by_file import file_residuals, files_of
@@ -28,7 +29,7 @@ from amibayes.inference.noise import ExtraNoise, FileNoise, add_noise, fit_noise
 from amibayes.inference.noise_marginal import files_share_errors, marginal_likelihood
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import default_prior
-from amibayes.inference.redraw import _search_each, _without_nuisance, profiled, search_many
+from amibayes.inference.redraw import profiled, search_many, search_simulated
 from amibayes.inference.refine import Box, fit_single, refine, single_likelihood
 from amibayes.inference.search import resolution_mas, search
 from amibayes.inference.significance import bank_statistic, null_maxima, significance
@@ -522,13 +523,23 @@ def test_second_companion_with_contrasts_of_two_filters(rng) -> None:
 
 
 @pytest.mark.parametrize("model", [BinaryModel(), BinaryModel(background="free")])
-def test_covariances_drawn_anew_search_all_bands(model, rng) -> None:
-    """With the unit matrix for every estimate the search of many is that of one covariance."""
-    data = join(NULLS["two filters"][0])
-    likelihood = joint_likelihood(Likelihood(data, model))
-    bank = bank_of(likelihood, make_grid(*FIELD, 60.0), np.zeros(model.n_nuisance))
-    noise = rng.standard_normal((bank.n_data, 5))
-    unit = np.broadcast_to(np.eye(bank.n_data), (5, bank.n_data, bank.n_data))
-    inverse = _without_nuisance(unit, bank.nuisance_basis)
-    found = _search_each(bank, noise, inverse, np.arange(5))
-    np.testing.assert_allclose(found.gain, search_many(bank, noise).gain, rtol=1e-4)
+def test_estimates_drawn_anew_search_all_bands(model, rng) -> None:
+    """Against the bank of each null set's own estimate, bands correlated and all."""
+    data = replace(join(NULLS["two filters"][0]), freedom=Freedom(90.0, 50.0))
+    grid, nuisance = make_grid(*FIELD, 60.0), np.zeros(model.n_nuisance)
+    bank = bank_of(joint_likelihood(Likelihood(data, model)), grid, nuisance)
+    noise = rng.standard_normal((bank.n_data, 3))
+    found = search_simulated(bank, noise, np.random.default_rng(7))
+    assert bank.estimate is not None
+    means = bank.estimate.draw(noise, np.random.default_rng(7))
+    colour = np.linalg.pinv(data.covariance.whitening.toarray())
+    own = bank.estimate.residual
+    for k in range(3):
+        outer = np.outer(own, own) - np.outer(means[:, k], means[:, k])
+        matrix = colour @ (np.eye(len(own)) + outer / 88.0) @ colour.T
+        covariance = dense_covariance(matrix, linalg.orth(colour))
+        alone = replace(data, covariance=covariance, freedom=None)
+        other = bank_of(joint_likelihood(Likelihood(alone, model)), grid, nuisance)
+        expected = search_many(other, covariance.whiten(colour @ means[:, k])[:, None])
+        assert found.gain[k] == pytest.approx(expected.gain[0], rel=1e-3)
+        assert found.position[k] == expected.position[0]
