@@ -6,8 +6,8 @@ import math
 
 NONE = "–"
 
-PLUS_MINUS, TIMES = "\u00a0±\u00a0", "\u00a0×\u00a0"
-"""No line breaks within a number."""
+PLUS_MINUS, TIMES = " ±\u00a0", "\u00a0×\u00a0"
+"""Where it is narrow the error stands below its value; a number itself is not broken."""
 
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
