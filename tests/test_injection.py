@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import niriss, simulated
 
 from amibayes import (
     Cube,
@@ -85,6 +86,28 @@ def test_injected_light_brings_its_noise_and_its_errors() -> None:
     assert abs((scatter**2).mean() - 1.0) < 4.5 * np.sqrt(2.0 / n)
     with pytest.raises(DataError, match="outside the images"):
         star.with_companion(5000.0, 0.0, 0.1)
+
+
+@pytest.mark.parametrize("kinds", [("vis2", "cp"), ("cp",)])
+def test_a_criterion_finds_what_is_bright_and_only_that(kinds: tuple[str, ...]) -> None:
+    """Far above and far below the limit of 1e-3 nothing is left to chance."""
+    rng = np.random.default_rng(3)
+    data = simulated(niriss(), [0.0, 0.0, 0.0], rng)
+    result = search(Likelihood(data.only(kinds)), (50.0, 400.0))
+    criterion = make_criterion(result, rng, alpha=0.01, null_draws=1000)
+    assert 0.0 < criterion.significance.alpha < 0.02
+    bright, faint = ([100.0, 60.0, c] for c in (0.03, 1e-7))
+    recovery = criterion.recover(np.array([bright] * 50 + [faint] * 400), rng)
+    assert recovery.located[:50].all()
+    # Noise alone passes at 1 %: more than 17 of 400 has a probability below 1e-5.
+    assert recovery.detected[50:].sum() <= 17
+    verdict = criterion.judge(simulated(niriss(), bright, rng), 100.0, 60.0)
+    assert verdict.detected
+    assert verdict.located
+    elsewhere = criterion.judge(simulated(niriss(), bright, rng), -150.0, -60.0)
+    assert elsewhere.detected
+    assert not elsewhere.located
+    assert verdict.statistic > criterion.significance.threshold()
 
 
 @pytest.mark.slow

@@ -12,12 +12,16 @@ from astropy.coordinates import SkyCoord
 from astropy.table import Table
 from helpers import niriss, simulated
 
+from amibayes.inference.grid_posterior import grid_posterior
 from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.limits import detection_limit
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import default_prior
 from amibayes.inference.results import Companion, SearchResult
 from amibayes.inference.search import search
+from amibayes.job import SearchOptions
 from amibayes.observables import Observables
+from amibayes.weighing import weigh
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +83,27 @@ def test_posterior(found: SearchResult) -> None:
     )
     assert repr(posterior).startswith(f"<Posterior: {len(posterior.samples)} samples of east_mas")
     assert f"{posterior.interval('delta_mag')[0]:.5g}" in texts(posterior._repr_html_())
+
+
+def test_limits_and_weights_in_a_line(found: SearchResult) -> None:
+    options = SearchOptions(null_draws=2000)
+    weight = weigh(found, options, np.random.default_rng(1), None, None)
+    limit = detection_limit(
+        found, weight, np.random.default_rng(2), trials_per_cell=20, separation_mas=[100.0, 300.0]
+    )
+    assert repr(limit).startswith(f"<DetectionLimit: injection, {limit.completeness:.0%}")
+    assert repr(limit).endswith("2 separations>")
+    table = limit.to_table()
+    np.testing.assert_array_equal(table["contrast"], limit.contrast)
+    assert table["separation_mas"].unit == u.mas
+    assert table.meta["completeness"] == limit.completeness
+    shown = texts(limit._repr_html_())
+    assert f"{limit.delta_mag[0]:.2f}" in shown
+    companion = found.companion
+    assert f"{companion.contrast:.5g}" in texts(companion._repr_html_())
+    assert repr(found).startswith(f"<SearchResult: {companion.separation_mas:.2f} mas, PA")
+    grid = grid_posterior(found.likelihood, default_prior(found.likelihood, 50.0, 400.0))
+    assert repr(grid).startswith(f"<GridPosterior: {len(grid.cells)} cells, ln Z {grid.log_z:.3f}")
 
 
 def test_observables(data: Observables) -> None:

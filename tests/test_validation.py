@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +10,21 @@ import pytest
 from scipy import stats
 
 from amibayes.cli import main
+from amibayes.errors import DataError, RunError
 from amibayes.inference.limits import DetectionLimit
+from amibayes.plots.style import save
+from amibayes.report.page import page_html, read_figure
 from amibayes.validation import QUICK, validate
-from amibayes.validation.plan import RANGES, ValidationPlan
+from amibayes.validation.plan import FIELD_MAS, RANGES, ValidationPlan
 from amibayes.validation.tally import rate, sum_of_tosses, tally, unequal, uniformity
-from amibayes.validation.trial import chance_to_find
+from amibayes.validation.trial import chance_to_find, run_trial
+from amibayes.validation_report import (
+    PICTURES,
+    validation_json,
+    validation_page,
+    validation_pictures,
+    validation_table,
+)
 
 PLAN = replace(QUICK, per_range=100, n_alone=400)
 
@@ -131,6 +142,70 @@ def test_chance_to_find_follows_the_limits() -> None:
     assert np.isnan(chance_to_find(limits, np.array([0.0, 200.0, 1e-3])))
 
 
+def test_one_star_goes_the_whole_way_and_is_held_to_its_truth() -> None:
+    """A companion a hundred times brighter than the limits of these data is found where it is."""
+    setting = replace(QUICK.settings[0], n_integrations=12)
+    plan = replace(QUICK, settings=(setting,), null_draws=300)
+    answer = run_trial(plan, (0, "bright", np.random.SeedSequence(2)))
+    assert answer["found"]
+    assert answer["expected"] > 0.99
+    assert answer["false_alarm_probability"] < 0.01
+    rho = np.hypot(*answer["truth"][:2])
+    assert FIELD_MAS[0] <= rho <= FIELD_MAS[1]
+    assert RANGES["bright"][0] <= answer["truth"][2] <= RANGES["bright"][1]
+    # Each rank is beyond 5e-5 of either end in one of 1e4 sound runs.
+    assert all(5e-5 < rank < 1.0 - 5e-5 for rank in answer["rank"])
+    assert all(wide or not narrow for narrow, wide in answer["covered"])
+
+
+def test_a_failure_of_the_analysis_names_the_trial(monkeypatch) -> None:
+    def refuse(*_: object) -> None:
+        raise DataError("holds nothing", source="star")
+
+    monkeypatch.setattr("amibayes.validation.trial.observe", refuse)
+    with pytest.raises(RunError, match=r"trial 3 \(alone\): star: holds nothing"):
+        run_trial(QUICK, (3, "alone", np.random.SeedSequence(1)))
+
+
+def test_the_page_says_what_holds_and_what_fails(tmp_path) -> None:
+    sound = tally(PLAN, 1, list(answers(PLAN)))
+    bad = tally(PLAN, 3, list(answers(PLAN, 3, coverage=0.8)))
+    failing = [check for check in bad.checks if not check.passed]
+    assert validation_table(sound)[-1] == "All 21 checks hold."
+    *rows, last = validation_table(bad)[1:]
+    assert [row[:52].strip() for row in rows] == [check.name for check in failing]
+    assert last.startswith(f"{len(failing)} of 21 checks fail: {failing[0].name}")
+    figures = {}
+    for name, drawing in validation_pictures(bad).items():
+        save(drawing, tmp_path / f"{name}.png")
+        figures[name] = read_figure(tmp_path / f"{name}.png", name, "")
+    assert set(figures) == {name for name, *_ in PICTURES.values()}
+    said = page_html(validation_page(bad, figures, "out"))
+    assert said.count("FAILS") == len(failing)
+    assert "Doubtful" in said
+    assert "Sound" in page_html(validation_page(sound, figures, "out"))
+    content = validation_json(bad)
+    assert content["passed"] is False
+    assert [c["passed"] for c in content["checks"]] == [c.passed for c in bad.checks]
+    known = bad.of_kind("faint")[0]
+    assert content["trials"]["rank"][known] == list(bad.rank[known])
+    assert content["trials"]["found"][bad.of_kind("alone")[0]] is None
+
+
+def test_command_on_one_star(monkeypatch, tmp_path, capsys) -> None:
+    setting = replace(QUICK.settings[0], n_integrations=12)
+    one = replace(QUICK, settings=(setting,), per_range=0, n_alone=1, null_draws=300)
+    monkeypatch.setattr("amibayes.validation.QUICK", one)
+    out = tmp_path / "out"
+    assert main(["validate", "--out", str(out), "--seed", "5"]) == 0
+    said = capsys.readouterr().out
+    assert said.strip().endswith(f"written to {out}")
+    content = json.loads((out / "validation.json").read_text())
+    assert content["trials"]["kind"] == ["alone"]
+    assert (out / "validation.html").read_text().count("data:image/png") == 4
+    assert not (out / "journal").exists() or not list((out / "journal").rglob("*.npz"))
+
+
 @pytest.fixture
 def small() -> ValidationPlan:
     setting = replace(QUICK.settings[0], n_integrations=12)
@@ -167,8 +242,6 @@ def test_whole_way_and_resumed(small: ValidationPlan, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_command_writes_page_pictures_and_numbers(small, tmp_path, monkeypatch, capsys) -> None:
-    import json
-
     monkeypatch.setattr("amibayes.validation.QUICK", small)
     out = tmp_path / "out"
     assert main(["validate", "--out", str(out), "--seed", "5", "--quiet"]) == 0

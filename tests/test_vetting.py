@@ -16,7 +16,8 @@ from amibayes.errors import DataError
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.noise import ExtraNoise, add_noise
 from amibayes.oifits import write_oifits
-from amibayes.vetting import _LeaveOut, vet
+from amibayes.vetting import Vetted, Vetting, _LeaveOut, vet
+from amibayes.vetting_report import vetting_picture, vetting_table
 
 FIELD = (50.0, 400.0)
 
@@ -88,6 +89,18 @@ def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
     assert point.agreement is None
     assert point.limit is not None
     assert np.nanmax(point.limit.delta_mag) > 5.0
+    header, first, *rest = vetting_table(vetting)
+    assert first.split()[:3] == ["point", "keep", "-"]
+    assert float(first.split()[3]) == pytest.approx(point.significance.probability, rel=0.05)
+    assert any(line.startswith("double") and "DROP" in line for line in rest)
+    assert any(double.reason in line for line in rest)
+    assert header.split()[0] == "calibrator"
+    assert len(vetting_picture(vetting).axes) == 2
+    assert len(vetting_picture(replace(vetting, calibrators=one_without_limit(vetting))).axes) == 1
+
+
+def one_without_limit(vetting: Vetting) -> tuple[Vetted, ...]:
+    return tuple(replace(vetted, limit=None) for vetted in vetting.calibrators)
 
 
 def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys) -> None:
