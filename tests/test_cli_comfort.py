@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import re
+import select
 import shlex
 import shutil
+import signal
 import subprocess
+import time
 import tomllib
 from pathlib import Path
 
@@ -140,6 +146,60 @@ def test_zsh_takes_the_script(tmp_path: Path, capsys) -> None:
     assert any(line.endswith(":(weighted hierarchical)") for line in lines)
     assert any(line.startswith("*--out[") and line.endswith(":DIR:_files -/") for line in lines)
     assert "*:target:_files" in lines
+
+
+def typed_in_zsh(line: str, home: Path, awaited: str | None = None) -> str:
+    """What a person sees who types a line into zsh and presses Tab."""
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.chdir(home / "files")
+        surroundings = {"HOME": str(home), "ZDOTDIR": str(home), "TERM": "dumb", "COLUMNS": "160",
+                        "LINES": "50", "PATH": os.environ["PATH"]}  # fmt: skip
+        os.execvpe("zsh", ["zsh", "-i"], surroundings)
+    try:
+        _seen(terminal, "READY> ")
+        os.write(terminal, f"{line}\t".encode())
+        return _seen(terminal, awaited)
+    finally:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        os.close(terminal)
+
+
+def _seen(terminal: int, awaited: str | None) -> str:
+    """Read until some text comes, or, without it, until the screen has been quiet for a second."""
+    seen, deadline = "", time.monotonic() + 20.0
+    while time.monotonic() < deadline and (awaited is None or awaited not in seen):
+        if select.select([terminal], [], [], 1.0 if seen else 20.0)[0]:
+            seen += os.read(terminal, 65536).decode()
+        elif awaited is None:
+            break
+    return seen
+
+
+@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
+def test_zsh_completes_as_one_types(tmp_path: Path, capsys) -> None:
+    assert run("completion", "zsh") == 0
+    functions, files = tmp_path / "functions", tmp_path / "files"
+    functions.mkdir()
+    (files / "out").mkdir(parents=True)
+    (files / "a star.oifits").touch()
+    (functions / "_amibayes").write_text(capsys.readouterr().out)
+    (tmp_path / ".zshrc").write_text(
+        f"fpath=({functions} $fpath)\nautoload -Uz compinit && compinit -u -d {tmp_path}/dump\n"
+        "unsetopt beep\nPS1='READY> '\n"
+    )
+    for line, rest in [
+        ("amibayes ca", "librate "),
+        ("amibayes search --null-d", "raws "),
+        ("amibayes search x --calibration w", "eighted "),
+        ("amibayes search x --out o", "ut/"),
+        ("amibayes search a", "\\ star.oifits "),
+    ]:
+        assert typed_in_zsh(line, tmp_path, line + rest).endswith(line + rest)
+    offered = typed_in_zsh("amibayes ", tmp_path)
+    assert all(re.search(rf"^{command} +-- ", offered, re.MULTILINE) for command in COMMANDS)
+    assert COMMANDS["doctor"] in offered
 
 
 @pytest.mark.skipif(shutil.which("fish") is None, reason="fish is not installed")

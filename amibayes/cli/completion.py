@@ -151,7 +151,7 @@ complete -o filenames -F _amibayes amibayes
 
 def zsh(commands: list[Command]) -> str:
     """Make the script for zsh."""
-    names = " \\\n        ".join(_quoted(f"{c.name}:{c.help.replace(':', ' ')}") for c in commands)
+    names = " \\\n        ".join(_quoted(f"{c.name}:{c.help}") for c in commands)
     cases = []
     for c in commands:
         specs = [_zsh_spec(flag, o) for o in c.options for flag in o.flags]
@@ -162,7 +162,7 @@ def zsh(commands: list[Command]) -> str:
 
 
 def _zsh_spec(flag: str, option: Option) -> str:
-    said = option.help.replace("[", "(").replace("]", ")").replace(":", " ")
+    said = option.help.replace("[", "(").replace("]", ")")
     value = "" if option.kind == "none" else f":{option.metavar.replace(':', ' ')}:"
     return _quoted(f"*{flag}[{said}]{value}{_zsh_action(option) if value else ''}")
 
