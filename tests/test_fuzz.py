@@ -205,6 +205,15 @@ def test_damaged_files(originals, tmp_path) -> None:
     assert failures(make_cases(originals, 56), tmp_path) == []
 
 
+FOUND = (639, 716, 819)
+"""What once failed: numbers of correlations that fill the memory, and baselines of 1e300 m."""
+
+
+def test_damage_that_once_did_harm(originals, tmp_path) -> None:
+    cases = make_cases(originals, 1 + max(FOUND))
+    assert failures([cases[k] for k in FOUND], tmp_path) == []
+
+
 @pytest.mark.slow
 def test_thousands_of_damaged_files(originals, tmp_path) -> None:
     assert failures(make_cases(originals, 3000)[56:], tmp_path) == []

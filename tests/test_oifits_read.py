@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import tracemalloc
 import warnings
 from pathlib import Path
 
@@ -250,6 +251,20 @@ def test_correlations_of_oi_corr(made: HandMade, tmp_path: Path) -> None:
     # Channels 1 and 2 have no correlation in the file: shared baselines are assumed there.
     assert np.count_nonzero(dense[19, 18:]) == 4
     np.testing.assert_allclose(np.diag(dense)[18:21:3], phase[:3:3] ** 2)
+
+
+def test_a_correlation_with_the_billionth_datum_takes_no_memory(made, tmp_path: Path) -> None:
+    """A damaged table of 9 GB would be asked for; the other pairs stand as they are."""
+    made.correlate([(1, 2, 0.5), (3, 1_275_068_417, 0.2)])
+    path = made.write(tmp_path / "a.fits")
+    tracemalloc.start()
+    dense = read_oifits(path).covariance.dense()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e7
+    vis2 = made.vis2_error.ravel()
+    np.testing.assert_allclose(dense[0, 1], 0.5 * vis2[0] * vis2[1])
+    assert np.count_nonzero(dense[:18, :18]) == 18 + 2
 
 
 def test_full_and_deficient_closure_matrix_have_kernel_rank(made: HandMade, tmp_path: Path) -> None:

@@ -222,8 +222,9 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
             source=source,
             remedy="check UCOORD and VCOORD",
         )
-    positions = np.pi * (outer**2 - inner**2) / step**2
-    if positions > MOST_POSITIONS:
+    with np.errstate(all="ignore"):  # a damaged baseline may be of any length
+        positions = np.pi * float(np.diff((np.array([inner, outer]) / step) ** 2)[0])
+    if not positions <= MOST_POSITIONS:
         raise UsageError(
             f"{positions:.2g} positions between {inner:.4g} and {outer:.4g} mas",
             source="--separation",

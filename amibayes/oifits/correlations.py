@@ -20,7 +20,7 @@ from amibayes.observables import (
     closure_sets,
     exposure_labels,
 )
-from amibayes.oifits.setups import integers, numbers, rest_of, same
+from amibayes.oifits.setups import integers, numbers, placed, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, FloatArray
 
@@ -74,17 +74,15 @@ def oi_corr_pairs(oifits: OIFits, table: OITable, index: IntArray, variance: Flo
         Where the table is inconsistent.
     """
     first, second, correlation, rest = _listed(oifits, table)
-    size = int(max(first.max(initial=0), second.max(initial=0), index.max(initial=0)))
-    where = np.full(size + 1, -1, dtype=np.intp)
     numbered = np.flatnonzero(index > 0)
+    numbered = numbered[np.argsort(index[numbered])]
     if len(np.unique(index[numbered])) != len(numbered):
         raise DataError(
             f"{table.label}: two data have the same place in the correlation matrix",
             source=oifits.path,
             remedy=REMEDY,
         )
-    where[index[numbered]] = numbered
-    a, b = where[first], where[second]
+    a, b = (placed(wanted, index[numbered], numbered) for wanted in (first, second))
     ours = (a >= 0) & (b >= 0) & (correlation != 0)
     a, b, correlation, rest = a[ours], b[ours], correlation[ours], rest[ours]
     return Pairs(a, b, pair_covariance(correlation, variance[a], variance[b]) + rest)

@@ -295,3 +295,10 @@ def make_setup(
 def listing(names: Sequence[str]) -> str:
     """Names for an error message, each once."""
     return ", ".join(dict.fromkeys(names))
+
+
+def placed(wanted: IntArray, known: IntArray, place: IntArray) -> IntArray:
+    """Places of rising numbers where they are wanted, −1 for others; any may be a billion."""
+    known, place = np.append(0, known), np.append(-1, place)
+    at = np.searchsorted(known, wanted, side="right") - 1
+    return np.where(known[at] == wanted, place[at], -1)
