@@ -180,7 +180,29 @@ def test_no_detection_states_a_limit(content) -> None:
     assert "34 %" in words
     assert "more than 7.50 mag fainter" in words
     assert "would be found 95 % of the time" in words
-    assert search_page(none).facts[0].name == "Separation (best fit)"
+    first, *excluded = search_page(none).facts
+    assert first.value == "34 %"
+    assert [fact.value for fact in excluded][1:] == ["0.001"]
+    mags = [m for m in none["limits"]["delta_mag_3sigma"] if m is not None]
+    assert excluded[0].value == f"{min(mags):.1f} to {max(mags):.1f}"
+    assert "Separation" not in " ".join(fact.name for fact in search_page(none).facts)
+    none |= {"posterior": None, "limits": None}
+    assert [fact.value for fact in search_page(none).facts] == ["34 %"]
+
+
+def test_a_posterior_without_a_detection_is_no_measurement(content) -> None:
+    none = copy.deepcopy(content)
+    none["significance"]["detected"] = False
+    none["modes"] = [none["modes"][0]] * 12
+    none["posterior"]["position_angle_deg"] |= {
+        "median": 350.0, "lower": 283.0, "upper": 417.0, "lower_95": 187.0, "upper_95": 513.0,
+    }  # fmt: skip
+    said = Reader(page_html(search_page(none))).said
+    assert "if there is one, and not a measurement" in said
+    assert "283 to 57" in said
+    assert "513" not in said
+    assert "4 more in result.json" in said
+    assert "not a measurement" not in Reader(page_html(search_page(content))).said
 
 
 def test_nothing_is_claimed_without_null_draws_and_absent_stages_are_absent(content) -> None:

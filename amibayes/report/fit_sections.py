@@ -22,6 +22,12 @@ UNITS = {
     "background": ("Over-resolved flux (star = 1)", ""),
 }
 
+MOST_MODES = 8
+"""Rows of the table of positions."""
+
+OPEN_DEG = 270.0
+"""An interval of position angles wider than this leaves every direction open."""
+
 
 def search(content: Json, figures: tuple[Figure, ...]) -> Section:
     """The best fit, χ² and the other local maxima."""
@@ -62,9 +68,13 @@ def _modes(content: Json) -> tuple[Table, ...]:
             fixed(m["delta_chi2"], 1),
             chance(m["probability"]) if "probability" in m else NONE,
         )
-        for m in modes
+        for m in modes[:MOST_MODES]
     )
     caption = "Positions that fit nearly as well, best first; the probability is among these"
+    if content["significance"]["detected"] is False:
+        caption = "Best positions of the field; the probability is among these, had it a companion"
+    if len(modes) > MOST_MODES:
+        caption += f" ({len(modes) - MOST_MODES} more in result.json)"
     return (Table(caption, tuple(Column(c) for c in columns), rows),)
 
 
@@ -152,7 +162,7 @@ def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
     if p is None:
         return None
     state = "It has converged" if p["converged"] else "IT HAS NOT CONVERGED"
-    text = (
+    text = [
         f"Prior: {p['prior']['form']}; separation {plain(p['prior']['separation_mas'][0])} to "
         f"{plain(p['prior']['separation_mas'][1])} mas, contrast "
         f"{plain(p['prior']['contrast'][0])} to {plain(p['prior']['contrast'][1])}.",
@@ -160,8 +170,14 @@ def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
         f"autocorrelation time {plain(p['autocorrelation_time'])} steps, "
         f"{count(p['n_effective'], 'independent sample')}, split R̂ "
         f"{fixed(p['split_rhat'], 3)}.",
-    )
-    return Section("Posterior", text, tables=(_intervals(p),), figures=figures)
+    ]
+    if content["significance"]["detected"] is False:
+        text.insert(
+            0,
+            "No companion was detected: these are the places and contrasts that the data leave to "
+            "one, if there is one, and not a measurement.",
+        )
+    return Section("Posterior", tuple(text), tables=(_intervals(p),), figures=figures)
 
 
 def _intervals(p: Json) -> Table:
@@ -175,12 +191,21 @@ def _intervals(p: Json) -> Table:
             (
                 f"{name} ({unit})" if unit else name,
                 fixed(q["median"], places),
-                f"{fixed(q['lower'], places)} to {fixed(q['upper'], places)}",
-                f"{fixed(q['lower_95'], places)} to {fixed(q['upper_95'], places)}",
+                _range(key, q["lower"], q["upper"], places),
+                _range(key, q["lower_95"], q["upper_95"], places),
             )
         )
     columns = (Column("", "text"), Column("Median"), Column("68 %"), Column("95 %"))
     return Table("Marginal posterior of each quantity", columns, tuple(rows))
+
+
+def _range(key: str, low: float, high: float, places: int) -> str:
+    """An interval; that of an angle may go through north, or leave every direction open."""
+    if key == "position_angle_deg":
+        if high - low > OPEN_DEG:
+            return "any"
+        low, high = low % 360.0, high % 360.0
+    return f"{fixed(low, places)} to {fixed(high, places)}"
 
 
 def _places(quantity: Json) -> int:

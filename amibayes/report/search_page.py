@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from amibayes.report.page import (
     figures_named,
 )
 from amibayes.report.statement import false_alarm, field, sky_of, statement_of
-from amibayes.report.words import count, measured, plain, sentence
+from amibayes.report.words import chance, count, fixed, measured, plain, sentence
 
 Json = dict[str, Any]
 
@@ -103,22 +103,43 @@ def _subtitle(content: Json) -> str:
 
 
 def _tiles(content: Json) -> tuple[Fact, ...]:
+    """The companion's numbers, or where none was detected those of what there is not."""
     fit, errors = content["fit"], content["fit"]["errors"]
-    if fit["contrast"] <= 0.0:
-        place: tuple[Fact, ...] = ()
-    else:
-        place = tuple(
-            Fact(name, measured(fit[key], errors[key], unit))
-            for name, key, unit in (
-                ("Separation", "separation_mas", " mas"),
-                ("Position angle", "position_angle_deg", "°"),
-                ("Magnitude difference", "delta_mag", ""),
-            )
-        )
-        if not content["significance"]["detected"]:
-            place = tuple(Fact(f"{f.name} (best fit)", f.value) for f in place)
     told = false_alarm(content["significance"])
-    return (*place, Fact("False-alarm probability", told, "by noise, anywhere in the field"))
+    alarm = Fact("False-alarm probability", told, "by noise, anywhere in the field")
+    if content["significance"]["detected"] is False:
+        return (alarm, *_excluded(content))
+    if fit["contrast"] <= 0.0:
+        return (alarm,)
+    judged = "" if content["significance"]["detected"] else " (best fit)"
+    place = (
+        Fact(f"{name}{judged}", measured(fit[key], errors[key], unit))
+        for name, key, unit in (
+            ("Separation", "separation_mas", " mas"),
+            ("Position angle", "position_angle_deg", "°"),
+            ("Magnitude difference", "delta_mag", ""),
+        )
+    )
+    return (*place, alarm)
+
+
+def _excluded(content: Json) -> Iterator[Fact]:
+    """What a search without a detection rules out."""
+    limits, posterior = content["limits"], content["posterior"]
+    reached = [] if limits is None else [m for m in limits["delta_mag_3sigma"] if m is not None]
+    if reached:
+        yield Fact(
+            "Magnitude difference reached",
+            f"{fixed(min(reached), 1)} to {fixed(max(reached), 1)}",
+            f"{chance(limits['completeness'])} of such companions would be found",
+        )
+    if posterior is not None and posterior["upper_limit"] is not None:
+        bound = posterior["upper_limit"]
+        yield Fact(
+            "Upper limit of the contrast",
+            plain(bound["contrast"]),
+            f"with {chance(bound['level'])} probability, anywhere in the field",
+        )
 
 
 def _data(content: Json, figures: tuple[Figure, ...]) -> Section:
