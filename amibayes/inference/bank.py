@@ -10,7 +10,9 @@ whitening is folded into one sparse matrix before any position is looked at.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +141,13 @@ class TemplateBank:
 
     def __len__(self) -> int:
         return len(self.grid)
+
+    def beside(self, residuals: FloatArray) -> Self:
+        """Make the same bank for data that left other whitened residuals (n_data,)."""
+        other = copy(self)
+        if self.estimate is not None:
+            other.estimate = replace(self.estimate, residual=self.project(residuals))
+        return other
 
     @property
     def n_nuisance(self) -> int:

@@ -16,8 +16,8 @@ from astropy.table import QTable
 from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.inference.joint_bank import bank_of
 from amibayes.inference.logistic import fit_logistic
+from amibayes.inference.quiet import without_companion
 from amibayes.inference.recovery import (
     Recovery,
     ambiguous,
@@ -211,9 +211,9 @@ def detection_limit(
     -------
     DetectionLimit
     """
-    setting, lost, sigma = _prepared(
-        result, significance, make_rings(result, n_separations, separation_mas), executor, journals
-    )
+    rings = make_rings(result, n_separations, separation_mas)
+    bank, significance = without_companion(result, significance, rng, executor, journals)
+    setting, lost, sigma = _prepared(result, bank, significance, rings, executor, journals)
     trials = inject(setting, trials_per_cell, rng, progress)
     false = _false_positives(setting, significance, rng)
     return _summarised(setting, trials, sigma, lost, significance.alpha, false)
@@ -221,6 +221,7 @@ def detection_limit(
 
 def _prepared(
     result: SearchResult,
+    bank: TemplateBank,
     significance: Significance,
     rings: Rings,
     executor: Executor | None,
@@ -228,7 +229,6 @@ def _prepared(
 ) -> tuple[Setting, FloatArray, FloatArray]:
     """What all rounds need, the ambiguous share of every ring, and errors of the contrast."""
     likelihood, frame = judging(result)
-    bank = bank_of(likelihood, result.grid, result.single_theta)
     gain = _gain_at(significance, bank)
     sigma = rings.sensitivity(bank, np.zeros(bank.n_data))[1]
     nearer = _nearer(bank, rings, result, executor, journals)
