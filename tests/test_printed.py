@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +20,15 @@ from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.noise_marginal import NoisePosterior
 from amibayes.inference.significance import Significance
 from amibayes.job import SearchOptions, SearchReport, calibrator_verdicts
-from amibayes.oifits import write_oifits
+from amibayes.oifits import read_oifits, write_oifits
+from amibayes.parallel import spawn
 from amibayes.pipeline import search_companion
 from amibayes.preparing import prepare
 from amibayes.report.limits import limits_summary
 from amibayes.report.result import result_json, upper_limit
 from amibayes.report.statement import statement_of
 from amibayes.report.summary import summary
+from amibayes.survey.summary import summary_lines
 
 FIRST, SECOND = [110.0, -75.0, 0.05], [-60.0, 140.0, 0.03]
 
@@ -276,3 +280,94 @@ def test_audit_and_export_in_words(alone: Path, tmp_path: Path, capsys) -> None:
     twin.write_bytes(other.read_bytes())
     assert run("audit", other, twin, "--fix", "--out", tmp_path / "b") == 2
     assert "two files have the same name" in error_of(capsys)
+
+
+SCENE = """
+name = "small"
+[star]
+magnitude = 6.0
+filter = "F430M"
+[instrument]
+filter = "F430M"
+[exposure]
+n_groups = 5
+n_integrations = 6
+n_pixels = 48
+"""
+
+
+def test_images_made_and_measured_in_words(tmp_path: Path, capsys) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    assert run("simulate", tmp_path / "scene.toml", "--out", tmp_path / "images") == 0
+    said = capsys.readouterr().out
+    (cube,) = (tmp_path / "images").glob("*_calints.fits")
+    assert f"{cube}  F430M  5 groups, 6 integrations, " in said
+    words = ("extract", cube, "--out", tmp_path / "e", "--per-integration", "--overwrite")
+    assert run(*words) == 0
+    said = capsys.readouterr().out
+    (entry,) = json.loads((tmp_path / "e" / "extract.json").read_text())["extractions"]
+    assert f"integrations   {entry['n_used']} of 6 used" in said
+    assert f"closure phase  σ {entry['sigma_closure_phase_deg']:.3g} deg" in said
+    assert len(said.splitlines()) <= 20
+    single = next((tmp_path / "e").glob("*_integrations.oifits"))
+    assert read_oifits(single).n_vis2 == 21 * entry["n_used"]
+    twin = tmp_path / "twin" / cube.name
+    twin.parent.mkdir()
+    twin.write_bytes(cube.read_bytes())
+    assert run("extract", cube, twin, "--out", tmp_path / "f") == 2
+    assert "two cubes have the same name" in error_of(capsys)
+    assert not (tmp_path / "f").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError("9 GB"), "not enough memory: 9 GB (ask for less)"),
+        (ValueError("odd\n  thing"), "ValueError: odd thing (a fault of amibayes"),
+    ],
+)
+def test_a_surprise_with_one_target_spares_the_others(
+    error, said, alone, tmp_path, capsys, monkeypatch
+) -> None:
+    batch = tmp_path / "t.csv"
+    batch.write_text(f"target,name\n{alone},bad\n{alone},good\n")
+    whole = importlib.import_module("amibayes.cli.search").perform
+
+    def perform(arguments):
+        if Path(arguments.out).name == "bad":
+            raise error
+        return whole(arguments)
+
+    monkeypatch.setattr("amibayes.cli.search.perform", perform)
+    out = tmp_path / "out"
+    words = ("--null-draws", 0, "--no-posterior", "--no-limits", "--separation", "80:200")
+    assert run("search", "--batch", batch, *words, "--out", out, "--quiet") == 4
+    assert said in error_of(capsys)
+    summary = json.loads((out / "summary.json").read_text())
+    assert [entry["status"] for entry in summary["targets"]] == ["failed", "done"]
+
+
+def test_a_survey_of_many_is_told_in_twenty_lines(tmp_path: Path) -> None:
+    targets = [{"name": f"s{k}", "status": "failed", "error": "gone"} for k in range(40)]
+    content = {"targets": targets, "n_done": 0, "n_targets": 40, "n_failed": 40}
+    lines = summary_lines(content, tmp_path)
+    assert len(lines) == 20
+    assert lines[0] == "targets     0 of 40 done, 40 failed"
+    shown = sum(text.startswith("s") for text in lines)
+    assert lines[-2].startswith(f"and {40 - shown} more in ")
+
+
+def test_what_mpi_and_other_schedulers_need(alone: Path, tmp_path: Path, capsys) -> None:
+    if importlib.util.find_spec("mpi4py") is None:
+        assert run("search", alone, "--scheduler", "mpi", "--out", tmp_path / "out") == 4
+        assert "mpi4py is missing (pip install 'amibayes[mpi]')" in error_of(capsys)
+    with pytest.raises(TypeError, match="not made from a SeedSequence"):
+        spawn(np.random.Generator(Unseeded()), 2)
+
+
+class Unseeded(np.random.PCG64):
+    """A generator that does not say how it was seeded."""
+
+    @property
+    def seed_seq(self):
+        return None
