@@ -466,3 +466,26 @@ def test_public_files(data: Path) -> None:
         assert codes(data / "oifits" / name) == wanted, name
     with pytest.raises(DataError, match="is cut short"):
         audit(data / "oifits" / "corrupted" / "truncated.fits")
+
+
+@pytest.mark.parametrize("spoilt", ["absent", "words", "wide"])
+def test_any_column_may_be_anything(spoilt: str, tmp_path: Path) -> None:
+    """Whichever column it is, the audit ends, with the column named or the file refused."""
+    whole = HandMade(np.random.default_rng(1)).tables
+    for name, column in [(t, c) for t, columns in whole.items() for c in columns]:
+        made = HandMade(np.random.default_rng(1))
+        form, values, _ = made.tables[name][column]
+        if spoilt == "absent":
+            del made.tables[name][column]
+        elif spoilt == "wide":
+            made.put(name, column, np.ones((len(values), 5)), form="5D")
+        elif form.endswith("A"):
+            continue
+        else:
+            made.put(name, column, ["x"] * len(values), form="4A", unit="")
+        path = made.write(tmp_path / f"{name}_{column}.fits")
+        try:
+            said = [f"{f.where} {f.what}" for f in audit(open_oifits(path)).findings]
+        except DataError as refused:
+            said = [f"{column} {refused}"] if str(path) in str(refused) else []
+        assert any(column in text for text in said), (name, column)
