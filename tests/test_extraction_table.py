@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 from types import ModuleType
 
 import pytest
-from conftest import ROOT
+from conftest import script
 
 from amibayes.extraction import ExtractOptions
 from amibayes.instrument import load_instrument
@@ -25,13 +24,7 @@ BOUNDS = {
 
 @pytest.fixture(scope="module")
 def table() -> ModuleType:
-    path = ROOT / "docs" / "extraction_table.py"
-    spec = importlib.util.spec_from_file_location("extraction_table", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return script("extraction_table")
 
 
 @pytest.mark.parametrize(
