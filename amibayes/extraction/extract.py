@@ -30,6 +30,7 @@ from amibayes.extraction.image_plane import (
     fringe_sampling,
     shift_of,
 )
+from amibayes.extraction.low_flux import expected_covariance
 from amibayes.extraction.noise import (
     NoiseModel,
     cropped,
@@ -184,14 +185,13 @@ def _measured(
         frames = replace(frames, reason=select(frames, options.clip, LARGEST_SHIFT_PX))
     if not frames.used.any():
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
-    jacobian = bench.sampling.jacobian(flux, samples)
     star = star_image(bench.view)
     response = off_axis_response(star, bench.sampling, template.orientation)
     return _Part(
         template,
         bench,
         frames,
-        bench.sampling.propagated(jacobian, bench.variance),
+        expected_covariance(bench.sampling, flux, samples, bench.variance, bench.skewness),
         response,
         pointing_response(star, bench.sampling, frames.shift_px),
     )
@@ -215,8 +215,8 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
-    variance = np.where(good, noise.variance, 0.0).ravel()
-    return Bench(view, geometry, reference, fit, expected, sampling, variance, options)
+    variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
+    return Bench(view, geometry, reference, fit, expected, sampling, variance, third, options)
 
 
 def _fit_of_median(

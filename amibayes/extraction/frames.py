@@ -109,6 +109,8 @@ class Bench:
         What is measured.
     variance : (n_pixels,) array
         Of the noise of one integration; 0 where a pixel is never used.
+    skewness : (n_pixels,) array
+        Its third cumulant.
     options : ExtractOptions
     """
 
@@ -119,6 +121,7 @@ class Bench:
     expected: Residual
     sampling: Sampling
     variance: FloatArray
+    skewness: FloatArray
     options: ExtractOptions
 
     @cached_property

@@ -38,6 +38,11 @@ class NoiseModel:
     def __post_init__(self) -> None:
         read_only(self, "variance")
 
+    @property
+    def skewness(self) -> FloatArray:
+        """Third cumulant (n_y, n_x): that of photons, of which each is ``per_signal`` units."""
+        return self.per_signal * np.maximum(self.variance - self.constant, 0.0)
+
 
 def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> NoiseModel:
     """Fit the variance that was measured at each pixel.

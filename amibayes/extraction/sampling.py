@@ -118,11 +118,6 @@ class Sampling:
         share[np.arange(self.n_samples), self.baseline] = self.weight
         return share
 
-    def propagated(self, jacobian: FloatArray, variance: FloatArray) -> FloatArray:
-        """Covariance of what has a jacobian by the operator's numbers, from the pixels'."""
-        by_pixel = self.matrix @ jacobian.T
-        return np.asarray(by_pixel.T @ (by_pixel * variance[:, None]))
-
     def bias(self, variance: FloatArray) -> tuple[float, FloatArray]:
         """What noise of independent pixels (n_pixels,) adds to flux² and to the power."""
         n, diagonal = self.n_samples, variance @ self.matrix**2
