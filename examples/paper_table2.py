@@ -43,8 +43,9 @@ from amibayes import (
     significance,
     simulate,
 )
+from amibayes.assumed import covariance_of_errors
 from amibayes.inference.detection import candid_n_sigma
-from amibayes.observables import Observables, covariance_of_errors
+from amibayes.observables import Observables
 from amibayes.planning import PAPER, contrast_curve, expected_observables
 from amibayes.plots.style import MARKERS, SERIES, new_figure, save, styled
 from amibayes.simulation import PRESETS

@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import h5py
@@ -36,15 +36,22 @@ def target(tmp_path: Path) -> Path:
     return path
 
 
-def start(*words: object, before: tuple[str, ...] = (), **more: object) -> subprocess.Popen[str]:
-    """Start the command in a process of its own."""
+def start(
+    *words: object, before: tuple[str, ...] = (), largest: int | None = None, **more: object
+) -> subprocess.Popen[str]:
+    """Start the command in a process of its own, in which no file may become larger."""
+
+    def prepared() -> None:
+        # What is started behind a shell's & ignores Ctrl-C, and so would its children.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if largest is not None:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
+
     command = [*before, sys.executable, "-m", "amibayes", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    # What is started behind a shell's & ignores Ctrl-C, and so would its children.
-    listen = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
-        preexec_fn=listen,
+        preexec_fn=prepared,
         **more,  # type: ignore[call-overload]
     )  # fmt: skip
 
@@ -129,12 +136,10 @@ def test_other_endings(error, said, monkeypatch, capsys) -> None:
 )
 def test_a_full_disk(limit: int, more, file: str, target: Path, tmp_path: Path) -> None:
     """No file may grow past the limit, as if the disk were full at that moment."""
-    import resource
-
     out = tmp_path / "out"
     process = start(
         "search", target, *QUICK, *more, "--out", out, "--quiet",
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        largest=limit,
     )  # fmt: skip
     status, line = ended(process)
     assert status == 4
