@@ -60,6 +60,7 @@ def pair(
     dither_rad: float = DITHER_RAD,
     *,
     noise: bool = True,
+    n_groups: int = N_GROUPS,
 ) -> list[Cube]:
     """Two exposures of one star on one detector, whose flat is known to ``flat_error``.
 
@@ -71,9 +72,9 @@ def pair(
     observation = Observation(
         Scene(),
         load_instrument("niriss", "F430M"),
-        Exposure(N_GROUPS, n, dither_rad=dither_rad),
+        Exposure(n_groups, n, dither_rad=dither_rad),
         detector=detector,
-        count_rate_e_s=photons / n / (N_GROUPS * detector.frame_time_s),
+        count_rate_e_s=photons / n / (n_groups * detector.frame_time_s),
     )
     maps, *exposures = np.random.SeedSequence(seed).spawn(3)
     drawn = draw_maps(detector, (80, 80), np.random.default_rng(maps))
