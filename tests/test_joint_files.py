@@ -21,6 +21,7 @@ from amibayes.observables import join
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.pipeline import search_companion
 from amibayes.report import result_json, summary
+from amibayes.report.words import measured
 
 FAST = ("--separation", "60:400", "--no-posterior", "--no-limits", "--null-draws", "1000")
 
@@ -86,6 +87,18 @@ def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path,
     assert MJD[0] < fit["reference_mjd"] < MJD[2]
     assert results[0]["significance"]["detected"] is None or results[0]["significance"]["detected"]
     assert (tmp_path / "0" / "files.png").stat().st_size > 5000
+    page = (tmp_path / "0" / "report.html").read_text(encoding="utf-8")
+    wanted = [
+        "Contrasts of the bands, each has its own",
+        "NIRISS_4.82um",
+        "Linear motion",
+        "mas/yr",
+    ]
+    wanted += ["Reduced χ² of each file", *(path.name for path in files)]
+    for words in wanted:
+        assert words in page, words
+    for entry in fit["contrasts"]:
+        assert measured(entry["contrast"], entry["errors"]["contrast"]) in page
     assert all(0.2 < r["chi2r_vis2"] < 3.0 for r in results[0]["residuals"])
     assert any("not integrated directly" in w for w in results[0]["warnings"])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from amibayes.inference.tails import LEAST_PROBABILITY
+from amibayes.report.joint_sections import joint_tables
 from amibayes.report.page import Column, Fact, Figure, Section, Table
 from amibayes.report.statement import false_alarm, field
 from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
@@ -38,7 +39,12 @@ def search(content: Json, figures: tuple[Figure, ...]) -> Section:
         f"{fixed(fit['chi2_binary'], 1)} with one, for {count(fit['ndof'], 'degree')} of freedom: "
         f"reduced, from {fixed(fit['chi2r_single'], 3)} to {fixed(fit['chi2r_binary'], 3)}.",
     )
-    return Section("Search", text, tables=(_fit(fit), *_modes(content)), figures=figures)
+    return Section(
+        "Search",
+        text,
+        tables=(_fit(fit), *joint_tables(content), *_modes(content)),
+        figures=figures,
+    )
 
 
 def _fit(fit: Json) -> Table:
