@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -322,6 +323,47 @@ def test_reported_probability_of_a_joint_null_is_uniform(name, free_scale) -> No
     p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
     assert stats.kstest(p, "uniform").pvalue > 1e-4
     assert abs((p < 0.05).sum() - 25) < 4 * np.sqrt(500 * 0.05 * 0.95)
+
+
+UNEQUAL = [(1.0, 3.0, 0.5), (1.0, 1.3, 1.0), (0.5, 1.5, 1.0)]
+
+
+def unequal(scales: tuple[float, ...], n: int, rng: np.random.Generator) -> np.ndarray:
+    """Reported probabilities of n null fits of files whose noise is not what they state."""
+    sheets = [
+        epoch((F430M, F480M)[k % 2], source=str(k), mjd=60000.0 + k, turn_deg=20.0 * k)
+        for k in range(len(scales))
+    ]
+    out = np.empty(n)
+    for i in range(n):
+        parts = []
+        for sheet, scale in zip(sheets, scales, strict=True):
+            data = sheet.data + scale * null_data([sheet], rng, 1)[:, 0]
+            vis2, closure = np.split(data, [sheet.n_vis2])
+            moved = replace(sheet.vis2, value=vis2)
+            turned = replace(sheet.closure_phase, value=closure)
+            parts.append(replace(sheet, vis2=moved, closure_phase=turned))
+        likelihood = free(join(parts))
+        bank = bank_of(likelihood, make_grid(*FIELD, 60.0), np.empty(0))
+        white = single_likelihood(likelihood).residuals(np.empty((1, 0)))
+        statistic = float(bank_statistic(bank, white, free_scale=True)[0])
+        null = null_maxima(bank, 400, rng, free_scale=True)
+        out[i] = (1 + (null >= statistic).sum()) / 401
+    return out
+
+
+@pytest.mark.parametrize(
+    ("scales", "n"),
+    [(UNEQUAL[0], 100), *(pytest.param(s, 500, marks=pytest.mark.slow) for s in UNEQUAL)],
+)
+def test_probability_is_uniform_where_files_state_wrong_errors(scales, n) -> None:
+    """Three files in two bands; 500 sets give P(p < 0.05) to 0.010, P(p < 0.01) to 0.0044."""
+    found = unequal(scales, n, np.random.default_rng([41, UNEQUAL.index(scales), n]))
+    rates = ", ".join(f"{(found < level).mean():.4f}" for level in (0.5, 0.1, 0.05, 0.01))
+    ks = stats.kstest(found, "uniform").pvalue
+    logging.getLogger("joint").info("%s: KS p %.3f, rates %s", scales, ks, rates)
+    assert ks > 1e-4
+    assert stats.binomtest(int((found < 0.05).sum()), n, 0.05).pvalue > 1e-4
 
 
 def test_local_probability_of_two_bands_is_the_chance_at_one_place() -> None:

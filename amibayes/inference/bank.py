@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 from amibayes.inference.estimate import estimate_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import disc
+from amibayes.inference.scale_groups import scale_groups
 from amibayes.inference.scan import Survey
 from amibayes.inference.waves import WIDTH, Waves
 from amibayes.units import MAS, FloatArray
@@ -137,7 +138,10 @@ class TemplateBank:
             self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
         single = likelihood.with_model(replace(likelihood.model, companions=0))
         left = single.residuals(nuisance) if beside is None else likelihood.residuals(beside)
-        self.estimate = estimate_of(likelihood.observables, self.project(left[:, 0]))
+        left = self.project(left)
+        self.estimate = estimate_of(likelihood.observables, left[:, 0])
+        self.groups = scale_groups(likelihood.observables, self.n_nuisance)
+        self.scale = np.sqrt(self.groups.variances(left))[self.groups.label]
 
     def __len__(self) -> int:
         return len(self.grid)
@@ -185,13 +189,17 @@ class TemplateBank:
         gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
         return Survey(contrast, sigma, gain, contrast[:, None])
 
-    def largest_gain(self, data: NDArray[np.float32]) -> tuple[FloatArray, IntArray]:
+    def largest_gain(
+        self, data: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+    ) -> tuple[FloatArray, IntArray]:
         """Search many data sets: largest gain in χ² over the bank, for positive contrast.
 
         Parameters
         ----------
         data : (n_data, n) float32 array
-            Whitened, nuisance directions taken out.
+            Whitened, nuisance directions taken out, times their weights.
+        weight : (n_groups, n) float32 array, optional
+            Weights of the groups of data, where they are not 1.
 
         Returns
         -------
@@ -205,15 +213,31 @@ class TemplateBank:
         data_even = np.ascontiguousarray(data[self._even.rows].T)
         data_odd = np.ascontiguousarray(data[self._odd.rows].T)
         for index, even, odd in self._halves():
-            scale = (1.0 / np.sqrt(self._norm(even, odd))).astype(np.float32)
+            scale = self._inverse_length(even, odd, weight)
             a, b = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
             for half, match in zip(np.split(np.arange(len(index)), 2), (a + b, a - b), strict=True):
-                match *= scale[half]
+                match *= scale[..., half]
                 top = match.argmax(axis=1)
                 value = match[each, top]
                 better = value > best
                 best[better], where[better] = value[better], index[half][top[better]]
         return np.asarray(best, dtype=float) ** 2, where
+
+    def _inverse_length(
+        self, even: FloatArray, odd: FloatArray, weight: NDArray[np.float32] | None
+    ) -> NDArray[np.float32]:
+        """1/√(t·t) of templates, (2m,), or with weights of each data set, (n, 2m)."""
+        if weight is None:
+            return np.asarray(1.0 / np.sqrt(self._norm(even, odd)), dtype=np.float32)
+        square = self.groups.sums(self.project(self._whole(even, odd)) ** 2).astype(np.float32)
+        return np.asarray(1.0 / np.sqrt(weight.T @ square))
+
+    def _whole(self, even: FloatArray, odd: FloatArray) -> FloatArray:
+        """Templates (n_data, 2m) of places and of their mirror images."""
+        templates = np.zeros((self.n_data, 2 * even.shape[1]))
+        templates[self._even.rows] = np.hstack([even, even])
+        templates[self._odd.rows] += np.hstack([odd, -odd])
+        return templates
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
@@ -280,10 +304,7 @@ class TemplateBank:
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
         for index, even, odd in self._halves():
-            templates = np.zeros((self.n_data, len(index)))
-            templates[self._even.rows] = np.hstack([even, even])
-            templates[self._odd.rows] += np.hstack([odd, -odd])
-            yield index, self.project(templates) / np.sqrt(self._norm(even, odd))
+            yield index, self.project(self._whole(even, odd)) / np.sqrt(self._norm(even, odd))
 
     def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""

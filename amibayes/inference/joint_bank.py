@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from amibayes.inference.bank import Grid, IntArray, MatchedFilter, TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.positive import best_positive
+from amibayes.inference.scale_groups import weighted_gain
 from amibayes.inference.scan import Survey
 from amibayes.units import MAS, FloatArray
 
@@ -99,13 +100,19 @@ class JointBank(TemplateBank):
                 tail[at, n:] = rate[better]
         return Survey(*self.scan(residuals), gain, tail, n)
 
-    def largest_gain(self, data: NDArray[np.float32]) -> tuple[FloatArray, IntArray]:
+    def largest_gain(
+        self, data: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+    ) -> tuple[FloatArray, IntArray]:
         """Search many data sets (n_data, n): largest gain over the bank, and where."""
         best = np.zeros(data.shape[1], dtype=np.float32)
         where = np.zeros(data.shape[1], dtype=np.intp)
         each, rows = np.arange(data.shape[1]), np.ascontiguousarray(data.T)
         for index, _, templates in self._all_templates():
-            _, gain = templates.best([rows @ unit.astype(np.float32) for unit in templates.unit])
+            match = [rows @ unit.astype(np.float32) for unit in templates.unit]
+            if weight is None:
+                _, gain = templates.best(match)
+            else:
+                gain = weighted_gain(self.groups, templates.unit, match, weight)
             top = gain.argmax(axis=1)
             value = gain[each, top]
             better = value > best

@@ -130,7 +130,8 @@ def _recover_piece(
     theta, nearer, seed = piece
     signal = injected_signal(likelihood, single, theta)
     rng = np.random.default_rng(seed)
-    hit = search_drawn(bank, rng.standard_normal(signal.shape), rng, frame, signal)
+    noise = rng.standard_normal(signal.shape)
+    hit = search_drawn(bank, noise, rng, frame, signal, own_scales=free_scale)
     fringe, places = resolution_mas(likelihood), theta[:, :2]
     found = _judged(bank, fringe, places, hit, threshold, free_scale=free_scale, nearer=nearer)
     return {name: found[name] for name in ("detected", "located")}
@@ -172,7 +173,8 @@ def judge(
     dict of (n,) arrays
         ``detected`` and ``located`` as in `Recovery`, and the ``statistic``.
     """
-    hit = search_many(bank, bounded(bank, white, frame))
+    own = free_scale and frame is None
+    hit = search_many(bank, bounded(bank, white, frame), own_scales=own)
     return _judged(bank, fringe_mas, places, hit, threshold, free_scale=free_scale, nearer=nearer)
 
 

@@ -45,11 +45,37 @@ class Searched:
     chi2: FloatArray
 
 
-def search_many(bank: TemplateBank, white: FloatArray) -> Searched:
-    """Search data sets (n_data, n), whitened by the bank's own covariance."""
+def search_many(bank: TemplateBank, white: FloatArray, *, own_scales: bool = False) -> Searched:
+    """Search data sets (n_data, n), whitened by the bank's own covariance.
+
+    With ``own_scales`` each group of data is weighed by its own scatter; see
+    `amibayes.inference.scale_groups`. The gain is then that share of χ² which the weighted
+    data lose.
+    """
     data = bank.project(white)
-    gain, position = bank.largest_gain(data.astype(np.float32))
-    return Searched(gain, position, (data**2).sum(axis=0))
+    chi2 = (data**2).sum(axis=0)
+    if not (own_scales and bank.groups.several):
+        gain, position = bank.largest_gain(data.astype(np.float32))
+        return Searched(gain, position, chi2)
+    rows, weight, total = weighted(bank, data)
+    gain, position = bank.largest_gain(rows.astype(np.float32), weight.astype(np.float32))
+    return Searched(gain * chi2 / total, position, chi2)
+
+
+def weighted(bank: TemplateBank, data: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weigh data (n_data, n) without nuisance directions by the scatter of their groups.
+
+    Returns
+    -------
+    rows : (n_data, n) float array
+        To be multiplied by templates.
+    weight : (n_groups, n) float array
+    total : (n,) float array
+        Weighted χ².
+    """
+    weight = 1.0 / bank.groups.variances(data)
+    rows = weight[bank.groups.label] * data
+    return bank.project(rows), weight, (rows * data).sum(axis=0)
 
 
 def search_simulated(
@@ -57,6 +83,8 @@ def search_simulated(
     noise: FloatArray,
     rng: np.random.Generator,
     signal: FloatArray | None = None,
+    *,
+    own_scales: bool = False,
 ) -> Searched:
     """Search simulated data sets, each with a covariance estimated anew where it was estimated.
 
@@ -69,9 +97,12 @@ def search_simulated(
         For the estimates.
     signal : (n_data, n) float array, optional
         What is in the data beside noise, whitened by the bank's own covariance.
+    own_scales : bool
+        As in `search_many`; an estimated covariance has measured them.
     """
     if bank.estimate is None:
-        return search_many(bank, noise if signal is None else noise + signal)
+        white = noise if signal is None else noise + signal
+        return search_many(bank, white, own_scales=own_scales)
     drawn = bank.project(bank.estimate.draw(noise, rng))
     data = drawn if signal is None else drawn + bank.project(signal)
     inverse = _Inverse.of(bank.estimate, drawn)

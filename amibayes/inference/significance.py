@@ -17,8 +17,15 @@ import numpy as np
 from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.inference.redraw import Searched, search_many, search_simulated, twice_log_ratio
+from amibayes.inference.redraw import (
+    Searched,
+    search_many,
+    search_simulated,
+    twice_log_ratio,
+    weighted,
+)
 from amibayes.inference.robust import Frame, scores
+from amibayes.inference.scale_groups import weighted_gain
 from amibayes.inference.tails import (
     LEAST_PROBABILITY,
     TAIL_FRACTION,
@@ -165,7 +172,8 @@ def bank_statistic(
     With a ``frame`` that of `amibayes.inference.robust.scores`: outliers count no more than
     their bounded score, in the data and in the null sets.
     """
-    found = search_many(bank, bounded(bank, white, frame))
+    own = free_scale and frame is None
+    found = search_many(bank, bounded(bank, white, frame), own_scales=own)
     return twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)
 
 
@@ -181,10 +189,23 @@ def statistic_field(
 
     Its maximum is that of `bank_statistic`.
     """
-    white = bounded(bank, white[:, None], frame)[:, 0]
-    gain = bank.survey(white).gain
-    chi2 = np.full(len(gain), float((bank.project(white) ** 2).sum()))
-    return twice_log_ratio(bank, gain, chi2, free_scale=free_scale)
+    data = bank.project(bounded(bank, white[:, None], frame))
+    if free_scale and frame is None and bank.groups.several:
+        gain, chi2 = _weighted_field(bank, data)
+    else:
+        gain, chi2 = bank.survey(data[:, 0]).gain, float((data**2).sum())
+    return twice_log_ratio(bank, gain, np.full(len(gain), chi2), free_scale=free_scale)
+
+
+def _weighted_field(bank: TemplateBank, data: FloatArray) -> tuple[FloatArray, float]:
+    """Gain in weighted χ² of one data set (n_data, 1) everywhere, and its weighted χ²."""
+    rows, weight, total = weighted(bank, data)
+    gain = np.zeros(len(bank))
+    for index, units in bank.by_band():
+        match = [rows.T @ unit for unit in units]
+        found = weighted_gain(bank.groups, units, match, weight)[0]
+        gain[index] = np.maximum(gain[index], found)
+    return gain, float(total[0])
 
 
 def null_maxima(
@@ -238,7 +259,9 @@ def _null_piece(
     seed, size = piece
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((bank.n_data, size), dtype=np.float32).astype(float)
-    found = search_drawn(bank, noise, rng, frame)
+    own = free_scale and frame is None
+    noise = noise * bank.scale[:, :1] if own and bank.estimate is None else noise
+    found = search_drawn(bank, noise, rng, frame, own_scales=own)
     return {"statistic": twice_log_ratio(bank, found.gain, found.chi2, free_scale=free_scale)}
 
 
@@ -248,6 +271,8 @@ def search_drawn(
     rng: np.random.Generator,
     frame: Frame | None = None,
     signal: FloatArray | None = None,
+    *,
+    own_scales: bool = False,
 ) -> Searched:
     """Search simulated data sets as the observed one is searched, robustly or not.
 
@@ -262,9 +287,11 @@ def search_drawn(
         Of the robust statistic.
     signal : (n_data, n) float array, optional
         What is in the data beside noise, whitened.
+    own_scales : bool
+        As in `amibayes.inference.redraw.search_many`, for the statistic free of scales.
     """
     if frame is None:
-        return search_simulated(bank, noise, rng, signal)
+        return search_simulated(bank, noise, rng, signal, own_scales=own_scales)
     white = noise if signal is None else noise + signal
     return search_many(bank, bounded(bank, white, frame))
 
