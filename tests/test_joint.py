@@ -348,7 +348,8 @@ def unequal(scales: tuple[float, ...], n: int, rng: np.random.Generator) -> np.n
         white = single_likelihood(likelihood).residuals(np.empty((1, 0)))
         statistic = float(bank_statistic(bank, white, free_scale=True)[0])
         null = null_maxima(bank, 400, rng, free_scale=True)
-        out[i] = (1 + (null >= statistic).sum()) / 401
+        ties = rng.random() * (null == statistic).sum()
+        out[i] = (1 + (null > statistic).sum() + ties) / 401
     return out
 
 

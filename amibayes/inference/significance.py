@@ -227,7 +227,8 @@ def null_maxima(
     n_draws : int
     rng : numpy.random.Generator
     free_scale : bool
-        Use the statistic of `profiled`, for noise whose size was fitted.
+        Use the statistic of `profiled`, for noise whose size was fitted, in each group of data
+        by itself; see `amibayes.inference.scale_groups`.
     frame : Frame, optional
         Use the robust statistic; see `bank_statistic`.
     executor : Executor, optional
