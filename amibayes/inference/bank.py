@@ -16,11 +16,10 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from amibayes.inference.estimate import estimate_of
 from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.model import disc
+from amibayes.inference.linear import linear_response, nuisance_directions
 from amibayes.inference.scale_groups import scale_groups
 from amibayes.inference.scan import Survey
 from amibayes.inference.waves import WIDTH, Waves
@@ -29,9 +28,6 @@ from amibayes.units import MAS, FloatArray
 IntArray = NDArray[np.intp]
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
-
-DENSE_ENOUGH = 0.15
-"""Share of non-zeros above which a dense product is the faster one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +124,12 @@ class TemplateBank:
         self.n_contrasts = likelihood.model.n_contrasts
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
-        self._even, self._odd, self._primary = _linear_response(likelihood, nuisance)
+        self._even, self._odd, self._primary = linear_response(likelihood, nuisance)
         self._offset = np.asarray(self._even.matrix @ self._primary)
         both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
         self._even_shared, self._odd_shared = both[1:]
         if beside is None:
-            self.nuisance_basis = _nuisance_basis(likelihood, nuisance)
+            self.nuisance_basis = nuisance_directions(likelihood, nuisance)
         else:
             self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
         single = likelihood.with_model(replace(likelihood.model, companions=0))
@@ -148,9 +144,10 @@ class TemplateBank:
 
     def beside(self, residuals: FloatArray) -> Self:
         """Make the same bank for data that left other whitened residuals (n_data,)."""
-        other = copy(self)
+        other, left = copy(self), self.project(residuals)
+        other.scale = np.sqrt(self.groups.variances(left[:, None]))[self.groups.label]
         if self.estimate is not None:
-            other.estimate = replace(self.estimate, residual=self.project(residuals))
+            other.estimate = replace(self.estimate, residual=left)
         return other
 
     @property
@@ -229,15 +226,16 @@ class TemplateBank:
         """1/√(t·t) of templates, (2m,), or with weights of each data set, (n, 2m)."""
         if weight is None:
             return np.asarray(1.0 / np.sqrt(self._norm(even, odd)), dtype=np.float32)
-        square = self.groups.sums(self.project(self._whole(even, odd)) ** 2).astype(np.float32)
+        whole = np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
+        square = self.groups.sums(whole**2).astype(np.float32)
         return np.asarray(1.0 / np.sqrt(weight.T @ square))
 
-    def _whole(self, even: FloatArray, odd: FloatArray) -> FloatArray:
-        """Templates (n_data, 2m) of places and of their mirror images."""
-        templates = np.zeros((self.n_data, 2 * even.shape[1]))
-        templates[self._even.rows] = np.hstack([even, even])
-        templates[self._odd.rows] += np.hstack([odd, -odd])
-        return templates
+    def _laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
+        """Templates (n_data, m) of their two parts, nuisance directions taken out."""
+        templates = np.zeros((self.n_data, even.shape[1]))
+        templates[self._even.rows] = even
+        templates[self._odd.rows] += odd
+        return self.project(templates)
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
@@ -268,10 +266,7 @@ class TemplateBank:
     def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
         """Templates of unit norm (n_data, m) at any positions, on the lattice or off it."""
         even, odd = self._parts_at(east_mas, north_mas)
-        templates = np.zeros((self.n_data, len(east_mas)))
-        templates[self._even.rows] = even
-        templates[self._odd.rows] += odd
-        templates = self.project(templates)
+        templates = self._laid_out(even, odd)
         return np.asarray(templates / np.linalg.norm(templates, axis=0))
 
     def _parts_at(
@@ -304,7 +299,8 @@ class TemplateBank:
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
         for index, even, odd in self._halves():
-            yield index, self.project(self._whole(even, odd)) / np.sqrt(self._norm(even, odd))
+            whole = np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
+            yield index, whole / np.sqrt(self._norm(even, odd))
 
     def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""
@@ -361,48 +357,3 @@ class TemplateBank:
 def _both(even: FloatArray, odd: FloatArray) -> FloatArray:
     """Values at positions and at their mirror images, one after the other."""
     return np.concatenate([even + odd, even - odd], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """A matrix (n_rows, n_samples) and the data that its rows stand for."""
-
-    matrix: csr_array | FloatArray
-    rows: IntArray
-
-
-def _part(matrix: csr_array) -> _Part:
-    matrix = csr_array(matrix)
-    matrix.eliminate_zeros()
-    rows = np.flatnonzero(np.diff(matrix.indptr))
-    kept = matrix[rows]
-    dense = kept.nnz > DENSE_ENOUGH * kept.shape[0] * kept.shape[1]
-    return _Part(kept.toarray() if dense else kept, rows)
-
-
-def _linear_response(
-    likelihood: Likelihood, nuisance: FloatArray
-) -> tuple[_Part, _Part, FloatArray]:
-    """Matrices A, B and V₀ with template = A·(Re(E) − V₀) + B·Im(−E).
-
-    With V₀ = D/(1 + f) real, dV/dc = (E − V₀)/(1 + f), hence dV² = 2V₀ Re dV and
-    dφ = Im dV / V₀.
-    """
-    model = replace(likelihood.model, companions=0)
-    _, diameter, background = model.split(np.atleast_2d(nuisance))
-    scale = 1.0 / (1.0 + float(background[0]))
-    primary = disc(likelihood.samples, diameter)[:, 0] * scale
-    whitening = likelihood.observables.covariance.whitening
-    n2 = likelihood.samples.squares.shape[0]
-    by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
-    even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary))
-    odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale / primary))
-    return even, odd, np.asarray(primary)
-
-
-def _nuisance_basis(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:
-    """Orthonormal directions (n_data, k) in which the nuisance parameters move the data."""
-    single = replace(likelihood.model, companions=0)
-    if not single.parameters:
-        return np.empty((likelihood.n_independent, 0))
-    return np.asarray(np.linalg.qr(likelihood.with_model(single).jacobian(nuisance))[0])
