@@ -123,6 +123,19 @@ def test_companions_in_the_images_keep_their_contrast(
     assert np.hypot(*(found - truth)[:2]) < 0.5
 
 
+@pytest.mark.parametrize("contrast", [0.003, 0.25])
+def test_matched_is_exact_off_the_axis(niriss: Instrument, contrast: float) -> None:
+    """Without noise; `fringes` is off by a percent here."""
+    offset = (337.0, 184.0)
+    images = binary_images(niriss, jittered(12, 41), offset, contrast)
+    alone = binary_images(niriss, jittered(12, 42), (0.0, 0.0), 0.0)
+    target, star = (extract(cube_of(i, niriss), "matched") for i in (images, alone))
+    likelihood = Likelihood(calibrate(target, [star]).observables)
+    found = search(likelihood, (200.0, 500.0)).companion
+    assert found.contrast == pytest.approx(contrast, rel=1e-3)
+    assert np.hypot(found.east_mas + offset[0], found.north_mas - offset[1]) < 0.02
+
+
 def truth_differences(calibrated: Observables, theta: list[float]) -> tuple[float, float]:
     """RMS of V² and of closure phase (degrees) about a binary."""
     likelihood = Likelihood(calibrated)

@@ -30,6 +30,7 @@ from amibayes.inference.search import search
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.report.common import data_json
+from amibayes.response import EXPONENTS
 
 FIELD = (50.0, 400.0)
 TRUTH = [110.0, -75.0, 0.01]
@@ -317,6 +318,17 @@ def test_reader_is_warned_of_few_integrations_and_of_errors_far_too_large() -> N
     assert "far too large" not in cautions(data)
     exact = simulated(niriss(), TRUTH, None)
     assert "n_sigma" in cautions(exact)
+
+
+def test_reader_is_warned_of_bright_companions_in_images() -> None:
+    """The full validation (docs/validation.md) found their intervals too narrow."""
+    for contrast, expected in ((0.01, False), (0.06, True)):
+        data = simulated(niriss(), [*TRUTH[:2], contrast], np.random.default_rng(3))
+        assert "measured in images" not in cautions(data)
+        n = len(data.setups[0].stations)
+        flat = np.zeros((n, n, len(EXPONENTS)))
+        extracted = replace(data, setups=(replace(data.setups[0], response=flat),))
+        assert ("measured in images" in cautions(extracted)) == expected
 
 
 def test_result_states_what_the_covariance_rests_on() -> None:
