@@ -172,12 +172,11 @@ def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:
 
 def _moved(view: View, by: FloatArray) -> View:
     """A view with another scale (relative), rotation, and centre."""
-    scale, turn, x, y = (float(b) for b in by)
+    scale, turn = (float(b) for b in by[:2])
     instrument = view.instrument
     pixel = instrument.pixel_scale_rad * (1.0 + scale)
     return replace(
-        view,
+        view.moved(by[2:]),
         instrument=replace(instrument, pixel_scale_rad=pixel),
         rotation_rad=view.rotation_rad + turn,
-        centre_px=(view.centre_px[0] + x, view.centre_px[1] + y),
     )

@@ -7,7 +7,7 @@ it is given the value that the fit then predicts, for which a small system is so
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -157,7 +157,7 @@ def centre_on(
     """
     pixels = np.where(good, image, 0.0)
     even = np.ones(view.shape)
-    view = _moved(view, _shift_of_transform(view, pixels))
+    view = view.moved(_shift_of_transform(view, pixels))
     for _ in range(MOST_STEPS):
         basis = view.basis()
         fit = fringe_fit(basis, even, good)
@@ -165,7 +165,7 @@ def centre_on(
         step = shift_of(view, samples, np.abs(samples[0]))[0]
         if np.hypot(*step) < CONVERGED_PX and flux[0] > 0.0:
             return view, basis, fit
-        view = _moved(view, step)
+        view = view.moved(step)
         if not flux[0] > 0.0 or np.abs(view.centre_px).max() > 0.5 * max(view.shape):
             break
     raise DataError(
@@ -173,11 +173,6 @@ def centre_on(
         source=source,
         remedy="check instrument, filter and pixel scale",
     )
-
-
-def _moved(view: View, by_px: FloatArray) -> View:
-    x, y = (float(c) for c in view.centre_px + by_px)
-    return replace(view, centre_px=(x, y))
 
 
 def _shift_of_transform(view: View, image: FloatArray) -> FloatArray:

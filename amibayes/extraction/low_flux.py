@@ -13,6 +13,7 @@ third cumulant correlates first and second order, by as much as the second order
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -146,6 +147,7 @@ class _Products:
         pairs = (np.einsum("ti,tij,tj->t", p, own, q) for p, q in ((a, b), (b, c), (c, a)))
         return np.asarray(1.0 + sum(pairs))
 
+    @cached_property
     def _third(self) -> FloatArray:
         """Third derivatives (n_triangles, 6, 6, 6)."""
         orders = ("ijk", "ikj", "jik", "jki", "kij", "kji")
@@ -156,13 +158,13 @@ class _Products:
         """What the third order has in common with the first, as a slope by the numbers."""
         own = noise[self.numbers[:, :, None], self.numbers[:, None, :]]
         slope = np.zeros((len(self.numbers), self.n_numbers))
-        part = 0.5 * np.einsum("tijk,tjk->ti", self._third(), own)
+        part = 0.5 * np.einsum("tijk,tjk->ti", self._third, own)
         np.put_along_axis(slope, self.numbers, part, axis=1)
         return slope
 
     def third_order(self, noise: FloatArray) -> FloatArray:
         """Covariance (n_triangles, n_triangles) of the rest of the third order."""
-        third = self._third()
+        third = self._third
         between = noise[self.numbers[:, None, :, None], self.numbers[None, :, None, :]]
         turned = np.einsum("tijk,tuia->tuajk", third, between)
         turned = np.einsum("tuajk,tujb->tuabk", turned, between)

@@ -73,6 +73,11 @@ class View:
         """(n_baselines, 2) fringe frequencies, cycles per pixel."""
         return np.asarray(self.uv_m * (self.instrument.pixel_scale_rad / self.wavelength_m))
 
+    def moved(self, by_px: FloatArray) -> View:
+        """The same with the star elsewhere, by (x, y)."""
+        x, y = (float(c) for c in self.centre_px + by_px)
+        return replace(self, centre_px=(x, y))
+
     def basis(self) -> FringeBasis:
         """Make the fringe model of this image."""
         reach = max(self.shape) + 2.0 * max(abs(c) for c in self.centre_px)

@@ -21,7 +21,7 @@ from amibayes.inference.estimate import estimate_of
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.linear import linear_response, nuisance_directions
 from amibayes.inference.scale_groups import scale_groups
-from amibayes.inference.scan import Survey
+from amibayes.inference.scan import Highest, Survey
 from amibayes.inference.waves import WIDTH, Waves
 from amibayes.units import MAS, FloatArray
 
@@ -204,9 +204,7 @@ class TemplateBank:
         position : (n,) int array
             Where on the grid.
         """
-        best = np.zeros(data.shape[1], dtype=np.float32)
-        where = np.zeros(data.shape[1], dtype=np.intp)
-        each = np.arange(data.shape[1])
+        highest = Highest(data.shape[1])
         data_even = np.ascontiguousarray(data[self._even.rows].T)
         data_odd = np.ascontiguousarray(data[self._odd.rows].T)
         for index, even, odd in self._halves():
@@ -214,11 +212,8 @@ class TemplateBank:
             a, b = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
             for half, match in zip(np.split(np.arange(len(index)), 2), (a + b, a - b), strict=True):
                 match *= scale[..., half]
-                top = match.argmax(axis=1)
-                value = match[each, top]
-                better = value > best
-                best[better], where[better] = value[better], index[half][top[better]]
-        return np.asarray(best, dtype=float) ** 2, where
+                highest.look(index[half], match)
+        return np.asarray(highest.score, dtype=float) ** 2, highest.position
 
     def _inverse_length(
         self, even: FloatArray, odd: FloatArray, weight: NDArray[np.float32] | None
@@ -226,8 +221,7 @@ class TemplateBank:
         """1/√(t·t) of templates, (2m,), or with weights of each data set, (n, 2m)."""
         if weight is None:
             return np.asarray(1.0 / np.sqrt(self._norm(even, odd)), dtype=np.float32)
-        whole = np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
-        square = self.groups.sums(whole**2).astype(np.float32)
+        square = self.groups.sums(self._both_laid_out(even, odd) ** 2).astype(np.float32)
         return np.asarray(1.0 / np.sqrt(weight.T @ square))
 
     def _laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
@@ -236,6 +230,10 @@ class TemplateBank:
         templates[self._even.rows] = even
         templates[self._odd.rows] += odd
         return self.project(templates)
+
+    def _both_laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
+        """Templates (n_data, 2m) of positions and, after them, of their mirror images."""
+        return np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
@@ -299,8 +297,7 @@ class TemplateBank:
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
         for index, even, odd in self._halves():
-            whole = np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
-            yield index, whole / np.sqrt(self._norm(even, odd))
+            yield index, self._both_laid_out(even, odd) / np.sqrt(self._norm(even, odd))
 
     def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""

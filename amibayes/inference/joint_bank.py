@@ -19,7 +19,7 @@ from amibayes.inference.bank import Grid, IntArray, MatchedFilter, TemplateBank
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.positive import best_positive
 from amibayes.inference.scale_groups import weighted_gain
-from amibayes.inference.scan import Survey
+from amibayes.inference.scan import Highest, Survey
 from amibayes.units import MAS, FloatArray
 
 RATE_STEPS_PER_FRINGE = 4
@@ -104,20 +104,15 @@ class JointBank(TemplateBank):
         self, data: NDArray[np.float32], weight: NDArray[np.float32] | None = None
     ) -> tuple[FloatArray, IntArray]:
         """Search many data sets (n_data, n): largest gain over the bank, and where."""
-        best = np.zeros(data.shape[1], dtype=np.float32)
-        where = np.zeros(data.shape[1], dtype=np.intp)
-        each, rows = np.arange(data.shape[1]), np.ascontiguousarray(data.T)
+        highest, rows = Highest(data.shape[1]), np.ascontiguousarray(data.T)
         for index, _, templates in self._all_templates():
             match = [rows @ unit.astype(np.float32) for unit in templates.unit]
             if weight is None:
                 _, gain = templates.best(match)
             else:
                 gain = weighted_gain(self.groups, templates.unit, match, weight)
-            top = gain.argmax(axis=1)
-            value = gain[each, top]
-            better = value > best
-            best[better], where[better] = value[better], index[top[better]]
-        return np.asarray(best, dtype=float), where
+            highest.look(index, gain)
+        return np.asarray(highest.score, dtype=float), highest.position
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (contrasts and rates, gain), off the lattice."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.estimate import Estimate
 from amibayes.inference.positive import best_positive
+from amibayes.inference.scan import Highest
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
@@ -109,15 +110,10 @@ def search_simulated(
     weighted = inverse.solve(data)
     chi2 = (data * weighted).sum(axis=0)
     rows = weighted.T.astype(np.float32)
-    each = np.arange(len(rows))
-    best, where = np.zeros(len(rows), dtype=np.float32), np.zeros(len(rows), dtype=np.intp)
+    highest = Highest(len(rows))
     for index, templates in bank.by_band():
-        score = inverse.scores(templates.astype(np.float32), rows)
-        top = score.argmax(axis=1)
-        value = score[each, top]
-        better = value > best
-        best[better], where[better] = value[better], index[top[better]]
-    return Searched(np.asarray(best, dtype=float) ** 2, where, chi2)
+        highest.look(index, inverse.scores(templates.astype(np.float32), rows))
+    return Searched(np.asarray(highest.score, dtype=float) ** 2, highest.position, chi2)
 
 
 @dataclass(frozen=True, eq=False)

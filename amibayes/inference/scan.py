@@ -12,6 +12,29 @@ from amibayes.units import FloatArray
 IntArray = NDArray[np.intp]
 
 
+class Highest:
+    """Largest score of many data sets over positions that are looked at part by part.
+
+    Attributes
+    ----------
+    score : (n,) float32 array
+        0 where none was above.
+    position : (n,) int array
+    """
+
+    def __init__(self, n: int) -> None:
+        self.score = np.zeros(n, dtype=np.float32)
+        self.position = np.zeros(n, dtype=np.intp)
+        self._each = np.arange(n)
+
+    def look(self, index: IntArray, score: NDArray[np.floating]) -> None:
+        """Look at scores (n, m) of positions (m,)."""
+        top = score.argmax(axis=1)
+        value = score[self._each, top]
+        better = value > self.score
+        self.score[better], self.position[better] = value[better], index[top[better]]
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
     """What a scan of one data set found at every position.

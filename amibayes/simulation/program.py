@@ -259,10 +259,8 @@ class _Reader:
         return Exposure(
             groups,
             integrations,
-            jitter_rad=table.number("jitter_mas", 7.0, at_least=0.0, at_most=LARGEST_POINTING_MAS)
-            * MAS,
-            dither_rad=table.number("dither_mas", 15.0, at_least=0.0, at_most=LARGEST_POINTING_MAS)
-            * MAS,
+            jitter_rad=_pointing(table, "jitter_mas", 7.0),
+            dither_rad=_pointing(table, "dither_mas", 15.0),
             n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MOST_PIXELS),
             keep_ramps=table.flag("ramps", False) or self.overrides.ramps,
         )
