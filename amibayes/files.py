@@ -6,8 +6,8 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -92,17 +92,40 @@ def sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
+def short_names(paths: Sequence[str | Path]) -> list[str]:
+    """Names of files, with as many of their folders as it takes to tell each from the others."""
+    parts = [Path(path).parts for path in paths]
+    names = []
+    for mine in parts:
+        others = [other for other in parts if other != mine]
+        depth = 1
+        while depth < len(mine) and any(o[-depth:] == mine[-depth:] for o in others):
+            depth += 1
+        names.append(str(Path(*mine[-depth:])) if mine else "")
+    return names
+
+
 _held: dict[Path, int] = {}
 """Folders that this process writes into, each with the handle that locks it."""
+
+_made: set[Path] = set()
+"""Folders that were not there before."""
 
 
 @contextmanager
 def folders_held() -> Iterator[None]:
-    """Let go, at the end, of the folders that `output_folder` has taken meanwhile."""
-    before = set(_held)
+    """Let go, at the end, of the folders that `output_folder` has taken meanwhile.
+
+    Those that it made and nothing was written into are taken away again.
+    """
+    before, made_before = set(_held), set(_made)
     try:
         yield
     finally:
+        for folder in _made - made_before:
+            with suppress(OSError):  # what holds files stays
+                folder.rmdir()
+        _made.intersection_update(made_before)
         for folder in set(_held) - before:
             os.close(_held.pop(folder))
 
@@ -135,7 +158,8 @@ def _hold(folder: Path) -> None:
 def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
     """Make ``folder`` ready for files called ``names``, and keep other runs out of it.
 
-    The lock is released by `folders_held`, or with the process.
+    The lock is released by `folders_held`, or with the process; a folder that stays empty goes
+    with it.
 
     Raises
     ------
@@ -144,6 +168,7 @@ def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> P
         run has the folder, or where it is a file, cannot be made or not be written into.
     """
     path = Path(folder)
+    is_new = not path.exists()
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -152,6 +177,8 @@ def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> P
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise UsageError("cannot be written into", source=path, remedy="choose another --out")
+    if is_new:
+        _made.add(path.resolve())
     _hold(path)
     present = [name for name in names if (path / name).exists()]
     if present and not overwrite:

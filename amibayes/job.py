@@ -40,7 +40,7 @@ class SearchOptions:
     closure_covariance : {"assumed", "diagonal"}
         For files that give errors and no correlations.
     calibration : {"hierarchical", "weighted"}, optional
-        By default hierarchical with 3 calibrators or more.
+        By default hierarchical where 3 calibrators or more share a baseline.
     clip : float
         Sigma clipping of the calibrators.
     keep_all : bool

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.files import short_names
 from amibayes.inference.by_file import file_residuals
 from amibayes.inference.limits import DetectionLimit
 from amibayes.inference.search import resolution_mas
@@ -96,7 +97,7 @@ def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
 
 def _calibrators(report: SearchReport) -> Figure:
     kept = [bool(c["kept"]) for c in calibrator_verdicts(report)]
-    return calibrator_plot(report.references, kept, [Path(p).name for p in report.calibrators])
+    return calibrator_plot(report.references, kept, short_names(report.calibrators))
 
 
 def _null(weight: Significance) -> Figure:
@@ -118,14 +119,22 @@ def _corner(report: SearchReport) -> Figure:
     posterior = report.posterior
     assert posterior is not None
     return corner_plot(
-        posterior.samples, posterior.names, best=[float(x) for x in report.result.theta]
+        posterior.samples, _labels(report), best=[float(x) for x in report.result.theta]
     )
+
+
+def _labels(report: SearchReport) -> list[str]:
+    """Parameters of the posterior, every contrast with its band where there are several."""
+    assert report.posterior is not None
+    bands = report.result.likelihood.model.bands
+    firsts = {"contrast", "contrast_2"} if bands else set()
+    return [f"{n}[{bands[0]}]" if n in firsts else n for n in report.posterior.names]
 
 
 def _chains(report: SearchReport) -> Figure:
     posterior = report.posterior
     assert posterior is not None
-    return trace_plot(posterior.chain, posterior.names, posterior.n_burn)
+    return trace_plot(posterior.chain, _labels(report), posterior.n_burn)
 
 
 def _limits(report: SearchReport) -> Figure:

@@ -126,6 +126,7 @@ def _calibrated(
                 separation_mas=options.separation_mas,
                 null_draws=VETTING_DRAWS,
                 limits=False,
+                fewest=FEWEST_TO_VET,
                 seed=options.seed,
             )
             believed = _believed(references, vetting)

@@ -43,20 +43,34 @@ EXPLAINED = {
 }
 
 PICTURES = {
-    "ranks": ("ranks", "Ranks of the truths", "How far the ranks of the truths stray from uniform"),
+    "ranks": (
+        "ranks",
+        "Ranks of the truths",
+        "How far the truths' ranks stray from uniform.",
+    ),
     "false alarms": (
         "false_alarms",
         "False alarms",
-        "Share of stars without a companion that reach a stated false-alarm probability",
+        "Share of stars without a companion that reach a stated false-alarm probability.",
     ),
-    "coverage": ("coverage", "Coverage", "Share of intervals that hold the truth"),
+    "coverage": ("coverage", "Coverage", "Share of intervals that hold the truth."),
     "completeness": (
         "completeness",
         "Promised and found",
-        "Share of companions found against the promise of the limits",
+        "Share of companions found against the promise of the limits.",
     ),
 }
 """Group of checks → file name, title and description of its picture."""
+
+
+QUANTITIES = {
+    "east_mas": "east",
+    "north_mas": "north",
+    "ln_contrast": "contrast",
+    "separation_mas": "separation",
+    "position_angle_deg": "position angle",
+    "delta_mag": "magnitude difference",
+}
 
 
 def validation_json(validation: Validation) -> dict[str, Any]:
@@ -207,7 +221,7 @@ def _row(check: Check) -> tuple[str, ...]:
 
     said = "holds" if check.passed else "FAILS"
     return (
-        check.name,
+        plainly(check.name),
         str(check.n),
         shown(check.measured),
         shown(check.expected),
@@ -215,6 +229,13 @@ def _row(check: Check) -> tuple[str, ...]:
         f"{check.p_value:.2g}" if np.isfinite(check.measured) else "–",
         said if np.isfinite(check.measured) else "too few",
     )
+
+
+def plainly(name: str) -> str:
+    """A check's name with its quantities as a reader calls them."""
+    for quantity, called in QUANTITIES.items():
+        name = name.replace(quantity, called)
+    return name.replace("% interval", "\u00a0% interval")
 
 
 def _what_was_done(validation: Validation, folder: str) -> Section:
@@ -247,10 +268,15 @@ def validation_table(validation: Validation) -> list[str]:
     shown = failed or [c for c in validation.checks if c.group != "ranks"]
     lines = [
         f"{'check':<52}{'n':>6}{'measured':>10}{'expected':>10}{'error':>8}{'p':>9}",
-        *(
-            f"{c.name:<52}{c.n:>6}{c.measured:>10.3f}{c.expected:>10.3f}{c.error:>8.3f}"
-            f"{c.p_value:>9.2g}"
-            for c in shown[:16]
-        ),
+        *(_line(c) for c in shown[:16]),
     ]
     return [*lines, verdict(len(validation.checks), failed)]
+
+
+def _line(check: Check) -> str:
+    if not np.isfinite(check.measured):
+        return f"{check.name:<52}{check.n:>6}{'too few':>10}"
+    return (
+        f"{check.name:<52}{check.n:>6}{check.measured:>10.3f}{check.expected:>10.3f}"
+        f"{check.error:>8.3f}{check.p_value:>9.2g}"
+    )

@@ -11,11 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
+from scipy.sparse.csgraph import connected_components
 
 from amibayes.calibration import Method, calibrate
+from amibayes.calibration.matching import keys_of, match, sharing
 from amibayes.errors import DataError
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.detection import chi2_survival
@@ -31,7 +34,7 @@ from amibayes.inference.significance import (
     bank_statistic,
     significance,
 )
-from amibayes.observables import Observables
+from amibayes.observables import BoolArray, Observables
 
 ALPHA = 0.003
 """Probability of each of the three tests below which a calibrator is dropped."""
@@ -102,9 +105,10 @@ def vet(
     null_draws: int = NULL_DRAWS,
     limits: bool = True,
     charge_levels: Sequence[float] | None = None,
+    fewest: int = 2,
     seed: int = 1,
 ) -> Vetting:
-    """Judge every calibrator, against the others and by itself.
+    """Judge every calibrator, against the others that share baselines with it and by itself.
 
     Parameters
     ----------
@@ -121,6 +125,8 @@ def vet(
         Measure the detection limit of each calibrator as well.
     charge_levels : sequence of float, optional
         Of the target, then of each calibrator.
+    fewest : int
+        Calibrators that must share baselines to be judged against each other; fewer are kept.
     seed : int
 
     Raises
@@ -131,22 +137,24 @@ def vet(
     if not calibrators:
         raise DataError("no calibrator given", remedy="give at least one")
     data = [c.unflagged() for c in calibrators]
-    compare = not calibrated and len(data) > 1
     leave_out = _LeaveOut(data)
-    agreement, dropped = _compared(leave_out, alpha) if compare else ([None] * len(data), set())
+    agreement: list[float | None] = [None] * len(data)
+    # Alone and uncalibrated, the instrument's own closure phases would pass for a companion.
+    judged: list[Observables | None] = list(data if calibrated else [None] * len(data))
+    dropped: set[int] = set()
+    for family in [] if calibrated else leave_out.families(max(fewest, 2)):
+        dropped |= _compare(leave_out, family, agreement, alpha)
+        for k in family:
+            judged[k] = leave_out.rest(k, [j for j in family if j not in dropped])
     streams = np.random.SeedSequence(seed).spawn(len(data))
     verdicts = []
     for k, stream in enumerate(streams):
-        others = [j for j in range(len(data)) if j != k and j not in dropped]
-        left = leave_out.rest(k, others) if compare and others else data[k]
-        # Alone and uncalibrated, the instrument's own closure phases would pass for a companion.
-        judged = left if calibrated or (compare and others) else None
         verdict = Vetted(
             data[k].source, True, "", agreement[k], charge_ratio=_ratio(charge_levels, k)
         )
-        if judged is not None:
+        if (left := judged[k]) is not None:
             rng = np.random.default_rng(stream)
-            verdict = _by_itself(verdict, judged, separation_mas, alpha, null_draws, limits, rng)
+            verdict = _by_itself(verdict, left, separation_mas, alpha, null_draws, limits, rng)
         verdicts.append(_decided(verdict, k in dropped, alpha))
     return Vetting(tuple(verdicts), alpha)
 
@@ -158,7 +166,9 @@ def _ratio(charge_levels: Sequence[float] | None, k: int) -> float | None:
 def _against(one: Observables, others: Sequence[Observables]) -> Observables:
     """What the other calibrators leave of one: V² = 1 and closure phase 0, if all are points."""
     # The scatter between calibrators is pooled over all baselines: two others can tell it.
-    method: Method = "hierarchical" if len(others) > 1 else "weighted"
+    keys = keys_of(one)
+    seen = [np.bincount(match(other, keys).key, minlength=len(keys)) > 0 for other in others]
+    method: Method = "hierarchical" if np.sum(seen, axis=0).max() > 1 else "weighted"
     return calibrate(one, others, method=method, clip=None).observables.unflagged()
 
 
@@ -169,34 +179,49 @@ class _LeaveOut:
         self.data = data
         self._made: dict[tuple[int, ...], Observables] = {}
 
-    def rest(self, one: int, others: Sequence[int]) -> Observables:
-        """What the others leave of one."""
-        key = (one, *others)
+    @cached_property
+    def _sharing(self) -> BoolArray:
+        return sharing(self.data)
+
+    def families(self, fewest: int) -> list[list[int]]:
+        """Calibrators that share baselines, with each other or by way of a third."""
+        n, label = connected_components(self._sharing, directed=False)
+        families = [np.flatnonzero(label == i).tolist() for i in range(n)]
+        return [family for family in families if len(family) >= fewest]
+
+    def rest(self, one: int, family: Sequence[int]) -> Observables | None:
+        """What the others leave of one; None where none of them shares a baseline with it."""
+        key = (one, *(j for j in family if j != one and self._sharing[one, j]))
+        if len(key) == 1:
+            return None
         if key not in self._made:
-            self._made[key] = _against(self.data[one], [self.data[j] for j in others])
+            self._made[key] = _against(self.data[one], [self.data[j] for j in key[1:]])
         return self._made[key]
 
-    def agreement(self, one: int, others: Sequence[int]) -> float:
+    def agreement(self, one: int, family: Sequence[int]) -> float | None:
         """Probability of `_chance` of one with the others."""
-        return _chance(self.rest(one, others), len(others))
+        left = self.rest(one, family)
+        others = sum(self._sharing[one, j] for j in family if j != one)
+        return None if left is None else _chance(left, int(others))
 
 
-def _compared(leave_out: _LeaveOut, alpha: float) -> tuple[list[float | None], set[int]]:
-    """Leave-one-out probabilities, the worst calibrator dropped before the rest are redone."""
-    data = leave_out.data
-    probability: list[float | None] = [None] * len(data)
+def _compare(
+    leave_out: _LeaveOut, family: list[int], agreement: list[float | None], alpha: float
+) -> set[int]:
+    """Fill leave-one-out probabilities in, the worst one dropped before the rest are redone."""
     dropped: set[int] = set()
-    while len(data) - len(dropped) > 2:
-        rest = [k for k in range(len(data)) if k not in dropped]
+    while len(family) - len(dropped) > 2:
+        rest = [k for k in family if k not in dropped]
         for k in rest:
-            probability[k] = leave_out.agreement(k, [j for j in rest if j != k])
-        worst = min(rest, key=lambda k: probability[k] or 0.0)
-        if (probability[worst] or 0.0) >= alpha:
-            return probability, dropped
+            agreement[k] = leave_out.agreement(k, rest)
+        chance = {k: p for k in rest if (p := agreement[k]) is not None}
+        worst = min(chance, key=chance.__getitem__, default=None)
+        if worst is None or chance[worst] >= alpha:
+            return dropped
         dropped.add(worst)
-    first, second = (k for k in range(len(data)) if k not in dropped)
-    probability[first] = probability[second] = leave_out.agreement(first, [second])
-    return probability, dropped
+    first, second = (k for k in family if k not in dropped)
+    agreement[first] = agreement[second] = leave_out.agreement(first, [second])
+    return dropped
 
 
 def _chance(left: Observables, n_others: int) -> float:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.files import short_names
 from amibayes.plots.style import GREY, marker_of, new_figure, styled
 from amibayes.report import limits_json, number
 from amibayes.vetting import Vetted, Vetting, doubts
@@ -58,16 +58,22 @@ def _companion(vetted: Vetted) -> Json | None:
 def vetting_table(vetting: Vetting) -> list[str]:
     """Say keep or drop, and why, one line each."""
     lines = [f"{'calibrator':<28} {'verdict':<7} {'agreement':>10} {'companion':>10} {'disc':>10}"]
-    for v in vetting.calibrators:
+    for name, v in _named(vetting):
         weight = None if v.significance is None else v.significance.probability
         numbers = " ".join(_cell(p) for p in (v.agreement, weight, v.diameter_probability))
-        lines.append(f"{Path(v.path).name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
+        lines.append(f"{name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
         lines += [f"    {text}" for text in [v.reason, *doubts(v, vetting.alpha)] if text]
     lines.append(
         f"probabilities of chance; below {vetting.alpha:g} a calibrator is dropped "
         f"(good ones: {vetting.false_drop_rate:.1%} of the time)"
     )
     return lines
+
+
+def _named(vetting: Vetting) -> list[tuple[str, Vetted]]:
+    """Each calibrator with a short name that no other one has."""
+    names = short_names([v.path for v in vetting.calibrators])
+    return list(zip(names, vetting.calibrators, strict=True))
 
 
 def _cell(probability: float | None) -> str:
@@ -77,7 +83,7 @@ def _cell(probability: float | None) -> str:
 @styled()
 def vetting_picture(vetting: Vetting) -> Figure:
     """Draw the probabilities of the three tests and what each calibrator rules out."""
-    limited = [v for v in vetting.calibrators if v.limit is not None]
+    limited = [(name, v) for name, v in _named(vetting) if v.limit is not None]
     n = len(vetting.calibrators)
     heights = [1.2 + 0.4 * n, 4.0] if limited else [1.2 + 0.4 * n]
     figure = new_figure(sum(heights))
@@ -107,7 +113,7 @@ def _draw_tests(ax: Any, vetting: Vetting) -> None:
     ax.set(xlim=(0.5 * LEAST_SHOWN, 2.0), ylim=(len(rows) - 0.5, -0.5))
     ax.set_yticks(
         rows,
-        [f"{Path(v.path).name} {'' if v.kept else '(dropped)'}" for v in vetting.calibrators],
+        [name if v.kept else f"{name} (dropped)" for name, v in _named(vetting)],
     )
     ax.set_xlabel(f"probability of chance (dashed: dropped below {vetting.alpha:g})")
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
@@ -117,21 +123,20 @@ LEAST_SHOWN = 1e-8
 """Smaller probabilities are drawn here."""
 
 
-def _draw_limits(ax: Any, limited: list[Vetted]) -> None:
-    for k, vetted in enumerate(limited):
+def _draw_limits(ax: Any, limited: list[tuple[str, Vetted]]) -> None:
+    for k, (name, vetted) in enumerate(limited):
         assert vetted.limit is not None
         colour, marker = marker_of(k)
-        label = f"{Path(vetted.path).name}{'' if vetted.kept else ' (dropped)'}"
         ax.plot(
             vetted.limit.separation_mas,
             vetted.limit.delta_mag,
             marker=marker,
             ls="-" if vetted.kept else ":",
             color=colour,
-            label=label,
+            label=name if vetted.kept else f"{name} (dropped)",
         )
     ax.invert_yaxis()
-    limit = limited[0].limit
+    limit = limited[0][1].limit
     assert limit is not None
     ax.set_xlabel("Separation (mas)")
     ax.set_ylabel(f"Magnitude difference ruled out ({limit.completeness:.0%})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,12 +34,12 @@ def run(*words: object) -> int:
         return int(stop.code or 0)
 
 
-def found(paths: list[Path], **options: object) -> SearchReport:
+def found(paths: list[Path], cals: Sequence[Path] = (), **options: object) -> SearchReport:
     """The main job without pictures."""
     quick = {"posterior": False, "limits": False, "null_draws": 1000}
     return search_companion(
         [str(p) for p in paths],
-        (),
+        [str(p) for p in cals],
         SearchOptions(separation_mas=(60.0, 400.0), **(quick | options)),  # type: ignore[arg-type]
     )
 
@@ -90,7 +91,7 @@ def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path,
     page = (tmp_path / "0" / "report.html").read_text(encoding="utf-8")
     wanted = [
         "Contrasts of the bands, each has its own",
-        "NIRISS_4.82um",
+        "NIRISS\u00a04.82\u00a0µm",
         "Linear motion",
         "mas/yr",
     ]
@@ -101,6 +102,33 @@ def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path,
         assert measured(entry["contrast"], entry["errors"]["contrast"]) in page
     assert all(0.2 < r["chi2r_vis2"] < 3.0 for r in results[0]["residuals"])
     assert any("not integrated directly" in w for w in results[0]["warnings"])
+
+
+@pytest.mark.parametrize(("many", "method"), [((2, 2), "weighted"), ((3, 1), "hierarchical")])
+def test_each_filter_has_its_calibrators(many, method, files, tmp_path) -> None:
+    """Files of one name in two folders; a filter's calibrators say nothing of the other's."""
+    rng = np.random.default_rng(43)
+    cals = []
+    for folder, band, count in zip(("blue", "red"), (F430M, F480M), many, strict=True):
+        (tmp_path / folder).mkdir()
+        for k in range(count):
+            cals.append(tmp_path / folder / f"cal{k}.oifits")
+            write_oifits(cals[-1], noisy(epoch(band, MJD[0]), [0.0, 0.0, 0.0], rng))
+    report = found(files[:2], cals, null_draws=500)
+    assert report.calibration is not None
+    assert report.calibration.method == method
+    assert [use.kept for use in report.calibration.calibrators] == [True] * 4
+    for (value, error), truth in zip(report.result.contrasts.values(), (0.01, 0.02), strict=True):
+        assert abs(value - truth) < 5 * error
+
+
+def test_one_calibrator_of_each_filter_tells_no_scatter(files, tmp_path) -> None:
+    rng = np.random.default_rng(43)
+    targets = [read_oifits(path) for path in files[:2]]
+    cals = [noisy(epoch(band, MJD[0]), [0.0, 0.0, 0.0], rng) for band in (F430M, F480M)]
+    assert calibrate(targets, cals).method == "weighted"
+    with pytest.raises(DataError, match="no baseline has more"):
+        calibrate(targets, cals, method="hierarchical")
 
 
 def test_tied_contrast_and_summary(files, tmp_path) -> None:

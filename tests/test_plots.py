@@ -20,6 +20,7 @@ from scipy.stats import binomtest
 
 from amibayes.covariance import DiagonalCovariance
 from amibayes.errors import RunError
+from amibayes.files import short_names
 from amibayes.inference.bank import make_grid
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.model import BinaryModel
@@ -368,6 +369,27 @@ def test_intervals_have_two_digits_of_the_smaller_side() -> None:
     assert interval_text(147.083, 12.0, 25.0) == "$147_{-12}^{+25}$"
     assert label_of("contrast_2") == "Contrast, 2"
     assert label_of("jitter") == "jitter"
+
+
+def test_a_contrast_of_a_band_says_so_on_a_line_of_its_own() -> None:
+    names = ["contrast[NIRISS_4.29um]", "contrast_2[NIRISS_4.82um]"]
+    axes = corner_plot(0.01 * samples()[:, :1] / 90.0 * [[1.0, 1.1]], names).axes
+    band = "NIRISS\u00a04.29\u00a0µm"
+    assert axes[0].get_title().startswith(f"Contrast × 10$^{{3}}$,\n{band}\n$10.0")
+    assert label_of(names[1]) == "Contrast, 2,\nNIRISS\u00a04.82\u00a0µm"
+
+
+def test_names_of_many_calibrators_stay_inside_the_picture() -> None:
+    """As many columns as there is room for, and no two names alike."""
+    names = short_names([f"{folder}/a_calibrator_calints.oifits" for folder in ("f380m", "f480m")])
+    assert names == [f"{folder}/a_calibrator_calints.oifits" for folder in ("f380m", "f480m")]
+    assert short_names(["a/x", "a/y", "b/a/y", "c/a/y"]) == ["x", "a/y", "b/a/y", "c/a/y"]
+    drawn = calibrator_plot([niriss()] * 6, [True] * 6, names * 3)
+    drawn.draw_without_rendering()
+    (legend,) = drawn.legends
+    box = legend.get_window_extent()
+    assert box.x0 > 0.0
+    assert box.x1 < drawn.bbox.x1
 
 
 def test_chain_thinning_is_stated() -> None:

@@ -22,7 +22,7 @@ from amibayes.orientation import Orientation
 from amibayes.scene import Point, Scene
 from amibayes.simulation import Detector, Exposure, simulate
 from amibayes.simulation.exposure import Recorder
-from amibayes.simulation.program import example, read_program
+from amibayes.simulation.program import Overrides, example, read_program
 from amibayes.units import DEGREE, MAS
 
 SMALL = """
@@ -301,7 +301,7 @@ def test_fault_of_the_file_is_one_line(
     assert shown.err.startswith("amibayes: ")
     assert shown.err.count("\n") == 1
     assert "scene.toml" in shown.err or fault == "same name"
-    assert list((tmp_path / "out").glob("*")) == []
+    assert not (tmp_path / "out").exists()
 
 
 def test_image_without_scale_is_one_line(
@@ -333,6 +333,36 @@ def test_present_files_and_bad_folders_are_one_line(
     (tmp_path / "file").write_text("in the way")
     assert main(["simulate", scene, "--out", str(tmp_path / "file")]) == 2
     assert "cannot be made a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        (("--photons", "1e30"), "--photons: that exposure takes"),
+        (("--photons", "3"), "--photons: 3 photons carry no closure phase"),
+        (("--photons", "1e12"), "--photons: n_integrations is"),
+        (("--filter", "F48"), "--filter: niriss has no filter 'F48'"),
+    ],
+)
+def test_fault_of_an_option_is_not_the_files(
+    option: tuple[str, str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["simulate", write(tmp_path), *option, "--out", str(out)]) == 2
+    assert capsys.readouterr().err.startswith(f"amibayes: {said}")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("text", [SMALL, SMALL.replace('[instrument]\nfilter = "F430M"\n', "")])
+def test_options_stand_in_the_place_of_the_file(text: str, tmp_path: Path) -> None:
+    """Also of what it says of single stars, and of its number of integrations."""
+    program = read_program(write(tmp_path, text), Overrides("F480M", 1e7))
+    assert len(program.shots) == 8
+    for shot in program.shots:
+        taken = shot.observation
+        assert taken.instrument.bandpass.name == "F480M"
+        one = 4 * 0.0745 * taken.count_rate_e_s * taken.scene.flux
+        assert 1e7 <= taken.exposure.n_integrations * one <= 1e7 + 2 * one
 
 
 LIMITED = """

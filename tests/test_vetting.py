@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 from scipy import stats
+from test_joint import F430M, epoch, noisy
 
 from amibayes.cli import main
 from amibayes.errors import DataError
 from amibayes.inference.model import BinaryModel
 from amibayes.inference.noise import ExtraNoise, add_noise
 from amibayes.oifits import write_oifits
-from amibayes.vetting import Vetted, Vetting, _LeaveOut, vet
+from amibayes.vetting import Vetted, Vetting, _compare, _LeaveOut, vet
 from amibayes.vetting_report import vetting_picture, vetting_table
 
 FIELD = (50.0, 400.0)
@@ -115,6 +116,23 @@ def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys
     assert any("charge level is 5 times" in text for text in said)
     assert any("disagrees" in text or "companion" in text for text in said)
     assert (tmp_path / "out" / "vetting.png").stat().st_size > 5000
+
+
+def test_calibrators_of_two_filters_are_judged_among_their_own(rng) -> None:
+    """As each filter by itself: no calibrator of the other one is asked."""
+    reds = [calibrator(rng, name=f"red{k}") for k in range(3)]
+    blues = [noisy(epoch(F430M, source=f"blue{k}"), [0.0, 0.0, 0.0], rng) for k in range(2)]
+    blues.append(noisy(epoch(F430M, source="bad"), [120.0, 60.0, 0.02], rng))
+    options = {"separation_mas": (90.0, 180.0), "limits": False, "null_draws": 500}
+    vetting = vet([reds[0], *blues, *reds[1:]], **options)
+    assert [v.path for v in vetting.calibrators if not v.kept] == ["bad"]
+    judged = {v.path: v.agreement for v in vetting.calibrators}
+    apart: list[float | None] = [None] * 3
+    assert _compare(_LeaveOut(reds), [0, 1, 2], apart, vetting.alpha) == set()
+    assert [judged[f"red{k}"] for k in range(3)] == pytest.approx(apart, rel=1e-9)
+    for unjudged in (vet([reds[0], blues[0], blues[2]], fewest=3), vet([reds[0], blues[2]])):
+        assert all(v.kept and v.agreement is None for v in unjudged.calibrators)
+        assert all(v.significance is None for v in unjudged.calibrators)
 
 
 def test_one_raw_calibrator_is_kept_unjudged_and_none_is_refused(rng) -> None:

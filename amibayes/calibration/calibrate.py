@@ -127,7 +127,8 @@ def calibrate(
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted"}, optional
         Inverse-variance means, with the scatter where it is larger than the errors; or random
-        effects (see `amibayes.calibration.hierarchical`), the default with 3 or more.
+        effects (see `amibayes.calibration.hierarchical`), the default where 3 or more share a
+        baseline.
     clip : float, optional
         Leave out values that stand off the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (float, float), optional
@@ -145,12 +146,12 @@ def calibrate(
         Where calibrators are none, too few, the target itself, or have nothing in common.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
-    chosen = _method(method, parts, calibrators := list(calibrators))
-    _refuse_same(parts, calibrators)
+    _refuse_same(parts, calibrators := list(calibrators))
     target = join(parts)
     keys = keys_of(target, window_days)
     seen = _transfers(calibrators, keys, diameters_mas)
-    serving = _serving(target, calibrators, seen, chosen)
+    serving = _serving(target, calibrators, seen)
+    chosen = _method(method, target, [seen[j] for j in serving])
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     used = [calibrators[j] for j in serving]
     kept = _consistent([seen[j] for j in serving], keys, clip)
@@ -167,25 +168,25 @@ def calibrate(
     )
 
 
-def _method(
-    method: Method | None, parts: list[Observables], calibrators: list[Observables]
-) -> Method:
-    source = parts[0].source if parts else None
-    if not parts:
-        raise DataError("no target to calibrate", remedy="give at least one file")
-    if not calibrators:
-        raise DataError("no calibrator given", source=source, remedy="give at least one")
-    if method == "hierarchical" and len(calibrators) < 2:
+def _method(method: Method | None, target: Observables, serving: list[Transfer]) -> Method:
+    """The method asked for, or what the calibrators of one baseline are enough for."""
+    together = int(np.sum([t.seen for t in serving], axis=0).max())
+    if method == "hierarchical" and together < 2:
         raise DataError(
-            "one calibrator says nothing of the scatter between calibrators",
-            source=source,
+            "one calibrator says nothing of the scatter between calibrators, and no baseline has "
+            "more",
+            source=target.source,
             remedy="give more of them, or use the weighted method",
         )
-    return method or ("hierarchical" if len(calibrators) >= 3 else "weighted")
+    return method or ("hierarchical" if together >= 3 else "weighted")
 
 
 def _refuse_same(parts: list[Observables], calibrators: list[Observables]) -> None:
-    """Refuse a calibrator whose data are those of the target or of another calibrator."""
+    """Refuse no data at all, and calibrators that are the target or another calibrator."""
+    if not parts:
+        raise DataError("no target to calibrate", remedy="give at least one file")
+    if not calibrators:
+        raise DataError("no calibrator given", source=parts[0].source, remedy="give at least one")
     before: list[tuple[Observables, str]] = [(p, "the target") for p in parts]
     for calibrator in calibrators:
         for other, name in before:
@@ -243,10 +244,7 @@ def _diameters(
 
 
 def _serving(
-    target: Observables,
-    calibrators: list[Observables],
-    seen: list[Transfer],
-    method: Method,
+    target: Observables, calibrators: list[Observables], seen: list[Transfer]
 ) -> list[int]:
     """Numbers of the calibrators that have something in common with the target."""
     serving = [j for j, transfer in enumerate(seen) if transfer.seen.any()]
@@ -256,12 +254,6 @@ def _serving(
             f"has no baseline at the same wavelength in common with {names}",
             source=target.source,
             remedy="give calibrators of the same instrument, stations and filter",
-        )
-    if method == "hierarchical" and len(serving) < 2:
-        raise DataError(
-            "has only one calibrator with baselines in common",
-            source=target.source,
-            remedy="give more of them, or use the weighted method",
         )
     return serving
 

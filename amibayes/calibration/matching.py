@@ -7,12 +7,13 @@ matter; turning a triangle round turns the sign of its closure phase.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from amibayes.closure import canonical
-from amibayes.observables import IntArray, Measurements, Observables, Setup
+from amibayes.observables import BoolArray, IntArray, Measurements, Observables, Setup
 from amibayes.units import FloatArray
 
 SAME_CHANNEL = 0.1
@@ -166,6 +167,12 @@ def match(calibrator: Observables, keys: Keys) -> Match:
         np.concatenate([empty, *(np.concatenate(m[i]) for m in found)]) for i in range(3)
     )
     return Match(entry, key, sign)
+
+
+def sharing(observations: Sequence[Observables]) -> BoolArray:
+    """Whether each (column) can serve as a calibrator of each other (row), (n, n)."""
+    keys = [keys_of(o) for o in observations]
+    return np.array([[len(match(o, k).key) > 0 for o in observations] for k in keys], dtype=bool)
 
 
 def _serving_setups(calibrator: Observables, setup: Setup) -> list[int]:

@@ -64,13 +64,23 @@ class Parser(argparse.ArgumentParser):
         return " (see --help)"
 
 
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help with a column that the names of commands, which are indented, fit into."""
+
+    def add_argument(self, action: argparse.Action) -> None:
+        """Make room for an action's name."""
+        super().add_argument(action)
+        if isinstance(action, argparse._SubParsersAction):
+            self._action_max_length += self._indent_increment
+
+
 def build_parser(command: str | None) -> Parser:
     """Build the parser of all commands; only the arguments of ``command`` are filled in."""
     parser = Parser(
         prog="amibayes",
         description="Bayesian inference for aperture masking interferometry.",
         epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=Help,
     )
     parser.add_argument("--version", action="version", version=f"amibayes {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -79,7 +89,7 @@ def build_parser(command: str | None) -> Parser:
             name,
             help=summary,
             description=summary,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            formatter_class=Help,
             allow_abbrev=False,
         )
         if name == command:

@@ -42,7 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--filter", metavar="NAME", help="in place of the file's filter")
     parser.add_argument(
-        "--photons", type=positive_float, metavar="N", help="in place of the file's photons"
+        "--photons",
+        type=positive_float,
+        metavar="N",
+        help="in place of the file's photons and n_integrations",
     )
     parser.add_argument("--resume", action="store_true", help="go on with a run that was cut off")
     parser.add_argument("--ramps", action="store_true", help="write the reads too (*_ramp.fits)")

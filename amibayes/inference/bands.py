@@ -36,6 +36,11 @@ class Band:
     setups: tuple[int, ...]
 
 
+def band_name(band: str) -> str:
+    """Write a band, as ``NIRISS_4.82um``, for a reader: NIRISS 4.82 µm, in one piece."""
+    return re.sub(r"_([\d.]+)um$", "\u00a0\\1\u00a0µm", band)
+
+
 def bands_of(observables: Observables) -> tuple[Band, ...]:
     """Bands of the unflagged data, the shortest wavelength (the reference band) first."""
     data = observables.unflagged()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
+from amibayes.files import short_names
 from amibayes.inference.by_file import FileResiduals
 from amibayes.plots.style import BLUE, GREY, VERMILLION, new_figure, styled
 
@@ -42,8 +42,8 @@ def file_residuals_plot(files: Sequence[FileResiduals]) -> Figure:
         ax.xaxis.set_major_formatter(ScalarFormatter())
         ax.xaxis.set_minor_formatter(NullFormatter())
         total = sum(getattr(f, count) for f in files)
-        ax.set_xlabel(f"Reduced χ² of {total} {title}{'s' if total != 1 and 'p' in title else ''}")
-    axes[0].set_yticks(rows, [Path(f.source).name or "data" for f in files])
+        ax.set_xlabel(f"Reduced χ² of\n{total} {title}{'s' if total != 1 and 'p' in title else ''}")
+    axes[0].set_yticks(rows, [name or "data" for name in short_names([f.source for f in files])])
     axes[0].set_ylim(len(files) - 0.5, -0.5)
     figure.suptitle("Residuals of each file under the joint fit")
     handles, labels = axes[0].get_legend_handles_labels()

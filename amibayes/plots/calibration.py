@@ -16,6 +16,9 @@ from amibayes.plots.fit import longest_baseline_m
 from amibayes.plots.style import BLACK, GREY, LIGHT_GREY, marker_of, new_figure, styled
 from amibayes.units import FloatArray
 
+ROOM_FOR_NAMES, EDGE_OF_NAME = 90, 9
+"""Letters that stand beside each other under a picture; those that a marker takes the room of."""
+
 MOST_KEYS = 100
 """Numbers of one kind and data set beyond which markers get smaller."""
 
@@ -65,8 +68,14 @@ def calibrator_plot(
         ax.set_ylabel(label)
         ax.set_xlabel(axis)
     handles, texts = axes[0].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=min(3, len(texts)))
+    figure.legend(handles, texts, loc="outside lower center", ncols=_columns(texts))
     return figure
+
+
+def _columns(texts: Sequence[str]) -> int:
+    """As many columns as the names leave room for."""
+    longest = max(map(len, texts), default=1)
+    return max(1, min(3, len(texts), ROOM_FOR_NAMES // (longest + EDGE_OF_NAME)))
 
 
 def _vis2(observables: Observables) -> _Column:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from amibayes.inference.bands import band_name
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray
 
@@ -31,7 +32,13 @@ CONTOUR_POINTS = 10_000
 
 
 def label_of(name: str) -> str:
-    """Name of a parameter as an axis label, with its unit; unknown names as they are."""
+    """Name of a parameter as an axis label, with its unit; unknown names as they are.
+
+    That of a band, as ``contrast[NIRISS_4.82um]``, stands on a second line.
+    """
+    name, _, band = name.partition("[")
+    if band:
+        return f"{label_of(name)},\n{band_name(band.rstrip(']'))}"
     base, _, number = name.rpartition("_")
     if number.isdigit() and base in NAMES:
         return f"{NAMES[base]}, {number}"
@@ -101,11 +108,14 @@ def _scales(draws: FloatArray, labels: Sequence[str]) -> tuple[FloatArray, list[
     power = np.where(
         (largest > 0) & (largest < 0.02), -np.floor(np.log10(np.maximum(largest, 1e-300)) / 3), 0
     )
-    names = [
-        label_of(name) + (f" × 10$^{{{3 * int(p)}}}$" if p else "")
-        for name, p in zip(labels, power, strict=True)
-    ]
+    names = [_scaled(label_of(name), 3 * int(p)) for name, p in zip(labels, power, strict=True)]
     return np.asarray(10.0 ** (3 * power)), names
+
+
+def _scaled(label: str, power: int) -> str:
+    """Say by which power of ten the numbers are multiplied, in the first line."""
+    name, comma, band = label.partition(",\n")
+    return f"{name} × 10$^{{{power}}}${comma}{band}" if power else label
 
 
 def _ranges(draws: FloatArray) -> list[tuple[float, float]]:

@@ -56,7 +56,10 @@ def frame_plot(extraction: Extraction) -> Figure:
     ax.set_xlabel("x (pixels)")
     ax.set_ylabel("y (pixels)")
     ax.set_title(f"{view.instrument.name} {view.instrument.bandpass.name}, median of integrations")
-    figure.colorbar(shown, ax=ax, label="Signal (unit of the cube)")
+    bar = figure.colorbar(shown, ax=ax, label="Signal (unit of the cube)")
+    # Powers of ten nearer to zero would be written over its own tick.
+    bar.set_ticks([0.0, *10.0 ** np.arange(np.ceil(np.log10(4e-3 * top)), np.log10(top))])
+    bar.minorticks_off()
     return figure
 
 

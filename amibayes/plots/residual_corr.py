@@ -34,7 +34,7 @@ def correlation_plot(observables: Observables) -> Figure:
     vis2, closure = _chosen(data)
     covariance = data.covariance.select(np.concatenate([vis2, closure]))
     sigma = np.sqrt(covariance.variance)
-    figure = new_figure(9.3)
+    figure = new_figure(8.2)
     upper, lower = figure.subplots(2, 1, gridspec_kw={"height_ratios": [4.6, 1.0]})
     _draw_matrix(figure, upper, covariance.dense() / np.outer(sigma, sigma), len(vis2))
     _draw_errors(lower, sigma, len(vis2))
@@ -68,6 +68,7 @@ def _draw_matrix(figure: Figure, ax: Axes, correlation: FloatArray, n_vis2: int)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(7, integer=True))
     figure.colorbar(image, ax=ax, label="Correlation", location="bottom", aspect=35, shrink=0.85)
+    ax.set_anchor("N")  # what the square leaves free stands below it, not under the title
 
 
 def _which(n_vis2: int, n_closure: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from amibayes.inference.bands import band_name
 from amibayes.inference.tails import LEAST_PROBABILITY
 from amibayes.report.joint_sections import joint_tables
 from amibayes.report.page import Column, Fact, Figure, Section, Table
@@ -183,14 +184,16 @@ def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
             "No companion was detected: these are the places and contrasts that the data leave to "
             "one, if there is one, and not a measurement.",
         )
-    return Section("Posterior", tuple(text), tables=(_intervals(p),), figures=figures)
+    return Section(
+        "Posterior", tuple(text), tables=(_intervals(p, content["fit"]),), figures=figures
+    )
 
 
-def _intervals(p: Json) -> Table:
+def _intervals(p: Json, fit: Json) -> Table:
     names = [key for key, value in p.items() if isinstance(value, dict) and "median" in value]
     rows = []
     for key in names:
-        name, unit = UNITS.get(key, (key, ""))
+        name, unit = _named(key, fit)
         q = p[key]
         places = _places(q)
         rows.append(
@@ -203,6 +206,15 @@ def _intervals(p: Json) -> Table:
         )
     columns = (Column("", "text"), Column("Median"), Column("68 %"), Column("95 %"))
     return Table("Marginal posterior of each quantity", columns, tuple(rows))
+
+
+def _named(key: str, fit: Json) -> tuple[str, str]:
+    """What a quantity of the posterior is called, and its unit; a contrast with its band."""
+    key, _, band = key.partition("[")
+    name, unit = UNITS.get(key, (key, ""))
+    if fit.get("contrast_kind") == "per-filter" and key in ("contrast", "delta_mag") and not band:
+        band = fit["contrasts"][0]["band"]
+    return (f"{name}, {band_name(band.rstrip(']'))}" if band else name), unit
 
 
 def _range(key: str, low: float, high: float, places: int) -> str:

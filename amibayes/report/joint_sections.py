@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
+from amibayes.files import short_names
+from amibayes.inference.bands import band_name
 from amibayes.report.page import Column, Table
 from amibayes.report.words import NONE, fixed, measured, plain
 
@@ -30,7 +31,7 @@ def _bands(fit: Json) -> tuple[Table, ...]:
         return ()
     rows = tuple(
         (
-            band["band"],
+            band_name(band["band"]),
             fixed(band["wavelength_um"], 3),
             measured(band["contrast"], band["errors"]["contrast"]),
             measured(band["delta_mag"], band["errors"]["delta_mag"]),
@@ -71,12 +72,13 @@ def _files(content: Json) -> tuple[Table, ...]:
     if extra:
         columns += [Column("Added to V²"), Column("Added to closure phase (°)")]
     rows = []
-    for f in content["residuals"]:
+    names = short_names([f["path"] for f in content["residuals"]])
+    for name, f in zip(names, content["residuals"], strict=True):
         values = [NONE if f[key] is None else fixed(f[key], 2) for key in RESIDUALS]
         if extra:
             own = extra[f["path"]]
             values += [plain(own[key], 2) for key in ("extra_vis2", "extra_closure_phase_deg")]
-        rows.append((Path(f["path"]).name, *values))
+        rows.append((name, *values))
     caption = "Reduced χ² of each file without and with the companion" + (
         ", and the noise added to its errors" if extra else ""
     )

@@ -25,6 +25,9 @@ from amibayes.files import write_text
 Kind = Literal["found", "none", "open"]
 """Of a statement: something is there, nothing is, or nothing is claimed."""
 
+MOST_ON_A_TELEPHONE = 4
+"""Columns of named rows that stand beside each other on a telephone."""
+
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 
@@ -51,7 +54,8 @@ class Table:
     @property
     def stacks(self) -> bool:
         """Whether its rows are too wide for a telephone and stand there one below the other."""
-        return any(column.kind == "code" for column in self.columns)
+        kinds = [column.kind for column in self.columns]
+        return "code" in kinds or (kinds[0] == "text" and len(kinds) > MOST_ON_A_TELEPHONE)
 
 
 @dataclass(frozen=True)

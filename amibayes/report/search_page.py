@@ -37,6 +37,7 @@ PLACED = {
     "false_alarm": "significance",
     "nsigma": "significance",
     "fit": "search",
+    "files": "search",
     "coverage": "data",
     "correlation": "data",
     "calibrators": "data",

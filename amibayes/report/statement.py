@@ -31,11 +31,11 @@ def statement_of(content: Json) -> Statement:
 def place(content: Json) -> str:
     """Where the best fit is, and how bright, with errors."""
     fit, errors = content["fit"], content["fit"]["errors"]
-    return (
-        f"{measured(fit['separation_mas'], errors['separation_mas'])} mas, position angle "
-        f"{measured(fit['position_angle_deg'], errors['position_angle_deg'], '°')}, "
-        f"{measured(fit['delta_mag'], errors['delta_mag'])} mag fainter than the star"
-    )
+    separation = measured(fit["separation_mas"], errors["separation_mas"], "\u00a0mas")
+    angle = measured(fit["position_angle_deg"], errors["position_angle_deg"], "°")
+    magnitude = measured(fit["delta_mag"], errors["delta_mag"], "\u00a0mag")
+    told = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
+    return told.replace(" ±", "\u00a0±")
 
 
 def field(content: Json) -> str:
@@ -75,11 +75,11 @@ def _chance(content: Json) -> str:
         return (
             f"Not one of {count(draws, 'data set')} simulated without a companion has anything as "
             f"good anywhere in the field ({field(content)}): the chance of this by noise is "
-            f"below {chance(high)}, with 95 % confidence; {asked}."
+            f"below {chance(high)}, with 95\u00a0% confidence; {asked}."
         )
     return (
         "The chance that noise alone gives something as good anywhere in the field "
-        f"({field(content)}) is {chance(probability)}, and with 95 % confidence between "
+        f"({field(content)}) is {chance(probability)}, and with 95\u00a0% confidence between "
         f"{chance(low)} and {chance(high)}: from the same search in {count(draws, 'data set')} "
         f"simulated without a companion; {asked}."
     )
@@ -128,8 +128,8 @@ def _limits(content: Json) -> str:
     return (
         f"Companions up to {fixed(worst[1], 2)} mag fainter than the star (at "
         f"{plain(worst[0])} mas) to {fixed(best[1], 2)} mag (at {plain(best[0])} mas) would be "
-        f"found {100.0 * limits['completeness']:.0f} % of the time, at a false-positive rate of "
-        f"{plain(limits['false_positive_rate'], 2)}."
+        f"found {100.0 * limits['completeness']:.0f}\u00a0% of the time, at a false-positive rate "
+        f"of {plain(limits['false_positive_rate'], 2)}."
     )
 
 
@@ -139,8 +139,8 @@ def _upper_limit(content: Json) -> str:
     if limit is None or content["significance"]["detected"] is None:
         return ""
     return (
-        f"With {100.0 * limit['level']:.0f} % probability a companion anywhere in the field is "
-        f"more than {fixed(limit['delta_mag'], 2)} mag fainter than the star (prior: "
+        f"With {100.0 * limit['level']:.0f}\u00a0% probability a companion anywhere in the field "
+        f"is more than {fixed(limit['delta_mag'], 2)} mag fainter than the star (prior: "
         f"{limit['prior']})."
     )
 

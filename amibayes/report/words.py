@@ -63,7 +63,7 @@ def chance(probability: float) -> str:
     if 0.001 <= probability < 0.01:
         return plain(probability, 2)
     if 0.01 <= probability <= 0.99:
-        return f"{100.0 * probability:.2g} %"
+        return f"{100.0 * probability:.2g}\u00a0%"
     return plain(probability, 2)
 
 

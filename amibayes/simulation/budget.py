@@ -212,14 +212,26 @@ def make_plan(
     _refuse_saturated(peaks.centred * rate * rules.frame_time_s, full_well)
     wanted = groups["paper" if rules.preset == "paper" else "centred"]
     n_groups = min(max(wanted, 2), MOST_GROUPS)
-    n = _integrations(rate, n_groups, rules, photons, time_s)
+    n = integrations(rate, n_groups, rules, photons=photons, time_s=time_s)
     plan = Plan(instrument, rules, rate, photons, n_groups, n, peaks, groups)
     return replace(plan, warnings=tuple(_warnings(plan, wanted, full_well)))
 
 
-def _integrations(
-    rate: float, n_groups: int, rules: PlanOptions, photons: float | None, time_s: float | None
+def integrations(
+    rate: float,
+    n_groups: int,
+    rules: PlanOptions,
+    *,
+    photons: float | None = None,
+    time_s: float | None = None,
 ) -> int:
+    """Integrations for so many photons, or those that fit into so much time.
+
+    Raises
+    ------
+    UsageError
+        Where no exposure would be so long or so short.
+    """
     if (photons is None) == (time_s is None):
         raise UsageError("give either the photons or the time")
     clock = (n_groups + 1) * rules.frame_time_s

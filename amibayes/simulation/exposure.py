@@ -29,6 +29,20 @@ MOST_SIMULATED = 1_000_000
 """Integrations of the largest file that is simulated, a hundred full exposures."""
 
 
+def refuse_too_many(n_integrations: int) -> None:
+    """Refuse an exposure that would fill the disk.
+
+    Raises
+    ------
+    UsageError
+    """
+    if n_integrations > MOST_SIMULATED:
+        raise UsageError(
+            f"n_integrations is {n_integrations:.4g}; at most {MOST_SIMULATED} are simulated",
+            remedy="fewer photons or a brighter star",
+        )
+
+
 @dataclass(frozen=True)
 class Exposure:
     """How an exposure is taken.
@@ -69,12 +83,7 @@ class Exposure:
             )
         if self.n_integrations < 1:
             raise UsageError(f"n_integrations is {self.n_integrations}; it must be 1 or more")
-        if self.n_integrations > MOST_SIMULATED:
-            raise UsageError(
-                f"n_integrations is {self.n_integrations:.4g}; at most {MOST_SIMULATED} are "
-                "simulated",
-                remedy="fewer photons or a brighter star",
-            )
+        refuse_too_many(self.n_integrations)
         if self.n_pixels < 8:
             raise UsageError(f"n_pixels is {self.n_pixels}; it must be 8 or more")
         for name in ("jitter_rad", "dither_rad"):

@@ -20,9 +20,9 @@ from amibayes.parallel import child_seeds
 from amibayes.scene import Scene
 from amibayes.scene_file import read_image, scene_from
 from amibayes.settings import Section, read_toml
-from amibayes.simulation.budget import PlanOptions, integrations_for, make_plan
+from amibayes.simulation.budget import LONGEST_S, PlanOptions, integrations, make_plan
 from amibayes.simulation.detector import Detector, DetectorMaps, detector_preset, draw_maps
-from amibayes.simulation.exposure import Exposure
+from amibayes.simulation.exposure import Exposure, refuse_too_many
 from amibayes.simulation.observe import Observation, Shutter, open_shutter, star_rate
 from amibayes.simulation.wavefront import WAVEFRONT_PRESETS, WavefrontErrors
 from amibayes.units import DEGREE, MAS
@@ -168,14 +168,14 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
 
 
 @contextmanager
-def blaming(source: str) -> Iterator[None]:
-    """Name the file in errors that do not know it: whatever it asks for, the fault is its own."""
+def blaming(source: str, kind: type[DataError | UsageError] = DataError) -> Iterator[None]:
+    """Name the file or option in errors that do not know it: what it asks for is its own fault."""
     try:
         yield
     except (DataError, UsageError) as error:
         if error.source is not None:
             raise
-        raise DataError(error.what, source=source, remedy=error.remedy) from error
+        raise kind(error.what, source=source, remedy=error.remedy) from error
 
 
 class _Reader:
@@ -189,7 +189,8 @@ class _Reader:
             for key in ("exposure", "detector", "wavefront", "instrument")
         )
         self.instrument_name = instrument.text("name", "niriss")
-        self.filter = overrides.filter or instrument.text("filter", _star_filter(top))
+        named = instrument.text("filter", _star_filter(top))
+        self.filter = overrides.filter or named
         instrument.refuse_unknown()
         beside = Path(top.source).parent / self.instrument_name
         source = str(beside) if beside.is_file() else self.instrument_name
@@ -248,17 +249,21 @@ class _Reader:
     def _exposure(self, own: Section, rate: float) -> Exposure:
         table = self.exposure
         photons = own.number("photons", table.number("photons", PHOTONS, above=0.0), above=0.0)
-        photons = self.overrides.photons or photons
-        limit = table.number("peak_limit_e", 30000.0, above=0.0)
-        groups, integrations = (_count(own, table, key) for key in ("n_groups", "n_integrations"))
-        if groups is None:
-            groups = self._groups(rate, photons, limit)
-        if integrations is None:
-            frame = self._options(limit).frame_time_s
-            integrations = integrations_for(photons, rate, max(groups, 1), frame)
+        rules = self._options(table.number("peak_limit_e", 30000.0, above=0.0))
+        n_groups, n_integrations = (_count(own, table, k) for k in ("n_groups", "n_integrations"))
+        if n_groups is None:
+            n_groups = self._groups(rate, rules)
+        if self.overrides.photons is not None:
+            with blaming("--photons", UsageError):
+                n_integrations = integrations(
+                    rate, max(n_groups, 1), rules, photons=self.overrides.photons
+                )
+                refuse_too_many(n_integrations)
+        elif n_integrations is None:
+            n_integrations = integrations(rate, max(n_groups, 1), rules, photons=photons)
         return Exposure(
-            groups,
-            integrations,
+            n_groups,
+            n_integrations,
             jitter_rad=_pointing(table, "jitter_mas", 7.0),
             dither_rad=_pointing(table, "dither_mas", 15.0),
             n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MOST_PIXELS),
@@ -270,12 +275,13 @@ class _Reader:
             return PlanOptions("paper", peak_limit_e=limit)
         return PlanOptions(peak_limit_e=limit, frame_time_s=self.detector.frame_time_s)
 
-    def _groups(self, rate: float, photons: float, limit: float) -> int:
+    def _groups(self, rate: float, rules: PlanOptions) -> int:
+        """Groups that the brightest pixel allows, however long the exposure is."""
         plan = make_plan(
             self.instrument,
             count_rate_e_s=rate,
-            photons=photons,
-            options=self._options(limit),
+            time_s=LONGEST_S,
+            options=rules,
             detector=self.detector,
         )
         return plan.n_groups
