@@ -64,6 +64,27 @@ def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
         assert abs(found - n * expected) < 4.5 * spread
 
 
+def test_probability_of_any_companion_is_that_of_the_injections(setting) -> None:
+    """χ² of the recovered counts of all rings and levels; its 1e-4 quantile."""
+    limit = setting[3]
+    rho, k = limit.separation_mas, 3
+    for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
+        assert limit.probability(rho[k], contrast) == pytest.approx(expected, abs=1e-6)
+    p = np.array(
+        [[limit.probability(r, c) for c in row] for r, row in zip(rho, limit.level, strict=True)]
+    )
+    expected, spread = limit.trials * p, np.sqrt(limit.trials * p * (1.0 - p))
+    sure = spread > 1.0
+    chi2 = (((limit.recovered - expected) / np.where(sure, spread, 1.0))[sure] ** 2).sum()
+    assert chi2 < stats.chi2.isf(1e-4, sure.sum())
+    middle = limit.probability(0.5 * (rho[1] + rho[2]), 1e-3)
+    ends = sorted(limit.probability(r, 1e-3) for r in rho[1:3])
+    assert ends[0] <= middle <= ends[1]
+    assert limit.probability(rho[k], 1e-9) < 1e-3
+    assert limit.probability(rho[k], 1.0) > 0.9999
+    assert np.isnan([limit.probability(r, 1e-3) for r in (0.9 * rho[0], 1.1 * rho[-1])]).all()
+
+
 @pytest.mark.slow
 def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) -> None:
     """c50 and c95 of `measure_limits` against the search job's own verdict on 1000 new data sets.

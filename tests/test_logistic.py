@@ -27,6 +27,18 @@ def test_fit_is_that_of_a_general_optimiser() -> None:
     assert np.abs(fit.beta - best).max() < 0.15 * np.sqrt(np.diag(fit.covariance)).min()
 
 
+def test_beyond_the_fitted_range_the_logit_goes_on_as_its_tangent() -> None:
+    trials = np.full(len(X), 1e4)
+    fit = fit_logistic(X, special.expit(5.0 * X - X**2) * trials, trials)
+    for end, away in ((fit.low, -1.0), (fit.high, 1.0)):
+        step = 1e-5 * away
+        logit = special.logit(fit(np.array([end - step, end, end + away, end + 3 * away])))
+        slope = (logit[1] - logit[0]) / step
+        np.testing.assert_allclose(logit[2:] - logit[1], slope * away * np.array([1, 3]), rtol=1e-3)
+    falling = fit_logistic(X, trials * special.expit(-4.0 * X - 10.0 * X**2), trials)
+    assert falling(falling.high + 5.0) == falling(falling.high)
+
+
 def test_errors_of_both_crossings_are_what_the_crossings_scatter() -> None:
     """400 sets of binomial counts: mean of the pulls within 4.5/√400, their variance of χ²."""
     rng = np.random.default_rng(2)

@@ -11,13 +11,12 @@ from scipy import stats
 
 from amibayes.cli import main
 from amibayes.errors import DataError, RunError
-from amibayes.inference.limits import DetectionLimit
 from amibayes.plots.style import save
 from amibayes.report.page import page_html, read_figure
 from amibayes.validation import QUICK, validate
 from amibayes.validation.plan import FIELD_MAS, RANGES, ValidationPlan
 from amibayes.validation.tally import rate, sum_of_tosses, tally, unequal, uniformity
-from amibayes.validation.trial import chance_to_find, run_trial
+from amibayes.validation.trial import run_trial
 from amibayes.validation_report import (
     PICTURES,
     validation_json,
@@ -110,36 +109,6 @@ def test_mean_and_scatter_of_the_distance() -> None:
     check = uniformity("g", "n", np.linspace(0.0, 1.0, 100))
     assert check.expected == pytest.approx(float(stats.kstwo.mean(100)), rel=0.02)
     assert check.error == pytest.approx(float(stats.kstwo.std(100)), rel=0.02)
-
-
-def test_chance_to_find_follows_the_limits() -> None:
-    rho = np.array([50.0, 150.0, 250.0])
-    c50 = np.array([1e-3, 1e-3, np.nan])
-    blank = np.zeros((3, 1))
-    limits = DetectionLimit(
-        method="injection",
-        separation_mas=rho,
-        contrast=2.0 * c50,
-        contrast_50=c50,
-        log_error=blank[:, 0],
-        log_error_50=blank[:, 0],
-        spread=np.zeros((3, 3)),
-        by_detection=np.zeros(3, dtype=bool),
-        ambiguous=blank[:, 0],
-        threshold=15.0,
-        false_positive_rate=0.01,
-        false_positives=(1, 100),
-        completeness=0.95,
-        level=blank,
-        trials=blank.astype(int),
-        detected=blank.astype(int),
-        located=blank.astype(int),
-    )
-    assert chance_to_find(limits, np.array([0.0, 100.0, 1e-3])) == pytest.approx(0.5)
-    assert chance_to_find(limits, np.array([0.0, 100.0, 2e-3])) == pytest.approx(0.95)
-    assert chance_to_find(limits, np.array([60.0, 80.0, 1e-4])) < 1e-3
-    assert np.isnan(chance_to_find(limits, np.array([0.0, 300.0, 1e-3])))
-    assert np.isnan(chance_to_find(limits, np.array([0.0, 200.0, 1e-3])))
 
 
 def test_one_star_goes_the_whole_way_and_is_held_to_its_truth() -> None:

@@ -14,7 +14,8 @@ def add_calibration(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--calibration",
         choices=["weighted", "hierarchical"],
-        help="how calibrators are combined (default: hierarchical where 3 or more share a baseline)",
+        help="how calibrators are combined (default: hierarchical where 3 or more "
+        "share a baseline)",
     )
     group.add_argument(
         "--clip",

@@ -16,7 +16,7 @@ from astropy.table import QTable
 from scipy import stats
 
 from amibayes.inference.bank import TemplateBank
-from amibayes.inference.logistic import fit_logistic
+from amibayes.inference.logistic import Logistic, fit_logistic
 from amibayes.inference.quiet import without_companion
 from amibayes.inference.recovery import (
     Recovery,
@@ -160,6 +160,27 @@ class DetectionLimit:
     def share(self) -> FloatArray:
         """Share of recovered companions, (n, n_levels); NaN where none was injected."""
         return np.where(self.trials > 0, self.recovered / np.maximum(self.trials, 1), np.nan)
+
+    def probability(self, separation_mas: float, contrast: float) -> float:
+        """Probability that a companion is recovered; NaN at separations that were not tried.
+
+        By the logistic fits of the rings beside it, between which it is interpolated.
+        """
+        inner, outer = self.separation_mas[[0, -1]]
+        if not inner <= separation_mas <= outer:
+            return float("nan")
+        behind = int(np.searchsorted(self.separation_mas, separation_mas, side="right")) - 1
+        rings = [behind, min(behind + 1, len(self.separation_mas) - 1)]
+        found = [float(self._fit(k)(np.log(contrast))) for k in rings]
+        return float(np.interp(separation_mas, self.separation_mas[rings], found))
+
+    def counts_anywhere(self, separation_mas: float) -> bool:
+        """Whether a companion there counts as recovered wherever it is seen."""
+        return bool(self.by_detection[np.abs(self.separation_mas - separation_mas).argmin()])
+
+    def _fit(self, ring: int) -> Logistic:
+        counts = self.recovered[ring].astype(float), self.trials[ring].astype(float)
+        return fit_logistic(np.log(self.level[ring]), *counts)
 
     @property
     def false_positive_interval(self) -> tuple[float, float]:

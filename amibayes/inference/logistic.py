@@ -21,7 +21,7 @@ NODES = 401
 
 @dataclass(frozen=True, eq=False)
 class Logistic:
-    """logit P = Σ βₖ (x − x₀)ᵏ, k = 0 to 3, fitted.
+    """logit P = Σ βₖ (x − x₀)ᵏ, k = 0 to 3, fitted; its tangent outside of the fitted range.
 
     Parameters
     ----------
@@ -46,7 +46,14 @@ class Logistic:
         return np.asarray(special.expit(self._logit(x)))
 
     def _logit(self, x: FloatArray | float) -> FloatArray:
-        return np.asarray(_design(x - self.centre) @ self.beta)
+        inside = np.clip(x, self.low, self.high)
+        beyond = np.maximum(self._slope(inside), 0.0) * (x - inside)
+        return np.asarray(_design(inside - self.centre) @ self.beta + beyond)
+
+    def _slope(self, x: FloatArray | float) -> FloatArray:
+        """Slope of the logit inside of the fitted range."""
+        powers = np.arange(1, len(self.beta))
+        return np.asarray(_design(x - self.centre)[..., :-1] @ (powers * self.beta[1:]))
 
     def crossing(self, probability: float) -> tuple[float, float]:
         """Find x above which the probability is exceeded, and its 1σ error.
@@ -63,9 +70,7 @@ class Logistic:
         between = nodes[below[-1]], nodes[below[-1] + 1]
         x = float(optimize.brentq(lambda at: float(self._logit(at)) - goal, *between))
         row = _design(x - self.centre)
-        powers = np.arange(1, len(row))
-        slope = (powers * self.beta[1:]) @ row[:-1]
-        return x, float(np.sqrt(row @ self.covariance @ row) / slope)
+        return x, float(np.sqrt(row @ self.covariance @ row) / self._slope(x))
 
 
 def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Logistic:

@@ -192,7 +192,7 @@ def _judged(
     statistic = twice_log_ratio(bank, hit.gain, hit.chi2, free_scale=free_scale)
     position, detected = hit.position, statistic > threshold
     found = np.column_stack([bank.grid.east_mas[position], bank.grid.north_mas[position]])
-    right = np.hypot(*(found - places).T) < 0.5 * fringe_mas
+    right = at_its_place(found, places, fringe_mas)
     doubtful = np.flatnonzero(detected & ~right)
     right[doubtful] = _correlation(bank, found[doubtful], places[doubtful]) > ALIAS
     # Aliases are the dearest part: only those are asked for that decide something.
@@ -205,6 +205,11 @@ def _judged(
     located = np.zeros(len(places), dtype=bool)
     located[sure] = ~ambiguous(closer, hit.gain[sure])
     return {"detected": detected, "located": located, "statistic": statistic}
+
+
+def at_its_place(found: FloatArray, places: FloatArray, fringe_mas: float) -> BoolArray:
+    """Whether positions (…, 2) are those of companions: nearer than λ/2B_max."""
+    return np.asarray(np.linalg.norm(found - places, axis=-1) < 0.5 * fringe_mas)
 
 
 def _correlation(bank: TemplateBank, there: FloatArray, here: FloatArray) -> FloatArray:

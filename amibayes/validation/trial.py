@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.special import expit, logit
 from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import calibrate
@@ -13,9 +12,9 @@ from amibayes.cube import Cube
 from amibayes.errors import AmibayesError, RunError
 from amibayes.extraction import extract
 from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
-from amibayes.inference.limits import DetectionLimit, detection_limit
+from amibayes.inference.limits import detection_limit
 from amibayes.inference.priors import Prior
-from amibayes.inference.results import SearchResult
+from amibayes.inference.recovery import at_its_place
 from amibayes.inference.search import resolution_mas
 from amibayes.instrument import load_instrument
 from amibayes.job import SearchOptions
@@ -126,27 +125,16 @@ def _analysed(
     limits = detection_limit(
         result, weight, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
     )
-    found = bool(weight.detected) and (_near(result, truth) or _anywhere(limits, truth))
+    place, rho = result.theta[:2], float(np.hypot(*truth[:2]))
+    near = bool(at_its_place(place, truth[:2], resolution_mas(result.likelihood)))
+    found = bool(weight.detected) and (near or limits.counts_anywhere(rho))
     return answer | {
         "truth": truth,
         "rank": _ranks(grid, truth),
         "covered": _covered(grid, truth),
         "found": found,
-        "expected": chance_to_find(limits, truth),
+        "expected": limits.probability(rho, truth[2]),
     }
-
-
-def _near(result: SearchResult, truth: FloatArray) -> bool:
-    """Whether the companion was found where it is."""
-    c = result.companion
-    away = np.hypot(c.east_mas - truth[0], c.north_mas - truth[1])
-    return bool(away < 0.5 * resolution_mas(result.likelihood))
-
-
-def _anywhere(limits: DetectionLimit, truth: FloatArray) -> bool:
-    """Whether the limits count a companion there as found wherever it is seen."""
-    nearest = np.abs(limits.separation_mas - np.hypot(truth[0], truth[1])).argmin()
-    return bool(limits.by_detection[nearest])
 
 
 def _ranks(grid: GridPosterior, truth: FloatArray) -> list[float]:
@@ -169,15 +157,3 @@ def _inside(grid: GridPosterior, name: str, value: float, level: float) -> bool:
     if name == "position_angle_deg":
         value = median + (value - median + 180.0) % 360.0 - 180.0
     return low <= value <= high
-
-
-def chance_to_find(limits: DetectionLimit, truth: FloatArray) -> float:
-    """Probability with which the limits say that a companion is found; NaN where they do not.
-
-    The logistic curve through the 50 and the 95 % contrasts at its separation.
-    """
-    rho = float(np.hypot(truth[0], truth[1]))
-    ln50 = np.interp(rho, limits.separation_mas, np.log(limits.contrast_50), np.nan, np.nan)
-    ln95 = np.interp(rho, limits.separation_mas, np.log(limits.contrast), np.nan, np.nan)
-    slope = logit(limits.completeness) / (ln95 - ln50)
-    return float(expit(slope * (np.log(truth[2]) - ln50)))
