@@ -139,12 +139,8 @@ def measure_limits(
     options : LimitsOptions, optional
     journals : Journals, optional
         Keep finished pieces, so that a run that was cut off goes on.
-    announce : callable
-        Told the name of each stage as it begins.
-    progress : callable, optional
-        Told (done, expected) within the longer stages.
-    executor : Executor, optional
-        Where null searches and injections are computed; the result does not depend on it.
+    announce, progress, executor : optional
+        As for `amibayes.search_companion`.
 
     Raises
     ------

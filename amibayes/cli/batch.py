@@ -30,13 +30,19 @@ NOT_OF_A_ROW = {
 SOME_FAILED = 4
 
 
-def add_batch_option(parser: argparse._ActionsContainer) -> None:
-    """Add ``--batch``."""
+def add_inputs(parser: argparse.ArgumentParser) -> None:
+    """Add targets, ``--batch`` in their place, and ``--cal``."""
+    parser.add_argument(
+        "targets", nargs="*", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
+    )
     parser.add_argument(
         "--batch",
         metavar="TABLE",
         help="do this for every row of a table (ECSV, CSV) instead: column target, and if "
         "wanted cal, name and any option such as diameter; exit status 4 if some target failed",
+    )
+    parser.add_argument(
+        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
 
 

@@ -27,13 +27,7 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``limits``."""
     parser.epilog = EXAMPLES
-    parser.add_argument(
-        "targets", nargs="*", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
-    )
-    batch.add_batch_option(parser)
-    parser.add_argument(
-        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
-    )
+    batch.add_inputs(parser)
     _add_limit(parser.add_argument_group("limit"))
     data_options.add_model(parser.add_argument_group("model"))
     data_options.add_joint(parser.add_argument_group("several files"))

@@ -26,13 +26,7 @@ EXAMPLES = """examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``search``."""
     parser.epilog = EXAMPLES
-    parser.add_argument(
-        "targets", nargs="*", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
-    )
-    batch.add_batch_option(parser)
-    parser.add_argument(
-        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
-    )
+    batch.add_inputs(parser)
     data_options.add_model(parser.add_argument_group("model"))
     data_options.add_joint(parser.add_argument_group("several files"))
     _add_weighing(parser.add_argument_group("prior and evidence"))

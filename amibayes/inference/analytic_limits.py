@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from scipy import special, stats
@@ -41,8 +41,6 @@ from amibayes.inference.rings import N_SEPARATIONS, Rings, make_rings
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
 AnalyticMethod = Literal["absil", "candid", "posterior", "closure-phase"]
-
-ANALYTIC_METHODS: tuple[AnalyticMethod, ...] = get_args(AnalyticMethod)
 
 SIGMAS = 3.0
 

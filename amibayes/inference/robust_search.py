@@ -39,9 +39,8 @@ def search_robust(
 
     Parameters
     ----------
-    likelihood : Likelihood
-        With the stated errors.
-    separation_mas : (inner, outer), optional
+    likelihood, separation_mas
+        As for `amibayes.inference.noise.search_with_noise`.
     free_scale : bool
         Fit the scale of the errors of each kind of observable (never below the stated ones).
 

@@ -10,7 +10,7 @@ from collections import Counter
 import numpy as np
 
 from amibayes.oifits.audit.finding import DATA_TABLES, Finding, Findings, column, listed
-from amibayes.oifits.scales import ANGLE, LENGTH, TIME
+from amibayes.oifits.scales import ANGLE
 from amibayes.oifits.setups import same
 from amibayes.oifits.standard import PRIMARY_KEYWORDS, TABLES, ColumnRule
 from amibayes.oifits.tables import OIFits, OITable, plain
@@ -146,9 +146,6 @@ def _channels(oifits: OIFits, table: OITable) -> int | None:
     name = table.keyword("INSNAME")
     found = {len(w) for w in oifits.named("OI_WAVELENGTH") if same(w.keyword("INSNAME"), name)}
     return found.pop() if len(found) == 1 else None
-
-
-KNOWN_UNITS = LENGTH | ANGLE | TIME | {"yr": 1.0, "year": 1.0, "years": 1.0}
 
 
 def standard_unit(unit: str) -> str:
