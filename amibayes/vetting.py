@@ -149,9 +149,8 @@ def vet(
     streams = np.random.SeedSequence(seed).spawn(len(data))
     verdicts = []
     for k, stream in enumerate(streams):
-        verdict = Vetted(
-            data[k].source, True, "", agreement[k], charge_ratio=_ratio(charge_levels, k)
-        )
+        ratio = _ratio(charge_levels, k)
+        verdict = Vetted(data[k].source, True, "", agreement[k], charge_ratio=ratio)
         if (left := judged[k]) is not None:
             rng = np.random.default_rng(stream)
             verdict = _by_itself(verdict, left, separation_mas, alpha, null_draws, limits, rng)

@@ -127,8 +127,7 @@ def calibrate(
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted"}, optional
         Inverse-variance means, with the scatter where it is larger than the errors; or random
-        effects (see `amibayes.calibration.hierarchical`), the default where 3 or more share a
-        baseline.
+        effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline.
     clip : float, optional
         Leave out values that stand off the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (float, float), optional
