@@ -8,7 +8,7 @@ import pytest
 from amibayes.cube import Cube
 from amibayes.extraction import ExtractOptions, extract_all
 from amibayes.extraction.low_flux import expected_covariance
-from amibayes.extraction.sampling import Sampling
+from amibayes.extraction.sampling import OneEach
 from amibayes.instrument import load_instrument
 from amibayes.optics import psf
 from amibayes.optics.psf import ComplexArray
@@ -18,9 +18,9 @@ INSTRUMENT = load_instrument("niriss", "F430M")
 TRIANGLES = INSTRUMENT.mask.triangle_baselines
 
 
-def bare_sampling() -> Sampling:
+def bare_sampling() -> OneEach:
     """Pixels that are the numbers: flux, 21 real parts, 21 imaginary parts."""
-    return Sampling.one_each(np.eye(43), INSTRUMENT.mask, INSTRUMENT.mask.uv_m)
+    return OneEach.of(np.eye(43), INSTRUMENT.mask, INSTRUMENT.mask.uv_m)
 
 
 @pytest.mark.parametrize("relative", [0.01, 1.0, 10.0])
@@ -62,7 +62,7 @@ def test_drawn_photons_scatter_as_expected(method: str, photons: float, read_noi
 
 
 def scatter_of(
-    sampling: Sampling, flux: float, images: FloatArray
+    sampling: OneEach, flux: float, images: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Variances of V² and closure phase that images have, about their means."""
     fluxes, samples = sampling.apply(images)
@@ -72,7 +72,7 @@ def scatter_of(
     return vis2.var(axis=0), (bispectrum / bispectrum.mean(axis=0)).imag.var(axis=0)
 
 
-def optics(method: str, photons: float, read_noise: float) -> tuple[Sampling, FloatArray]:
+def optics(method: str, photons: float, read_noise: float) -> tuple[OneEach, FloatArray]:
     """A method's operator on a bright star's images, and the image of a faint one."""
     image = psf(INSTRUMENT, INSTRUMENT.bandpass.channels(), 80)
     bright = np.stack([1e7 * image] * 3)
@@ -84,7 +84,7 @@ def optics(method: str, photons: float, read_noise: float) -> tuple[Sampling, Fl
 
 
 def first_order(
-    sampling: Sampling, flux: float, samples: ComplexArray, variance: FloatArray
+    sampling: OneEach, flux: float, samples: ComplexArray, variance: FloatArray
 ) -> FloatArray:
     slope = sampling.jacobian(flux, samples) @ sampling.matrix.T
     return np.asarray((slope * variance) @ slope.T)

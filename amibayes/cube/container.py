@@ -31,7 +31,8 @@ class Cube:
     Parameters
     ----------
     images : (n_int, ny, nx) array
-        One image per integration, +y up and +x right, in ``unit``.
+        One image per integration, +y up and +x right, in ``unit``. Single precision stays
+        single precision, as do the errors.
     pixel_scale_rad : float
         Side of a pixel.
     instrument, filter : str
@@ -73,14 +74,14 @@ class Cube:
     source: str = "cube"
 
     def __post_init__(self) -> None:
-        self._hold("images", np.asarray(self.images, dtype=float))
+        self._hold("images", _real(self.images))
         if self.images.ndim != 3:
             raise DataError(f"has {self.images.ndim} axes, not 3", source=self.source)
         nothing = np.broadcast_to(np.uint32(0), self.images.shape)
         dq = nothing if self.dq is None else self.dq
         self._hold("dq", np.asarray(dq, dtype=np.uint32))
         if self.error is not None:
-            self._hold("error", np.asarray(self.error, dtype=float))
+            self._hold("error", _real(self.error))
         for name in ("error", "dq"):
             self._check_shape(name, self.images.shape)
         if self.mjd is not None:
@@ -110,7 +111,8 @@ class Cube:
         """(n_int, ny, nx): flagged as not to be used, or without a finite value or error."""
         assert self.dq is not None
         bad = ~np.isfinite(self.images)
-        if self.dq.any():
+        # One flag spread over all pixels, as where none are given, is looked at once.
+        if (self.dq if any(self.dq.strides) else self.dq[:1, :1, :1]).any():
             bad |= (self.dq & DO_NOT_USE) > 0
         if self.error is not None:
             bad |= ~(np.isfinite(self.error) & (self.error > 0.0))
@@ -120,3 +122,10 @@ class Cube:
     def variance(self) -> FloatArray | None:
         """(n_int, ny, nx): square of the error, where there is one."""
         return None if self.error is None else self.error**2
+
+
+def _real(values: NDArray[Any]) -> NDArray[Any]:
+    """Floating-point numbers in the machine's order of bytes."""
+    array = np.asarray(values)
+    single = array.dtype.kind == "f" and array.dtype.itemsize == 4
+    return np.asarray(array, dtype=np.float32 if single else float)

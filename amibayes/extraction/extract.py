@@ -40,6 +40,7 @@ from amibayes.extraction.noise import (
 )
 from amibayes.extraction.options import ExtractOptions, Method
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
+from amibayes.extraction.sampling import split
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import Source, opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
@@ -265,14 +266,14 @@ def _noise_and_misfit(
         np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
     )
     coefficients = fit.solve(pixels)
-    residual = pixels - coefficients @ fit.design.T
+    residual = fit.residual(pixels, coefficients)
     mean = residual.mean(axis=0).reshape(image.shape)
     noise = cropped(reference.noise, view.part)
     _refuse_another(image, mean, noise, good, reference)
     if not reference.has_errors and len(sample) < 3:
         noise = noise_model(image, (residual[0] ** 2).reshape(image.shape), good)
     elif not reference.has_errors:
-        _, samples = fringe_sampling(fit, view).split(coefficients)
+        _, samples = split(coefficients)
         spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
         noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
     level = misfit_level(mean, noise.variance / len(sample), good)

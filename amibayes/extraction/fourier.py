@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import BoolArray, IntArray, Sampling, closing_products
+from amibayes.extraction.patches import Patches
+from amibayes.extraction.sampling import OneEach, Sampling
+from amibayes.extraction.splodges import Splodges
 from amibayes.extraction.view import View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
@@ -35,41 +37,24 @@ FAINTEST, BRIGHT = 0.3, 0.6
 above the second in full. Farther out the feet of neighbouring splodges overlap."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Samples: baseline, offset from its frequency in whole cells, frequency."""
-
-    baseline: IntArray
-    offset: IntArray
-    frequency_px: FloatArray
-
-    def select(self, keep: BoolArray) -> _Cells:
-        return _Cells(self.baseline[keep], self.offset[keep], self.frequency_px[keep])
-
-
 def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) -> Sampling:
     """Make the operator of one of the Fourier methods; ``fringes`` is the view's basis."""
-    mask = view.instrument.mask
     star = fringes.image().ravel()
     level = _Levels.of(view, options, star)
     if options.method == "unique":
-        cells = _Cells(np.arange(mask.n_baselines), np.zeros((0, 2), np.intp), view.frequency_px)
-        closing, triangle = mask.triangle_baselines, np.arange(len(mask.triangles))
-        return _assembled(view, cells, level, star, np.ones(len(cells.baseline)), closing, triangle)
+        return _unique(view, level, star)
     half_width = _half_width(view, options.method)
     if options.method == "matched":
-        return _matched(view, _Patches.of(view, half_width), level, fringes.matrix)
-    cells = _lattice(view, half_width)
-    gain = np.ones(len(cells.baseline))
+        return _matched(view, half_width, level, fringes.matrix)
+    side = np.arange(-half_width, half_width + 1)
+    gain = np.ones((len(side), len(side)))
     if options.method == "gauss":
-        away = cells.frequency_px - view.frequency_px[cells.baseline]
-        gain = np.exp(-0.25 * np.sum((away * max(view.shape) / GAUSS_SIGMA) ** 2, axis=1))
+        gain = np.exp(-0.25 * (side[:, None] ** 2 + side**2) / GAUSS_SIGMA**2)
     if options.method == "fft":
-        own = _own(_Patches.of(view, half_width), level, fringes.matrix)
-        gain = np.tile(_brightness(own).ravel(), mask.n_baselines)
-        cells, gain = cells.select(gain > 0.0), gain[gain > 0.0]
-    closing, triangle = closing_products(mask.triangle_baselines, cells.offset, cells.baseline)
-    return _assembled(view, cells, level, star, gain, closing, triangle)
+        patches = Patches.of(view, view.frequency_px, half_width)
+        gain = _trimmed(_brightness(_own(view, patches, level, fringes.matrix)))
+    linear = np.column_stack([level.flux, level.background])
+    return Splodges(view, linear, level.window, gain, star)
 
 
 def _half_width(view: View, method: str) -> int:
@@ -79,48 +64,6 @@ def _half_width(view: View, method: str) -> int:
     return int(
         np.ceil(size * view.instrument.pixel_scale_rad / view.wavelength_m * max(view.shape))
     )
-
-
-def _lattice(view: View, half_width: int) -> _Cells:
-    """Cells about every splodge, as far apart as those of an FFT of the image.
-
-    Each baseline has them about its own frequency. Frequencies close, hence offsets that
-    close are closing products, and a patch has no side on which it sees more of its
-    splodge than on the other: the phase of a companion's fringe is that of its baseline.
-    """
-    step = 1.0 / max(view.shape)
-    n = view.instrument.mask.n_baselines
-    side = np.arange(-half_width, half_width + 1)
-    patch = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    frequency = view.frequency_px[:, None, :] + patch * step
-    return _Cells(
-        np.repeat(np.arange(n), len(patch)), np.tile(patch, (n, 1)), frequency.reshape(-1, 2)
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Patches:
-    """Waves along either axis, (n_baselines, n_x, k) and (n_baselines, n_y, k)."""
-
-    along_x: ComplexArray
-    along_y: ComplexArray
-
-    @classmethod
-    def of(cls, view: View, half_width: int) -> _Patches:
-        side = np.arange(-half_width, half_width + 1) / max(view.shape)
-        x, y = (
-            np.exp(-2j * np.pi * axis[:, None] * (f[:, None] + side)[:, None, :])
-            for axis, f in zip(view.axes_px(), view.frequency_px.T, strict=True)
-        )
-        return cls(x, y)
-
-    def transform(self, images: ComplexArray | FloatArray) -> ComplexArray:
-        """Transform (n_baselines, k, k) of an image (…, n_y, n_x) for each baseline."""
-        return np.asarray(self.along_y.swapaxes(1, 2) @ images @ self.along_x)
-
-    def combined(self, weight: ComplexArray) -> ComplexArray:
-        """Sum (n_baselines, n_y, n_x) of the waves with weights (n_baselines, k, k)."""
-        return np.asarray(self.along_y @ weight @ self.along_x.swapaxes(1, 2))
 
 
 def _brightness(own: ComplexArray) -> FloatArray:
@@ -158,72 +101,52 @@ class _Levels:
         flux, background = np.linalg.solve(system, both)
         return cls(window.ravel(), flux, background)
 
-    def transform(self, view: View, frequency_px: FloatArray) -> ComplexArray:
-        """Operator (n_pixels, n) from pixels to the transform less the background's."""
-        x, y = view.axes_px()
-        along_x = np.exp(-2j * np.pi * np.outer(x, frequency_px[:, 0]))
-        along_y = np.exp(-2j * np.pi * np.outer(y, frequency_px[:, 1]))
-        wave = (along_y[:, None, :] * along_x).reshape(-1, len(frequency_px))
-        wave *= self.window[:, None]
-        return np.asarray(wave - np.outer(self.background, wave.sum(axis=0)))
+
+def _unique(view: View, level: _Levels, star: FloatArray) -> OneEach:
+    """One sample per baseline, at its frequency; a point source makes it 1."""
+    patches = Patches.of(view, view.frequency_px, 0)
+    x, y = patches.along_x[:, 0], patches.along_y[:, 0]
+    wave = (y[:, :, None] * x[:, None, :]).reshape(len(x), -1) * level.window
+    wave -= np.outer(wave.sum(axis=1), level.background)
+    # Feet of other splodges turn a sample: a point source is to have phase 0.
+    wave /= (wave @ star)[:, None]
+    rows = np.concatenate([level.flux[None], wave.real, wave.imag])
+    return OneEach.of(rows.T, view.instrument.mask, view.frequency_px)
 
 
-def _matched(view: View, patches: _Patches, level: _Levels, basis: FloatArray) -> Sampling:
+def _matched(view: View, half_width: int, level: _Levels, basis: FloatArray) -> OneEach:
     """One sample per baseline: cells weighted with the splodge that is expected there.
 
     The outskirts of neighbouring splodges overlap; what each sample sees of the others is
     known from the model and taken out.
     """
-    mask = view.instrument.mask
-    n = mask.n_baselines
-    own = _own(patches, level, basis)
+    patches = Patches.of(view, view.frequency_px, half_width)
+    own = _own(view, patches, level, basis)
     share = (own * _brightness(own)).conj()
-    window = level.window.reshape(view.shape)
-    level_of = np.sum(share * patches.transform(window), axis=(1, 2))
-    operator = (window * patches.combined(share)).reshape(n, -1).T
-    operator = operator - np.outer(level.background, level_of)
-    matrix = np.column_stack([level.flux, operator.real, operator.imag])
-    seen = basis.T @ matrix
-    scale = np.abs(seen).max(axis=0)
-    alone = np.linalg.solve((seen / scale).T, (matrix / scale).T).T
-    return Sampling.one_each(alone, mask, view.frequency_px)
+    level_of = np.sum(share * patches.transform(level.window.reshape(view.shape)), axis=(1, 2))
+    weights = np.concatenate([share, -1j * share])
+    waves = patches.repeated(2).combined(weights).reshape(len(weights), -1) * level.window
+    waves -= np.outer(np.concatenate([level_of.real, level_of.imag]), level.background)
+    rows = np.concatenate([level.flux[None], waves])
+    seen = rows @ basis
+    scale = np.abs(seen).max(axis=1)[:, None]
+    alone = np.linalg.inv(seen / scale) @ (rows / scale)
+    return OneEach.of(alone.T, view.instrument.mask, view.frequency_px)
 
 
-def _own(patches: _Patches, level: _Levels, basis: FloatArray) -> ComplexArray:
+def _own(view: View, patches: Patches, level: _Levels, basis: FloatArray) -> ComplexArray:
     """Transform (n_baselines, k, k) of every baseline's own fringe, less its background."""
     n = basis.shape[1] // 2
-    fringe = (basis[:, 1 : 1 + n] - 1j * basis[:, 1 + n :]).T
-    shape = patches.along_y.shape[1], patches.along_x.shape[1]
-    window = level.window.reshape(shape)
-    background = fringe @ level.background
-    return np.asarray(
-        patches.transform(window * fringe.reshape(n, *shape))
-        - background[:, None, None] * patches.transform(window)
-    )
+    background = (level.background @ basis)[1:].reshape(2, n)
+    fringes = (basis.T[1:] * level.window).reshape(2, n, *view.shape)
+    real, imaginary = (patches.transform(f) for f in fringes)
+    flat = patches.transform(level.window.reshape(view.shape))
+    below = background[0] - 1j * background[1]
+    return np.asarray(real - 1j * imaginary - below[:, None, None] * flat)
 
 
-def _assembled(
-    view: View,
-    cells: _Cells,
-    level: _Levels,
-    star: FloatArray,
-    gain: FloatArray,
-    closing: IntArray,
-    triangle: IntArray,
-) -> Sampling:
-    """Samples as they are, normalised so that a point source has V² = 1."""
-    operator = level.transform(view, cells.frequency_px) * np.sqrt(gain)
-    reference = star @ operator
-    # Feet of other splodges turn a sample: a point source is to have phase 0.
-    operator *= reference.conj() / np.abs(reference)
-    reference = np.abs(reference).astype(complex)
-    total = np.bincount(cells.baseline, reference.real**2)
-    return Sampling(
-        np.column_stack([level.flux, operator.real, operator.imag]),
-        cells.baseline,
-        1.0 / total[cells.baseline],
-        closing,
-        triangle,
-        cells.frequency_px,
-        reference,
-    )
+def _trimmed(gain: FloatArray) -> FloatArray:
+    """The middle of a symmetric patch, outside which it is 0."""
+    lit = np.flatnonzero(gain.any(axis=0) | gain.any(axis=1))
+    part = slice(int(lit[0]), int(lit[-1]) + 1)
+    return np.asarray(gain[part, part])

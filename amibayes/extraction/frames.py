@@ -15,7 +15,7 @@ from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Referenc
 from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.image_plane import FringeFit, SingleArray, shift_of
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import IntArray, Sampling
+from amibayes.extraction.sampling import IntArray, PixelArray, Sampling
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
@@ -129,6 +129,32 @@ class Bench:
         """What noise adds to flux² and to the power of every baseline."""
         return self.sampling.bias(self.variance)
 
+    def numbers(self, pixels: PixelArray) -> FloatArray:
+        """Coefficients of the fit, then what else the sampling needs, of images (n, n_pixels)."""
+        single = pixels.dtype == np.float32
+        return np.asarray(pixels @ (self._single if single else self._double), dtype=float)
+
+    def sampled(
+        self, numbers: FloatArray, pixels: PixelArray
+    ) -> tuple[FloatArray, ComplexArray]:
+        """Flux and samples of images whose `numbers` are known."""
+        first = 0 if self._fitted else self.fit.n_coefficients
+        return self.sampling.completed(numbers[:, first:], pixels)
+
+    @property
+    def _fitted(self) -> bool:
+        """Whether the coefficients are what is measured."""
+        return self.options.method == "fringes"
+
+    @cached_property
+    def _double(self) -> FloatArray:
+        parts = [self.fit.inverse] if self._fitted else [self.fit.inverse, self.sampling.linear]
+        return np.concatenate(parts, axis=1)
+
+    @cached_property
+    def _single(self) -> SingleArray:
+        return np.ascontiguousarray(self._double, dtype=np.float32)
+
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
     """Measure every integration of a file, which is number ``index`` of its set.
@@ -146,8 +172,7 @@ def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArra
     for cube in _chunks(file):
         frames, samples = _measure_chunk(bench, cube)
         lit = frames.used
-        turn = np.exp(2j * np.pi * frames.shift_px[lit] @ bench.sampling.frequency_px.T)
-        total += (samples[lit] * turn).sum(axis=0)
+        total += bench.sampling.centred(samples[lit], frames.shift_px[lit])
         flux, count = flux + float(frames.flux[lit].sum()), count + int(lit.sum())
         parts.append(frames)
     joined = concatenated(parts)
@@ -172,8 +197,8 @@ def _chunks(file: Source) -> Iterator[Cube]:
 
 
 def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
-    pixels, misfit, n_bad = _cleaned(bench, cube)
-    flux, samples = bench.sampling.apply(pixels)
+    pixels, numbers, misfit, n_bad = _cleaned(bench, cube)
+    flux, samples = bench.sampled(numbers, pixels)
     own, extra = bench.bias
     n = cube.n_integrations
     hopeless = n_bad > MOST_BAD * pixels.shape[1]
@@ -196,7 +221,9 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
-def _cleaned(bench: Bench, cube: Cube) -> tuple[FloatArray, FloatArray, IntArray]:
+def _cleaned(
+    bench: Bench, cube: Cube
+) -> tuple[PixelArray, FloatArray, SingleArray, IntArray]:
     """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
     Only where the fit of an integration leaves something that it does not of others is it
@@ -205,6 +232,8 @@ def _cleaned(bench: Bench, cube: Cube) -> tuple[FloatArray, FloatArray, IntArray
     Returns
     -------
     pixels : (n, n_pixels) array
+    numbers : (n, m) array
+        Those of the bench.
     misfit : (n,) array
         Residual as a share of the image, rms.
     n_bad : (n,) int array
@@ -215,29 +244,31 @@ def _cleaned(bench: Bench, cube: Cube) -> tuple[FloatArray, FloatArray, IntArray
     images = np.where(bad, 0.0, cube.images) if bad.any() else cube.images
     part = np.s_[:, view.rows, view.columns]
     pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
-    filled, residual = _filled(bench.fit, pixels, missing)
+    filled, numbers, residual = _filled(bench, pixels, missing)
     hit = np.flatnonzero(bench.expected.standing_off(residual, limit).any(axis=1))
     if len(hit):
         wrong = missing[hit]
         wrong |= bench.reference.outliers(images[hit], bad[hit], limit)[part].reshape(wrong.shape)
-        _, left = _filled(bench.fit, pixels[hit], wrong)
+        _, _, left = _filled(bench, pixels[hit], wrong)
         wrong |= bench.expected.standing_off(left, limit)
         filled, missing[hit] = np.array(filled), wrong
-        filled[hit], residual[hit] = _filled(bench.fit, pixels[hit], wrong)
+        filled[hit], numbers[hit], residual[hit] = _filled(bench, pixels[hit], wrong)
     left, whole = (np.einsum("np,np->n", a, a) for a in (residual, filled))
-    misfit = np.sqrt(left / np.maximum(whole, 1e-300))
-    return filled, misfit, np.count_nonzero(missing & bench.fit.used, axis=1)
+    misfit = np.sqrt(left / np.maximum(whole, np.finfo(whole.dtype).tiny))
+    return filled, numbers, misfit, np.count_nonzero(missing & bench.fit.used, axis=1)
 
 
 def _filled(
-    fit: FringeFit, pixels: FloatArray, missing: BoolArray
-) -> tuple[FloatArray, SingleArray]:
-    """Pixels with the missing ones filled, and what the fit leaves of them."""
+    bench: Bench, pixels: PixelArray, missing: BoolArray
+) -> tuple[PixelArray, FloatArray, SingleArray]:
+    """Pixels with the missing ones filled, their numbers, and what the fit leaves of them."""
+    fit = bench.fit
     gone = missing | ~fit.used
     if gone.any():
         hopeless = np.count_nonzero(missing & fit.used, axis=1) > MOST_BAD * missing.shape[1]
         pixels = fit.fill(pixels, gone & ~hopeless[:, None])
-    return pixels, fit.residual(pixels)
+    numbers = bench.numbers(pixels)
+    return pixels, numbers, fit.residual(pixels, numbers[:, : fit.n_coefficients])
 
 
 def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.str_]:

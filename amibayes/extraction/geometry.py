@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.extraction.fine_image import fine_image
-from amibayes.extraction.image_plane import FringeFit
+from amibayes.extraction.image_plane import FringeFit, weighted_fit
 from amibayes.extraction.view import View
 from amibayes.units import FloatArray
 
@@ -115,7 +115,7 @@ def solve_geometry(
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     if not 0.0 < error[:2].min() <= error[:2].max() < CONSTRAINED:
         return None
-    total, residual = np.zeros(4), _residual(fit.design, fit, pixels)
+    total, residual = np.zeros(4), _residual(fit, pixels)
     for _ in range(MOST_STEPS):
         step = covariance @ (slopes * fit.weight) @ residual
         total = total + step
@@ -123,8 +123,7 @@ def solve_geometry(
             return None
         if np.all(SHRINKS * np.abs(step[:2]) < np.maximum(ENOUGH_SIGMA * error[:2], ENOUGH)):
             break
-        design = np.column_stack([_moved(view, total).basis().matrix, np.ones(image.size)])
-        residual = _residual(design, fit, pixels)
+        residual = _residual(weighted_fit(_moved(view, total).basis(), fit.weight), pixels)
     return total[:2], error[:2]
 
 
@@ -135,11 +134,9 @@ def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
     return float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
 
 
-def _residual(design: FloatArray, fit: FringeFit, pixels: FloatArray) -> FloatArray:
-    """What the best sum of the columns of a design leaves of one image, (n_pixels,)."""
-    weighted = design * fit.weight[:, None]
-    best = np.linalg.solve(design.T @ weighted, weighted.T @ pixels[0])
-    return np.asarray(pixels[0] - design @ best)
+def _residual(fit: FringeFit, pixels: FloatArray) -> FloatArray:
+    """What a fit leaves of one image, (n_pixels,)."""
+    return np.asarray((pixels - fit.solve(pixels) @ fit.design.T)[0])
 
 
 def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:

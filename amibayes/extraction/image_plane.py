@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
-from amibayes.extraction.sampling import BoolArray, IntArray, Sampling
+from amibayes.extraction.sampling import BoolArray, IntArray, OneEach, PixelArray, split
 from amibayes.extraction.view import CONVERGED_PX, View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray, read_only
+from amibayes.units import FloatArray
 
 MOST_STEPS = 12
 
@@ -34,45 +34,46 @@ class FringeFit:
     ----------
     design : (n_pixels, 2 + 2·n_baselines) array
         Columns: envelope, cosines, sines, pedestal.
-    inverse : (n_pixels, 2 + 2·n_baselines) array
-        Images times this matrix are the coefficients.
+    covariance : (2 + 2·n_baselines, 2 + 2·n_baselines) array
+        Of the coefficients: inverse of the normal matrix.
     weight : (n_pixels,) array
         Inverse variances; 0 where a pixel is never used.
     """
 
     design: FloatArray
-    inverse: FloatArray
+    covariance: FloatArray
     weight: FloatArray
 
-    def __post_init__(self) -> None:
-        read_only(self, "design", "inverse", "weight")
-
     @property
-    def n_baselines(self) -> int:
-        """How many baselines."""
-        return int(self.design.shape[1]) // 2 - 1
+    def n_coefficients(self) -> int:
+        """How many numbers are fitted."""
+        return int(self.design.shape[1])
 
     @cached_property
     def used(self) -> BoolArray:
         """(n_pixels,) those that are used at all."""
         return self.weight > 0.0
 
-    def solve(self, pixels: FloatArray) -> FloatArray:
-        """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
-        return np.asarray(pixels @ self.inverse)
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """(n_pixels, n_coefficients): images times this matrix are the coefficients."""
+        return np.asarray((self.covariance @ (self.design.T * self.weight)).T)
 
-    def residual(self, pixels: FloatArray) -> SingleArray:
+    def solve(self, pixels: PixelArray) -> FloatArray:
+        """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
+        return np.asarray((pixels * self.weight) @ self.design @ self.covariance)
+
+    def residual(self, pixels: PixelArray, coefficients: FloatArray) -> SingleArray:
         """What the fit leaves of images, in single precision: it is looked at, not measured."""
-        inverse, model = self._single
         left = pixels.astype(np.float32)
-        left -= (left @ inverse) @ model
+        left -= coefficients.astype(np.float32) @ self._model
         return left
 
     @cached_property
-    def _single(self) -> tuple[SingleArray, SingleArray]:
-        return self.inverse.astype(np.float32), np.ascontiguousarray(self.design.T, np.float32)
+    def _model(self) -> SingleArray:
+        return np.ascontiguousarray(self.design.T, np.float32)
 
-    def fill(self, pixels: FloatArray, missing: BoolArray) -> FloatArray:
+    def fill(self, pixels: PixelArray, missing: BoolArray) -> PixelArray:
         """Give missing pixels the values that a fit without them predicts.
 
         Parameters
@@ -83,8 +84,11 @@ class FringeFit:
         Returns
         -------
         (n, n_pixels) array
+            In the same precision; the very array where nothing is missing.
         """
         frame, pixel = np.nonzero(missing)
+        if not len(frame):
+            return pixels
         filled = pixels.copy()
         filled[frame, pixel] = 0.0
         count = np.bincount(frame, minlength=len(pixels))
@@ -95,11 +99,12 @@ class FringeFit:
             filled[frames[:, None], index] = self._predicted(filled[frames], index)
         return filled
 
-    def _predicted(self, pixels: FloatArray, index: IntArray) -> FloatArray:
+    def _predicted(self, pixels: PixelArray, index: IntArray) -> FloatArray:
         """Predictions (n, k) of the pixels ``index`` (n, k), which are 0 in ``pixels``."""
-        design, inverse = self.design[index], self.inverse[index]
-        system = np.eye(index.shape[1]) - design @ inverse.swapaxes(1, 2)
+        design = self.design[index]
+        gain = design @ self.covariance @ (design * self.weight[index][..., None]).swapaxes(1, 2)
         start = np.einsum("nkp,np->nk", design, self.solve(pixels))
+        system = np.eye(index.shape[1]) - gain
         return np.asarray(np.linalg.solve(system, start[..., None])[..., 0])
 
 
@@ -111,10 +116,20 @@ def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> Fri
     DataError
         Where the good pixels do not determine it.
     """
-    design = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
-    weight = np.where(good, 1.0 / variance, 0.0).ravel()
-    weighted = design * weight[:, None]
-    normal = design.T @ weighted
+    return weighted_fit(basis, np.where(good, 1.0 / variance, 0.0).ravel())
+
+
+def weighted_fit(basis: FringeBasis, weight: FloatArray) -> FringeFit:
+    """Prepare the fit with the inverse variances (n_pixels,).
+
+    Raises
+    ------
+    DataError
+        Where they do not determine it.
+    """
+    rows = np.concatenate([basis.matrix.T, np.ones((1, len(basis.matrix)))])
+    weighted = rows * np.sqrt(weight)
+    normal = weighted @ weighted.T
     # Fringes of different frequency are nearly orthogonal: columns of like size keep the
     # normal equations well conditioned.
     scale = np.sqrt(np.diag(normal))
@@ -122,14 +137,13 @@ def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> Fri
         factor = cho_factor(normal / np.outer(scale, scale))
     except (LinAlgError, ValueError):
         raise DataError("too few good pixels to tell the fringes apart") from None
-    inverse = cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None]
-    return FringeFit(design, weighted @ inverse, weight)
+    covariance = cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None]
+    return FringeFit(rows.T, covariance, weight)
 
 
-def fringe_sampling(fit: FringeFit, view: View) -> Sampling:
-    """Coefficients of the fit as flux and one complex sample per baseline."""
-    mask = view.instrument.mask
-    return Sampling.one_each(fit.inverse[:, : 1 + 2 * mask.n_baselines], mask, view.frequency_px)
+def fringe_sampling(fit: FringeFit, view: View) -> OneEach:
+    """Coefficients of the fit, but for the pedestal, as flux and a sample per baseline."""
+    return OneEach.of(fit.inverse[:, :-1], view.instrument.mask, view.frequency_px)
 
 
 def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None) -> FloatArray:
@@ -161,7 +175,7 @@ def centre_on(
     for _ in range(MOST_STEPS):
         basis = view.basis()
         fit = fringe_fit(basis, even, good)
-        flux, samples = fringe_sampling(fit, view).apply(pixels.reshape(1, -1))
+        flux, samples = split(fit.solve(pixels.reshape(1, -1)))
         step = shift_of(view, samples, np.abs(samples[0]))[0]
         if np.hypot(*step) < CONVERGED_PX and flux[0] > 0.0:
             return view, basis, fit

@@ -6,18 +6,19 @@ order are as large as the first: pairs of noises with the third leg, and the pro
 three noises (the terms of Gordon & Buscher 2012, their sums over photons and read noise put
 in as one covariance of the numbers, which pixels and weights may correlate as they like).
 For Gaussian noise the three orders are uncorrelated once what the third has in common with
-the first is counted there, and each has a closed form. Photons are not quite Gaussian: their
-third cumulant correlates first and second order, by as much as the second order itself.
+the first is counted there, and each is a sum of products of the covariances of two legs
+(Isserlis 1918). Photons are not quite Gaussian: their third cumulant correlates first and
+second order, by as much as the second order itself.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from amibayes.extraction.sampling import IntArray, Sampling
+from amibayes.extraction.sampling import OneEach, Sampling, signs
+from amibayes.extraction.splodges import Splodges
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
@@ -51,122 +52,125 @@ def expected_covariance(
     -------
     (n_baselines + n_triangles, n_baselines + n_triangles) array
     """
-    noise = sampling.matrix.T @ (sampling.matrix * variance[:, None])
-    slope = sampling.jacobian(flux, samples)
-    n = sampling.n_baselines
-    share = _shares(sampling, flux, samples)
-    if not sampling.single:
-        total = slope @ noise @ slope.T
-        total[:n, :n] += 2.0 * share @ noise**2 @ share.T
-        return np.asarray(total)
-    products = _Products.of(sampling, samples)
-    curved = np.column_stack([sampling.matrix**2 @ share.T, products.of_one(sampling.matrix)])
-    skewed = (sampling.matrix @ slope.T).T @ (curved * skewness[:, None])
-    slope[n:] += products.slope_of_third(noise)
-    total = slope @ noise @ slope.T + _second_order(share, products.curvature(), noise)
-    total += skewed + skewed.T
-    total[n:, n:] += products.third_order(noise)
-    scale = np.concatenate([np.ones(n), 1.0 / np.abs(products.mean(noise))])
+    if isinstance(sampling, OneEach):
+        return _of_one_each(sampling, flux, samples, variance, skewness)
+    assert isinstance(sampling, Splodges)
+    slopes = sampling.slopes(flux, samples) * np.sqrt(variance)
+    total = slopes @ slopes.T
+    second = sampling.squares(flux, samples, variance)
+    total[: len(second), : len(second)] += second
+    return np.asarray(total)
+
+
+def _of_one_each(
+    sampling: OneEach, flux: float, samples: ComplexArray, variance: FloatArray, third: FloatArray
+) -> FloatArray:
+    noise = sampling.covariance(variance)
+    share, slope = sampling.shares(flux, samples), sampling.jacobian(flux, samples)
+    legs = _Legs.of(sampling, samples, noise)
+    n = len(share)
+    skewed = slope @ _curved(sampling, samples, share, third)
+    slope[n:] += legs.slope_of_third()
+    total = slope @ noise @ slope.T + skewed + skewed.T
+    both = legs.second_order_with(share)
+    total[:n, :n] += 2.0 * share @ noise**2 @ share.T
+    total[:n, n:] += both
+    total[n:, :n] += both.T
+    total[n:, n:] += legs.second_order() + legs.third_order()
+    scale = np.concatenate([np.ones(n), 1.0 / np.abs(legs.mean())])
     return np.asarray(scale[:, None] * total * scale)
 
 
-def _shares(sampling: Sampling, flux: float, samples: ComplexArray) -> FloatArray:
-    """V² as a sum of squares of the numbers: their shares (n_baselines, n_numbers)."""
-    n = sampling.n_samples
-    power = sampling.power(samples[None])[0]
-    share = np.zeros((len(power), 1 + 2 * n))
-    share[:, 0] = -power / flux**4
-    for first in (1, 1 + n):
-        share[sampling.baseline, first + np.arange(n)] = sampling.weight / flux**2
-    return share
+def _curved(
+    sampling: OneEach, samples: ComplexArray, share: FloatArray, third: FloatArray
+) -> FloatArray:
+    """Third moments (n_numbers, n_baselines + n_triangles) of a number and a second order.
 
-
-def _second_order(share: FloatArray, curvature: FloatArray, noise: FloatArray) -> FloatArray:
-    """Covariance ½ tr(H C H' C) of the quadratic parts of V² and of closure phase."""
-    turned = curvature @ noise
-    vis2 = 2.0 * share @ noise**2 @ share.T
-    both = share @ np.einsum("kl,tlk->kt", noise, turned)
-    flat = turned.reshape(len(turned), -1)
-    closure = 0.5 * flat @ turned.swapaxes(1, 2).reshape(len(turned), -1).T
-    return np.block([[vis2, both], [both.T, closure]])
+    The second order that a unit in one pixel makes with itself is Σ pairs x·y of the legs'
+    changes: (Σ Re)(Σ Im) − Σ Re·Im is its imaginary part.
+    """
+    columns, n = sampling.matrix.T, sampling.n_samples
+    of_real, of_imaginary = (1.0 / samples)[:, None].real, (1.0 / samples)[:, None].imag
+    a, b = columns[1 : 1 + n], columns[1 + n :]
+    real, imaginary = a * of_real - b * of_imaginary, a * of_imaginary + b * of_real
+    turned = signs(sampling.triangles, n)
+    curved = np.concatenate([share @ columns**2, (np.abs(turned) @ real) * (turned @ imaginary)])
+    curved[n:] -= turned @ (real * imaginary)
+    curved *= third
+    return np.asarray(columns @ curved.T)
 
 
 @dataclass(frozen=True, eq=False)
-class _Products:
-    """The bispectrum over its mean as a product of three linear forms of the numbers.
+class _Legs:
+    """The bispectrum over its mean as a product of three noisy legs.
 
     Parameters
     ----------
-    numbers : (n_triangles, 6) int array
-        Which of the numbers a triangle takes.
-    forms : (3, n_triangles, 6) complex array
-        Relative change of each leg by those numbers.
-    n_numbers : int
+    forms : (3, n_triangles, n_numbers) complex array
+        Relative change of each leg by the numbers.
+    noise : (n_numbers, n_numbers) array
+        Covariance of the numbers.
+    plain, conjugate : (3, n_triangles, 3, n_triangles) complex array
+        Mean of the product of two legs, and of one with the conjugate of another.
     """
 
-    numbers: IntArray
     forms: ComplexArray
-    n_numbers: int
+    noise: FloatArray
+    plain: ComplexArray
+    conjugate: ComplexArray
 
     @classmethod
-    def of(cls, sampling: Sampling, samples: ComplexArray) -> _Products:
-        n, count = sampling.n_samples, len(sampling.closing)
-        forms = np.zeros((3, count, 6), dtype=complex)
-        for leg, turn in enumerate((1j, 1j, -1j)):
-            value = samples[sampling.closing[:, leg]]
-            value = value.conj() if turn == -1j else value
-            forms[leg, :, leg], forms[leg, :, 3 + leg] = 1.0 / value, turn / value
-        numbers = np.concatenate([1 + sampling.closing, 1 + n + sampling.closing], axis=1)
-        return cls(numbers, forms, 1 + 2 * n)
+    def of(cls, sampling: OneEach, samples: ComplexArray, noise: FloatArray) -> _Legs:
+        n = sampling.n_samples
+        relative = np.zeros((n, 1 + 2 * n), dtype=complex)
+        relative[:, 1 : 1 + n], relative[:, 1 + n :] = np.diag(1.0 / samples), np.diag(1j / samples)
+        forms = relative[sampling.triangles.T]
+        forms[2] = forms[2].conj()
+        flat = forms.reshape(-1, 1 + 2 * n)
+        noisy, shape = flat @ noise, (*forms.shape[:2], *forms.shape[:2])
+        plain, conjugate = noisy @ flat.T, noisy @ flat.conj().T
+        return cls(forms, noise, plain.reshape(shape), conjugate.reshape(shape))
 
-    def of_one(self, matrix: FloatArray) -> FloatArray:
-        """Second order (n_pixels, n_triangles) that a unit in one pixel makes with itself."""
-        full = np.zeros((3, len(self.numbers), self.n_numbers), dtype=complex)
-        np.put_along_axis(full, np.broadcast_to(self.numbers, self.forms.shape), self.forms, axis=2)
-        # Real times complex as one real product.
-        columns = np.ascontiguousarray(full.reshape(-1, self.n_numbers).T).view(float)
-        x, y, z = np.split((matrix @ columns).view(complex), 3, axis=1)
-        return np.asarray((x * y + (x + y) * z).imag)
+    def _own(self) -> ComplexArray:
+        """Mean products of two legs of one triangle: second and third, third and first, ..."""
+        t = np.arange(self.forms.shape[1])
+        return np.stack([self.plain[1, t, 2, t], self.plain[2, t, 0, t], self.plain[0, t, 1, t]])
 
-    def curvature(self) -> FloatArray:
-        """Second derivatives (n_triangles, n_numbers, n_numbers) of the phase."""
-        a, b, c = self.forms
-        half = sum(np.einsum("ti,tj->tij", p, q) for p, q in ((a, b), (b, c), (c, a)))
-        full = np.zeros((len(a), self.n_numbers, self.n_numbers))
-        rows, columns = self.numbers[:, :, None], self.numbers[:, None, :]
-        full[np.arange(len(a))[:, None, None], rows, columns] = np.imag(half + half.swapaxes(1, 2))
-        return full
-
-    def mean(self, noise: FloatArray) -> ComplexArray:
+    def mean(self) -> ComplexArray:
         """Mean bispectrum (n_triangles,) in units of the product of the mean legs.
 
         Noises of two legs that have photons in common do not average out.
         """
-        own = noise[self.numbers[:, :, None], self.numbers[:, None, :]]
-        a, b, c = self.forms
-        pairs = (np.einsum("ti,tij,tj->t", p, own, q) for p, q in ((a, b), (b, c), (c, a)))
-        return np.asarray(1.0 + sum(pairs))
+        return np.asarray(1.0 + self._own().sum(axis=0))
 
-    @cached_property
-    def _third(self) -> FloatArray:
-        """Third derivatives (n_triangles, 6, 6, 6)."""
-        orders = ("ijk", "ikj", "jik", "jki", "kij", "kji")
-        terms = (np.einsum(f"t{o[0]},t{o[1]},t{o[2]}->tijk", *self.forms) for o in orders)
-        return np.asarray(sum(term.imag for term in terms))
-
-    def slope_of_third(self, noise: FloatArray) -> FloatArray:
+    def slope_of_third(self) -> FloatArray:
         """What the third order has in common with the first, as a slope by the numbers."""
-        own = noise[self.numbers[:, :, None], self.numbers[:, None, :]]
-        slope = np.zeros((len(self.numbers), self.n_numbers))
-        part = 0.5 * np.einsum("tijk,tjk->ti", self._third, own)
-        np.put_along_axis(slope, self.numbers, part, axis=1)
-        return slope
+        return np.asarray((self._own()[..., None] * self.forms).sum(axis=0).imag)
 
-    def third_order(self, noise: FloatArray) -> FloatArray:
+    def second_order_with(self, share: FloatArray) -> FloatArray:
+        """Covariance (n_baselines, n_triangles) of the quadratic parts with those of V²."""
+        with_leg = self.forms @ self.noise
+        pairs = with_leg.sum(axis=0) ** 2 - (with_leg**2).sum(axis=0)
+        return np.asarray(share @ pairs.imag.T)
+
+    def second_order(self) -> FloatArray:
+        """Covariance (n_triangles, n_triangles) of the quadratic parts of closure phases."""
+        return np.asarray(0.5 * (_pairs(self.conjugate) - _pairs(self.plain)).real)
+
+    def third_order(self) -> FloatArray:
         """Covariance (n_triangles, n_triangles) of the rest of the third order."""
-        third = self._third
-        between = noise[self.numbers[:, None, :, None], self.numbers[None, :, None, :]]
-        turned = np.einsum("tijk,tuia->tuajk", third, between)
-        turned = np.einsum("tuajk,tujb->tuabk", turned, between)
-        turned = np.einsum("tuabk,tukc->tuabc", turned, between)
-        return np.asarray(np.einsum("tuabc,uabc->tu", turned, third) / 6.0)
+        return np.asarray(0.5 * (_triples(self.conjugate) - _triples(self.plain)).real)
+
+
+def _pairs(means: ComplexArray) -> ComplexArray:
+    """Two different legs of one triangle with two different ones of another, either way."""
+    both, squares = means.sum(axis=(0, 2)) ** 2, means**2
+    same = (means.sum(axis=0) ** 2).sum(axis=1) + (means.sum(axis=2) ** 2).sum(axis=0)
+    return np.asarray(0.5 * (both - same + squares.sum(axis=(0, 2))))
+
+
+def _triples(means: ComplexArray) -> ComplexArray:
+    """All three legs of one triangle with all three of another, in each order."""
+    a, b, c = means.swapaxes(1, 2)
+    orders = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+    return np.asarray(sum(a[i] * b[j] * c[k] for i, j, k in orders))
