@@ -130,9 +130,13 @@ class Bench:
         return self.sampling.bias(self.variance)
 
     def numbers(self, pixels: PixelArray) -> FloatArray:
-        """Coefficients of the fit, then what else the sampling needs, of images (n, n_pixels)."""
-        single = pixels.dtype == np.float32
-        return np.asarray(pixels @ (self._single if single else self._double), dtype=float)
+        """Coefficients of the fit, then what else the sampling needs, of images (n, n_pixels).
+
+        They are those of the reference, and those of what an image differs by from it: the
+        rounding of single precision is then that of a small number.
+        """
+        usual, known, operator = self._single if pixels.dtype == np.float32 else self._double
+        return np.asarray((pixels - usual) @ operator + known)
 
     def sampled(
         self, numbers: FloatArray, pixels: PixelArray
@@ -147,13 +151,17 @@ class Bench:
         return self.options.method == "fringes"
 
     @cached_property
-    def _double(self) -> FloatArray:
+    def _double(self) -> tuple[PixelArray, FloatArray, PixelArray]:
+        """Reference image (n_pixels,), its numbers, and the operator that they are made by."""
         parts = [self.fit.inverse] if self._fitted else [self.fit.inverse, self.sampling.linear]
-        return np.concatenate(parts, axis=1)
+        operator = np.concatenate(parts, axis=1)
+        usual = self.reference.image[self.view.part].ravel().astype(np.float32)
+        return usual, usual.astype(float) @ operator, operator
 
     @cached_property
-    def _single(self) -> SingleArray:
-        return np.ascontiguousarray(self._double, dtype=np.float32)
+    def _single(self) -> tuple[PixelArray, FloatArray, PixelArray]:
+        usual, known, operator = self._double
+        return usual, known, np.ascontiguousarray(operator, dtype=np.float32)
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
