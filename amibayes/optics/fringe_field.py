@@ -2,9 +2,9 @@
 
 Every fringe is a wave under a hill: the wave is known exactly, and the hill, the power of
 one hole's diffraction pattern with what the width of the filter makes of it, is so smooth
-that a sample per pixel or two holds all of it. Hills are computed once for an instrument;
-interpolation, the average over the pixels and the wave are then one small matrix per
-axis and baseline.
+that a sample every pixel or two holds all of it. So it is with the average over a pixel of
+wave and hill, less the wave. These hills are computed once for an instrument; what is left
+is to interpolate them, with one small matrix per axis, and to multiply by the waves.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.fringes import FringeBasis
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.psf import ComplexArray
-from amibayes.optics.sampling import HALF_WIDTH, fine_sampling, interpolator, pixel_weights
+from amibayes.optics.sampling import HALF_WIDTH, LARGEST_FREQUENCY, interpolator, pixel_weights
 from amibayes.units import FloatArray, read_only
 
 REACH_STEP_PX = 8
@@ -32,65 +32,52 @@ class FringeField:
 
     Parameters
     ----------
-    hills : (1 + n_baselines, k, k) complex array
-        Envelope and fringes less their waves, photons per pixel for one through the mask.
+    hills : (2, 1 + n_baselines, k, k) array
+        Real and imaginary part of envelope and fringes, averaged over a pixel, less their
+        waves; photons per pixel for one through the mask.
     frequency_px : (1 + n_baselines, 2) array
         Of the waves, cycles per pixel; 0 for the envelope.
-    oversample : int
-        Samples per pixel.
+    spacing_px : float
+        Distance of the samples.
     """
 
-    hills: ComplexArray
+    hills: FloatArray
     frequency_px: FloatArray
-    oversample: int
+    spacing_px: float
 
     def __post_init__(self) -> None:
-        read_only(self, "frequency_px")
-        self.hills.flags.writeable = False
+        read_only(self, "hills", "frequency_px")
 
     def basis(
         self, shape: tuple[int, int], centre_px: tuple[float, float] = (0.0, 0.0)
     ) -> FringeBasis:
         """Fringe model of an image (n_y, n_x) with the star ``centre_px`` from its middle."""
-        waves = self.waves(shape, centre_px)
-        columns = np.concatenate([waves[:1].real, 2.0 * waves[1:].real, -2.0 * waves[1:].imag])
-        return FringeBasis(columns.reshape(len(columns), -1).T, shape)
-
-    def waves(self, shape: tuple[int, int], centre_px: tuple[float, float]) -> ComplexArray:
-        """Envelope and fringes averaged over the pixels, (1 + n_baselines, n_y, n_x)."""
-        along_y, along_x = self._operators(shape, centre_px)
-        return np.asarray(along_y @ self.hills @ along_x.swapaxes(1, 2))
-
-    def _operators(
-        self, shape: tuple[int, int], centre_px: tuple[float, float]
-    ) -> tuple[ComplexArray, ComplexArray]:
-        """Matrices along y and along x."""
-        along_y, along_x = (
-            self._operator(size, centre, frequency)
+        (up, wave_y), (across, wave_x) = (
+            self._along(size, centre, frequency)
             for size, centre, frequency in zip(
                 shape, centre_px[::-1], self.frequency_px.T[::-1], strict=True
             )
         )
-        return along_y, along_x
+        real, imaginary = up @ (self.hills @ across.T)
+        wave = wave_y[1:, :, None] * wave_x[1:, None, :]
+        n = len(wave)
+        columns = np.empty((1 + 2 * n, *shape))
+        columns[0] = real[0]
+        columns[1 : 1 + n] = wave.real * real[1:] - wave.imag * imaginary[1:]
+        columns[1 + n :] = -wave.real * imaginary[1:] - wave.imag * real[1:]
+        columns[1:] *= 2.0
+        return FringeBasis(columns.reshape(len(columns), -1).T, shape)
 
-    def _operator(self, n_pixels: int, centre_px: float, frequency: FloatArray) -> ComplexArray:
-        """Matrices (n_waves, n_pixels, k) from the samples of a hill to pixels of the wave."""
-        nodes, weight = pixel_weights()
-        over, size = self.oversample, self.hills.shape[-1]
-        first = -0.5 * (n_pixels - 1) - centre_px
-        sample, taps = interpolator((first + nodes) * over + 0.5 * (size - 1))
-        # Pixels differ by whole samples: one kernel serves them all.
-        start = int(sample.min())
-        kernel = np.zeros((len(nodes), int(sample.max()) - start + 1))
-        np.add.at(kernel, (np.arange(len(nodes))[:, None], sample - start), taps)
-        turn = np.exp(2j * np.pi * np.outer(frequency, first + nodes)) * weight
-        once = turn @ kernel
-        pixel = np.arange(n_pixels)
-        wave = np.exp(2j * np.pi * np.outer(frequency, pixel))
-        operator = np.zeros((len(frequency), n_pixels, size), dtype=complex)
-        column = start + over * pixel[:, None] + np.arange(kernel.shape[1])
-        operator[:, pixel[:, None], column] = wave[..., None] * once[:, None, :]
-        return operator
+    def _along(
+        self, n_pixels: int, centre_px: float, frequency: FloatArray
+    ) -> tuple[FloatArray, ComplexArray]:
+        """Matrix (n_pixels, k) from samples to pixels of an axis, and waves (n, n_pixels)."""
+        pixel = np.arange(n_pixels) - 0.5 * (n_pixels - 1) - centre_px
+        size = self.hills.shape[-1]
+        sample, weight = interpolator(pixel / self.spacing_px + 0.5 * (size - 1))
+        matrix = np.zeros((n_pixels, size))
+        np.put_along_axis(matrix, sample, weight, axis=1)
+        return matrix, np.exp(2j * np.pi * np.outer(frequency, pixel))
 
 
 def fringe_field(
@@ -203,13 +190,13 @@ class _Recipe:
 
 @lru_cache(maxsize=6)
 def _remembered(recipe: _Recipe) -> FringeField:
-    pixel, channels = recipe.instrument.pixel_scale_rad, recipe.channels
-    mask = recipe.mask
+    pixel, channels, mask = recipe.instrument.pixel_scale_rad, recipe.channels, recipe.mask
     mean = float(1.0 / (channels.weight @ (1.0 / channels.wavelength_m)))
-    over = fine_sampling(_band_limit(mask, channels, mean) * pixel)
-    half = (recipe.n_pixels // 2 + 1) * over + HALF_WIDTH + over
-    place = np.arange(-half, half + 1) * (pixel / over)
+    spacing = LARGEST_FREQUENCY / (_band_limit(mask, channels, mean) * pixel)
     uv = np.vstack([np.zeros((1, 2)), mask.uv_m])
+    reach = math.ceil(0.5 * recipe.n_pixels / spacing) + HALF_WIDTH
+    margin = HALF_WIDTH + math.ceil(0.5 / spacing)
+    place = np.arange(-reach - margin, reach + margin + 1) * (spacing * pixel)
     hills = np.zeros((len(uv), len(place), len(place)), dtype=complex)
     for wavelength, weight in zip(channels.wavelength_m, channels.weight, strict=True):
         f = place / wavelength
@@ -219,7 +206,23 @@ def _remembered(recipe: _Recipe) -> FringeField:
         x, y = (np.exp(2j * np.pi * np.outer(r, place)) for r in rest.T)
         hills += (y[:, :, None] * power) * x[:, None, :]
     hills[0] *= mask.n_holes
-    return FringeField(hills, uv * (pixel / mean), over)
+    frequency = uv * (pixel / mean)
+    across, up = (_averaging(f, spacing, margin, len(place)) for f in frequency.T)
+    averaged = up @ hills @ across.swapaxes(1, 2)
+    return FringeField(np.stack([averaged.real, averaged.imag]), frequency, spacing)
+
+
+def _averaging(frequency_px: FloatArray, spacing_px: float, margin: int, size: int) -> ComplexArray:
+    """Matrices (n_waves, size − 2·margin, size): a pixel's mean of wave and hill, less the wave."""
+    nodes, weight = pixel_weights()
+    sample, taps = interpolator(nodes / spacing_px + margin)
+    kernel = np.zeros((len(nodes), 2 * margin + 1))
+    np.put_along_axis(kernel, sample, taps, axis=1)
+    once = (np.exp(2j * np.pi * np.outer(frequency_px, nodes)) * weight) @ kernel
+    row = np.arange(size - 2 * margin)[:, None]
+    matrix = np.zeros((len(once), len(row), size), dtype=complex)
+    matrix[:, row, row + np.arange(2 * margin + 1)] = once[:, None, :]
+    return matrix
 
 
 def _band_limit(mask: Mask, channels: Channels, mean_m: float) -> float:
