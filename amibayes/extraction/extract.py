@@ -21,10 +21,11 @@ from amibayes.extraction.cleaning import (
     reference_of,
 )
 from amibayes.extraction.fourier import fourier_sampling
-from amibayes.extraction.frames import Bench, Frames, Residual, concatenated, measure, select
+from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
     FringeFit,
+    SingleArray,
     centre_on,
     fringe_fit,
     fringe_sampling,
@@ -210,14 +211,14 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         view, geometry = fit_geometry(view, image, _fit_of_median(view, basis, even, reference))
     if not geometry.stated:
         view, basis, even = centre_on(view, image, good, template.source)
-    noise, level, expected = _noise_and_misfit(view, even, reference)
+    noise, level, scatter = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
     if options.method == "fringes":
         sampling = fringe_sampling(fit, view)
     else:
         sampling = fourier_sampling(view, basis, options)
     variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
-    return Bench(view, geometry, reference, fit, expected, sampling, variance, third, options)
+    return Bench(view, geometry, reference, fit, scatter, sampling, variance, third, options)
 
 
 def _fit_of_median(
@@ -253,7 +254,7 @@ def _fit_variance(
 
 def _noise_and_misfit(
     view: View, fit: FringeFit, reference: Reference
-) -> tuple[NoiseModel, float, Residual]:
+) -> tuple[NoiseModel, float, SingleArray]:
     """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
 
     Where the cube has no errors of its own, the noise is what differs between the
@@ -266,7 +267,7 @@ def _noise_and_misfit(
         np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
     )
     coefficients = fit.solve(pixels)
-    residual = fit.residual(pixels, coefficients)
+    residual = fit.without(pixels, coefficients)
     mean = residual.mean(axis=0).reshape(image.shape)
     noise = cropped(reference.noise, view.part)
     _refuse_another(image, mean, noise, good, reference)
@@ -277,17 +278,17 @@ def _noise_and_misfit(
         spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
         noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
     level = misfit_level(mean, noise.variance / len(sample), good)
-    return noise, level, _expected(residual, image, noise)
+    return noise, level, _scatter(residual, image, noise)
 
 
-def _expected(residual: FloatArray, image: FloatArray, noise: NoiseModel) -> Residual:
-    """Robust mean and scatter of the residuals (n, n_pixels) of some integrations."""
-    middle, spread = median_and_scatter(residual)
+def _scatter(residual: SingleArray, image: FloatArray, noise: NoiseModel) -> SingleArray:
+    """Robust scatter (n_pixels,) of the residuals (n, n_pixels) of some integrations."""
+    spread = median_and_scatter(residual)[1].reshape(image.shape)
     # A scatter of few integrations may be small by chance: its surroundings have a say.
-    around = np.sqrt(uniform_filter(spread.reshape(image.shape) ** 2, 5)).ravel()
-    slack = JITTER_SLACK * maximum_filter(np.abs(image), 3).ravel()
-    scatter = np.maximum(spread, around) + np.sqrt(noise.variance).ravel() + slack
-    return Residual(middle.astype(np.float32), scatter.astype(np.float32))
+    around = np.sqrt(uniform_filter(spread**2, 5))
+    slack = JITTER_SLACK * maximum_filter(np.abs(image), 3)
+    scatter = np.maximum(spread, around) + np.sqrt(noise.variance) + slack
+    return np.asarray(scatter.astype(np.float32).ravel())
 
 
 def _refuse_another(

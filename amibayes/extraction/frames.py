@@ -78,21 +78,6 @@ class Frames:
 
 
 @dataclass(frozen=True, eq=False)
-class Residual:
-    """What the fit of a good integration leaves in each pixel, and how that varies."""
-
-    mean: SingleArray
-    scatter: SingleArray
-
-    def standing_off(self, residual: SingleArray, limit: float) -> BoolArray:
-        """Pixels (n, n_pixels) of which more is left than ``limit`` scatters from the mean."""
-        reach = np.float32(limit) * self.scatter
-        off = residual - self.mean
-        np.abs(off, out=off)
-        return np.asarray(off > reach)
-
-
-@dataclass(frozen=True, eq=False)
 class Bench:
     """Everything that an integration goes through.
 
@@ -103,8 +88,8 @@ class Bench:
     reference : Reference
     fit : FringeFit
         Also of the Fourier methods, for which it fills bad pixels.
-    expected : Residual
-        Of that fit.
+    scatter : (n_pixels,) array
+        Of what that fit leaves of a good integration.
     sampling : Sampling
         What is measured.
     variance : (n_pixels,) array
@@ -118,7 +103,7 @@ class Bench:
     geometry: Geometry
     reference: Reference
     fit: FringeFit
-    expected: Residual
+    scatter: SingleArray
     sampling: Sampling
     variance: FloatArray
     skewness: FloatArray
@@ -129,14 +114,39 @@ class Bench:
         """What noise adds to flux² and to the power of every baseline."""
         return self.sampling.bias(self.variance)
 
-    def numbers(self, pixels: PixelArray) -> FloatArray:
-        """Coefficients of the fit, then what else the sampling needs, of images (n, n_pixels).
+    def look(self, pixels: PixelArray) -> tuple[FloatArray, SingleArray]:
+        """Measure images (n, n_pixels), and tell what the fit leaves of them.
 
-        They are those of the reference, and those of what an image differs by from it: the
+        Both are those of the reference, and those of what an image differs by from it: the
         rounding of single precision is then that of a small number.
+
+        Returns
+        -------
+        numbers : (n, m) array
+            Coefficients of the fit, then what else the sampling needs.
+        left : (n, n_pixels) array
+            Residual of the fit less that of the reference.
         """
-        usual, known, operator = self._single if pixels.dtype == np.float32 else self._double
-        return np.asarray((pixels - usual) @ operator + known)
+        off = pixels - self._usual
+        beyond = off @ (self._single if pixels.dtype == np.float32 else self._operator)
+        left = self.fit.without(off, beyond[:, : self.fit.n_coefficients])
+        return beyond + self._known, left
+
+    def standing_off(self, left: SingleArray) -> BoolArray:
+        """Pixels (n, n_pixels) of which more is left than of other integrations."""
+        return np.asarray(np.abs(left) > np.float32(self.options.outlier) * self.scatter)
+
+    def outliers(self, images: PixelArray, bad: BoolArray) -> BoolArray:
+        """Pixels (n, n_pixels) of images of the whole detector that stand off the reference."""
+        found = self.reference.outliers(images, bad, self.options.outlier)
+        return found[:, self.view.rows, self.view.columns].reshape(len(images), -1)
+
+    def misfit(self, flux: FloatArray, left: SingleArray) -> FloatArray:
+        """Residual of images of a flux (n,) in units of the reference at that flux, rms."""
+        usual = self._usual_left
+        power = np.einsum("np,np->n", left, left) + 2.0 * (left @ usual) + usual @ usual
+        size = np.abs(flux / self._known[0]) * np.sqrt(float(self._usual @ self._usual))
+        return np.asarray(np.sqrt(np.maximum(power, 0.0)) / np.maximum(size, 1e-300))
 
     def sampled(
         self, numbers: FloatArray, pixels: PixelArray
@@ -151,17 +161,30 @@ class Bench:
         return self.options.method == "fringes"
 
     @cached_property
-    def _double(self) -> tuple[PixelArray, FloatArray, PixelArray]:
-        """Reference image (n_pixels,), its numbers, and the operator that they are made by."""
+    def _operator(self) -> FloatArray:
+        """(n_pixels, m): images times this are the numbers."""
         parts = [self.fit.inverse] if self._fitted else [self.fit.inverse, self.sampling.linear]
-        operator = np.concatenate(parts, axis=1)
-        usual = self.reference.image[self.view.part].ravel().astype(np.float32)
-        return usual, usual.astype(float) @ operator, operator
+        return np.concatenate(parts, axis=1)
 
     @cached_property
-    def _single(self) -> tuple[PixelArray, FloatArray, PixelArray]:
-        usual, known, operator = self._double
-        return usual, known, np.ascontiguousarray(operator, dtype=np.float32)
+    def _single(self) -> SingleArray:
+        return np.ascontiguousarray(self._operator, dtype=np.float32)
+
+    @cached_property
+    def _usual(self) -> SingleArray:
+        """(n_pixels,) the reference image."""
+        return self.reference.image[self.view.part].ravel().astype(np.float32)
+
+    @cached_property
+    def _known(self) -> FloatArray:
+        """(m,) its numbers."""
+        return np.asarray(self._usual.astype(float) @ self._operator)
+
+    @cached_property
+    def _usual_left(self) -> SingleArray:
+        """(n_pixels,) what the fit leaves of it."""
+        coefficients = self._known[None, : self.fit.n_coefficients]
+        return self.fit.without(self._usual[None], coefficients)[0]
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
@@ -231,7 +254,7 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
 
 def _cleaned(
     bench: Bench, cube: Cube
-) -> tuple[PixelArray, FloatArray, SingleArray, IntArray]:
+) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
     """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
     Only where the fit of an integration leaves something that it does not of others is it
@@ -247,36 +270,31 @@ def _cleaned(
     n_bad : (n,) int array
         Pixels left out, of those that are ever used.
     """
-    view, n, limit = bench.view, cube.n_integrations, bench.options.outlier
+    view, n, fit = bench.view, cube.n_integrations, bench.fit
     bad = cube.bad
     images = np.where(bad, 0.0, cube.images) if bad.any() else cube.images
     part = np.s_[:, view.rows, view.columns]
     pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
-    filled, numbers, residual = _filled(bench, pixels, missing)
-    hit = np.flatnonzero(bench.expected.standing_off(residual, limit).any(axis=1))
+    filled = _filled(fit, pixels, missing)
+    numbers, left = bench.look(filled)
+    hit = np.flatnonzero(bench.standing_off(left).any(axis=1))
     if len(hit):
-        wrong = missing[hit]
-        wrong |= bench.reference.outliers(images[hit], bad[hit], limit)[part].reshape(wrong.shape)
-        _, _, left = _filled(bench, pixels[hit], wrong)
-        wrong |= bench.expected.standing_off(left, limit)
+        wrong = missing[hit] | bench.outliers(images[hit], bad[hit])
+        wrong |= bench.standing_off(bench.look(_filled(fit, pixels[hit], wrong))[1])
         filled, missing[hit] = np.array(filled), wrong
-        filled[hit], numbers[hit], residual[hit] = _filled(bench, pixels[hit], wrong)
-    left, whole = (np.einsum("np,np->n", a, a) for a in (residual, filled))
-    misfit = np.sqrt(left / np.maximum(whole, np.finfo(whole.dtype).tiny))
-    return filled, numbers, misfit, np.count_nonzero(missing & bench.fit.used, axis=1)
+        filled[hit] = _filled(fit, pixels[hit], wrong)
+        numbers[hit], left[hit] = bench.look(filled[hit])
+    n_bad = np.count_nonzero(missing & fit.used, axis=1) if missing.any() else np.zeros(n, int)
+    return filled, numbers, bench.misfit(numbers[:, 0], left), n_bad
 
 
-def _filled(
-    bench: Bench, pixels: PixelArray, missing: BoolArray
-) -> tuple[PixelArray, FloatArray, SingleArray]:
-    """Pixels with the missing ones filled, their numbers, and what the fit leaves of them."""
-    fit = bench.fit
+def _filled(fit: FringeFit, pixels: PixelArray, missing: BoolArray) -> PixelArray:
+    """Pixels with the missing ones filled, unless there are too many."""
     gone = missing | ~fit.used
     if gone.any():
         hopeless = np.count_nonzero(missing & fit.used, axis=1) > MOST_BAD * missing.shape[1]
         pixels = fit.fill(pixels, gone & ~hopeless[:, None])
-    numbers = bench.numbers(pixels)
-    return pixels, numbers, fit.residual(pixels, numbers[:, : fit.n_coefficients])
+    return pixels
 
 
 def select(frames: Frames, limit: float, largest_shift_px: float) -> NDArray[np.str_]:

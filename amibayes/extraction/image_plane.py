@@ -63,10 +63,10 @@ class FringeFit:
         """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
         return np.asarray((pixels * self.weight) @ self.design @ self.covariance)
 
-    def residual(self, pixels: PixelArray, coefficients: FloatArray) -> SingleArray:
-        """What the fit leaves of images, in single precision: it is looked at, not measured."""
+    def without(self, pixels: PixelArray, coefficients: PixelArray) -> SingleArray:
+        """Images less the fit, in single precision: what is left is looked at, not measured."""
         left = pixels.astype(np.float32)
-        left -= coefficients.astype(np.float32) @ self._model
+        left -= coefficients.astype(np.float32, copy=False) @ self._model
         return left
 
     @cached_property
