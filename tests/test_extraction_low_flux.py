@@ -61,9 +61,7 @@ def test_drawn_photons_scatter_as_expected(method: str, photons: float, read_noi
         assert np.mean(seen / first[part]) > (1.05 if read_noise == 0.0 else 1.12)
 
 
-def scatter_of(
-    sampling: OneEach, flux: float, images: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def scatter_of(sampling: OneEach, flux: float, images: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Variances of V² and closure phase that images have, about their means."""
     fluxes, samples = sampling.apply(images)
     power, bispectrum = sampling.power(samples), sampling.bispectrum(samples)

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter
 from amibayes.cube import Cube
 from amibayes.errors import DataError
 from amibayes.extraction.noise import NoiseModel, noise_model
+from amibayes.extraction.sampling import PixelArray
 from amibayes.extraction.source import Source
 from amibayes.units import FloatArray, read_only
 
@@ -120,7 +121,7 @@ def reference_of(file: Source) -> Reference:
     return replace(found, sample=np.where(off, np.nan, images))
 
 
-def median_and_scatter(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def median_and_scatter(values: PixelArray) -> tuple[PixelArray, PixelArray]:
     """Median along the first axis, and the standard deviation that the absolute ones tell.
 
     NaN are left out; where there is nothing else, NaN comes out.
@@ -129,7 +130,7 @@ def median_and_scatter(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return middle, TO_SIGMA * _median(np.abs(values - middle))
 
 
-def _median(values: FloatArray) -> FloatArray:
+def _median(values: PixelArray) -> PixelArray:
     """`numpy.nanmedian` along the first axis, by a sort: many times quicker for few values."""
     in_order = np.sort(values, axis=0)
     if not np.isnan(in_order[-1]).any():  # where NaN go

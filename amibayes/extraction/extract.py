@@ -213,10 +213,11 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         view, basis, even = centre_on(view, image, good, template.source)
     noise, level, scatter = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
-    if options.method == "fringes":
-        sampling = fringe_sampling(fit, view)
-    else:
-        sampling = fourier_sampling(view, basis, options)
+    sampling = (
+        fringe_sampling(fit, view)
+        if options.method == "fringes"
+        else fourier_sampling(view, basis, options)
+    )
     variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
     return Bench(view, geometry, reference, fit, scatter, sampling, variance, third, options)
 

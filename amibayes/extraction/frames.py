@@ -148,9 +148,7 @@ class Bench:
         size = np.abs(flux / self._known[0]) * np.sqrt(float(self._usual @ self._usual))
         return np.asarray(np.sqrt(np.maximum(power, 0.0)) / np.maximum(size, 1e-300))
 
-    def sampled(
-        self, numbers: FloatArray, pixels: PixelArray
-    ) -> tuple[FloatArray, ComplexArray]:
+    def sampled(self, numbers: FloatArray, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux and samples of images whose `numbers` are known."""
         first = 0 if self._fitted else self.fit.n_coefficients
         return self.sampling.completed(numbers[:, first:], pixels)
@@ -184,7 +182,7 @@ class Bench:
     def _usual_left(self) -> SingleArray:
         """(n_pixels,) what the fit leaves of it."""
         coefficients = self._known[None, : self.fit.n_coefficients]
-        return self.fit.without(self._usual[None], coefficients)[0]
+        return np.asarray(self.fit.without(self._usual[None], coefficients)[0])
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
@@ -252,9 +250,7 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
-def _cleaned(
-    bench: Bench, cube: Cube
-) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
+def _cleaned(bench: Bench, cube: Cube) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
     """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
     Only where the fit of an integration leaves something that it does not of others is it

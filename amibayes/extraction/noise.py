@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
 
-from amibayes.extraction.sampling import BoolArray
+from amibayes.extraction.sampling import BoolArray, PixelArray
 from amibayes.units import FloatArray, read_only
 
 _ROUNDS = 4
@@ -77,7 +77,7 @@ def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> Nois
     return NoiseModel(np.maximum(variance, floor), constant, per_signal)
 
 
-def scatter_about_pointing(residual: FloatArray, shift_px: FloatArray) -> FloatArray:
+def scatter_about_pointing(residual: PixelArray, shift_px: FloatArray) -> FloatArray:
     """Variance of every pixel between integrations, what goes with the pointing taken out.
 
     Parameters

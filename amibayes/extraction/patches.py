@@ -39,7 +39,7 @@ class Patches:
 
     def transform(self, images: FloatArray) -> ComplexArray:
         """Transform (n_patches, k, k), rows along y, of an image for all or one for each."""
-        n, k, n_y = self.along_y.shape
+        k = self.along_y.shape[1]
         parts = self._real_y @ images
         half = parts[:, :k] + 1j * parts[:, k:]
         return np.asarray(half @ self.along_x.swapaxes(1, 2))

@@ -40,9 +40,7 @@ class Sampling(Protocol):
     def n_samples(self) -> int:
         """How many complex samples."""
 
-    def completed(
-        self, numbers: FloatArray, pixels: PixelArray
-    ) -> tuple[FloatArray, ComplexArray]:
+    def completed(self, numbers: FloatArray, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux (n,) and samples (n, n_samples) of images (n, n_pixels) times `linear`."""
 
     def apply(self, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
@@ -97,9 +95,7 @@ class OneEach:
         """How many complex samples."""
         return len(self.frequency_px)
 
-    def completed(
-        self, numbers: FloatArray, pixels: PixelArray
-    ) -> tuple[FloatArray, ComplexArray]:
+    def completed(self, numbers: FloatArray, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux and samples out of the numbers alone."""
         return split(numbers)
 

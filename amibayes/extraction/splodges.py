@@ -207,7 +207,8 @@ class Splodges:
         total = np.zeros((n, n))
         total[first, second] = self._between(first, second, variance)
         total = total + np.triu(total, 1).T
-        common = self._transform(variance * own) - float(variance @ (own * background)) * self._level
+        common = self._transform(variance * own)
+        common -= float(variance @ (own * background)) * self._level
         with_flux = np.sum(np.abs(self._factor * common) ** 2, axis=(1, 2))
         crossed = 2.0 * np.outer(power, with_flux)
         total += 2.0 * np.outer(power, power) * float(variance @ own**2) ** 2 - crossed - crossed.T
