@@ -27,6 +27,7 @@ from amibayes.extraction.averaging import average
 from amibayes.extraction.fine_image import FineImage
 from amibayes.extraction.image_plane import shift_of
 from amibayes.extraction.response import pointing_response, star_image
+from amibayes.extraction.sampling import split
 from amibayes.parallel import SerialExecutor
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
@@ -107,7 +108,7 @@ def _observables(quiet: Extraction, star: FineImage, numbers: FloatArray) -> Flo
     """V² and closure phase of the mean of some integrations' numbers, pointing included."""
     bench = quiet.benches[0]
     sampling, view = bench.sampling, bench.view
-    flux, samples = sampling.split(numbers)
+    flux, samples = split(numbers)
     frames = replace(
         quiet.frames,
         power=sampling.power(samples),

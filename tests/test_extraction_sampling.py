@@ -94,10 +94,8 @@ def test_stars_that_are_moved_back_add_up(splodges: Splodges) -> None:
     _, samples = splodges.apply(images_of(splodges)[:2])
     side = np.arange(-2, 3) / 26.0
     u, v = view.frequency_px.T
-    turns = [
-        np.exp(2j * np.pi * ((u[:, None, None] + side) * x + (v[:, None, None] + side[:, None]) * y))
-        for x, y in shift
-    ]  # fmt: skip
+    u, v = u[:, None, None] + side, v[:, None, None] + side[:, None]
+    turns = [np.exp(2j * np.pi * (u * x + v * y)) for x, y in shift]
     expected = sum(s * t.ravel() for s, t in zip(samples, turns, strict=True))
     np.testing.assert_allclose(splodges.centred(samples, shift), expected, rtol=1e-10)
 
