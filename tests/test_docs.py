@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import ast
+import importlib.util
 import os
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +17,7 @@ from types import SimpleNamespace
 import pytest
 
 import amibayes
+from amibayes.cli import main as amibayes_command
 from amibayes.cli.main import COMMANDS, build_parser
 from amibayes.job import SearchOptions
 from amibayes.pipeline import search_companion
@@ -88,6 +92,33 @@ def test_pictures_are_those_that_a_script_makes(page: Path) -> None:
         assert name in code, f"{page.name}: {folder}/{name}.png"
 
 
+def python_of(page: Path) -> list[str]:
+    """The blocks of Python of a page."""
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
+
+
+@pytest.mark.parametrize("page", [p for p in [*PAGES, ROOT / "README.md"] if python_of(p)], ids=str)
+def test_python_on_a_page_names_what_there_is(page: Path) -> None:
+    for block in python_of(page):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("amibayes"):
+                module = importlib.import_module(str(node.module))
+                assert all(hasattr(module, name.name) for name in node.names), block
+
+
+def test_the_notebook_of_the_how_to_runs(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    blocks = python_of(DOCS / "howto" / "notebook.md")
+    if importlib.util.find_spec("arviz") is None:
+        blocks = [block for block in blocks if "to_inference_data" not in block]
+    (tmp_path / "notebook.py").write_text("\n".join(blocks))
+    names = runpy.run_path(str(tmp_path / "notebook.py"))
+    assert (tmp_path / "closure_phases.ecsv").stat().st_size > 1000
+    assert names["low"] - 0.1 < 5.0 < names["high"] + 0.1
+    assert len(names["samples"]) > 1000
+
+
 def keys_of(content: object) -> set[str]:
     if isinstance(content, list):
         return set().union(*(keys_of(item) for item in content)) if content else set()
@@ -112,6 +143,22 @@ def test_the_mask_of_the_how_to_is_one() -> None:
     mine = amibayes.load_instrument(DOCS / "howto" / "my_mask.toml", "K")
     assert mine.mask.n_baselines == 15
     assert mine.mask.non_redundant
+
+
+@pytest.mark.slow
+def test_the_readme_prints_what_the_command_does(tmp_path: Path, monkeypatch, capsys) -> None:
+    """All lines but those of the far tail, whose extrapolation any change of a library moves."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"bin/amibayes (search .*)", readme)
+    target, _, pattern, _ = shlex.split(command)[1:]
+    cals = sorted(str(p) for p in Path().glob(pattern))
+    assert amibayes_command(["search", target, "--cal", *cals]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    (told,) = re.findall(r"^```\n(data .*?)^```", readme, re.MULTILINE | re.DOTALL)
+    tail = "extrapolated"
+    assert [x.split(tail)[0] for x in printed] == [x.split(tail)[0] for x in told.splitlines()]
 
 
 @pytest.mark.slow

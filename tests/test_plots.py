@@ -450,6 +450,7 @@ def test_a_detection_far_beyond_the_draws_is_pointed_at() -> None:
 
 def test_round_contrasts_stand_at_their_magnitudes() -> None:
     np.testing.assert_allclose(contrast_marks(2.4, 5.1), [2.5, 3.25257, 4.24743, 5.0], atol=1e-5)
+    np.testing.assert_allclose(contrast_marks(6.2, 6.9), [6.30720, 6.74743], atol=1e-5)
     np.testing.assert_allclose(contrast_marks(0.0, 10.1), [0.0, 2.5, 5.0, 7.5, 10.0])
 
 

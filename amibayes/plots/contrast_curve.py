@@ -219,8 +219,10 @@ def magnitude_axis(ax: Axes, limits: tuple[float, float] | None = None) -> None:
 
 
 def contrast_marks(low: float, high: float) -> list[float]:
-    """Magnitudes of round contrasts in a range: decades, and 2 and 5 of each in short ones."""
-    steps = np.array([1.0, 2.0, 5.0]) if high - low < 7.5 else np.array([1.0])
+    """Magnitudes of round contrasts in a range: the shorter it is, the more of each decade."""
+    room = high - low
+    steps = np.array([1.0, 2.0, 5.0]) if room < 7.5 else np.array([1.0])
+    steps = np.arange(1.0, 10.0) if room < 1.5 else steps
     decades = 10.0 ** np.arange(np.floor(-0.4 * high), np.ceil(-0.4 * low) + 1)
     marks = -2.5 * np.log10(np.outer(decades, steps).ravel())
     return sorted(marks[(marks >= low) & (marks <= high)].tolist())
