@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -17,6 +18,7 @@ from oi_builders import HandMade, table
 from amibayes.covariance import DiagonalCovariance
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
+from amibayes.oifits.scales import ANGLE, LENGTH, TIME
 
 DEGREE = np.pi / 180
 
@@ -596,3 +598,16 @@ def test_a_file_without_widths_says_so(made: HandMade, tmp_path: Path) -> None:
     assert data.notes == (
         "OI_WAVELENGTH (extension 3) has no EFF_BAND: channels are taken as narrow",
     )
+
+
+SPELLINGS = {"a": "angstrom", "mum": "um", "sec": "s"}
+
+
+@pytest.mark.parametrize(("known", "si"), [(LENGTH, "m"), (ANGLE, "rad"), (TIME, "s")])
+def test_units_are_worth_what_astropy_says(known: dict[str, float], si: str) -> None:
+    for name, factor in known.items():
+        spelled = SPELLINGS.get(name, name.replace("metre", "meter"))
+        unit = units.Unit(spelled, parse_strict="silent")
+        if isinstance(unit, units.UnrecognizedUnit):
+            unit = units.Unit(spelled.removesuffix("s"))
+        assert factor == pytest.approx(unit.to(si), rel=1e-14), name
