@@ -28,7 +28,7 @@ COLUMNS = (
     Column("Expected"),
     Column("Error"),
     Column("p"),
-    Column("", "text"),
+    Column("Verdict", "text"),
 )
 
 EXPLAINED = {
@@ -127,11 +127,7 @@ def validation_pictures(validation: Validation) -> dict[str, Drawing]:
     """Draw the pictures, by file name without its ending."""
     ranks = {kind: validation.rank[validation.of_kind(kind)] for kind in RANGES}
     coverage = {
-        c.name.replace(" interval of ", " ").removesuffix("_mas").removesuffix("_deg"): (
-            c.expected,
-            c.measured,
-            c.error,
-        )
+        plainly(c.name).replace(" interval of ", " "): (c.expected, c.measured, c.error)
         for c in validation.checks
         if c.group == "coverage"
     }

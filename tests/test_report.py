@@ -16,18 +16,23 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from test_validation import PLAN, answers
 
 from amibayes.cli import common, main
 from amibayes.errors import DataError
 from amibayes.job import SearchOptions
 from amibayes.oifits import write_oifits
 from amibayes.pictures import picture_names
+from amibayes.plots.style import save
 from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
 from amibayes.report.captions import CAPTIONS
-from amibayes.report.page import Sky, page_html
+from amibayes.report.joint_sections import RESIDUALS
+from amibayes.report.page import Sky, page_html, read_figure
 from amibayes.report.search_page import PLACED
 from amibayes.report.statement import statement_of
 from amibayes.report.words import chance, count, measured, plain
+from amibayes.validation.tally import tally
+from amibayes.validation_report import validation_page, validation_pictures
 
 HOSTILE = "<b>bold</b>&\"'<img src=x onerror=alert(1)>.oifits".replace("/", "")
 TRUTH = [110.0, -75.0, 0.02]
@@ -312,7 +317,37 @@ def shown(browser: Any, path: Path, size: tuple[int, int], scheme: str = "light"
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_in_a_browser(browser: Any, folder: Path, size, scheme) -> None:
-    shown(browser, folder / "report.html", size, scheme)
+    looks_right(browser, folder / "report.html", size, scheme, len(list(folder.glob("*.png"))))
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+def test_other_pages_in_a_browser(browser: Any, content, tmp_path: Path, size) -> None:
+    """Nothing detected, two bands in motion, and a validation."""
+    none, joint = copy.deepcopy(content), copy.deepcopy(content)
+    none["significance"]["detected"] = False
+    none["modes"] = [none["modes"][0]] * 12
+    band = {key: joint["fit"][key] for key in ("contrast", "delta_mag", "errors")}
+    bands = [band | {"band": f"NIRISS_{w}um", "wavelength_um": w} for w in (4.29, 4.82)]
+    joint["fit"] |= {"contrast_kind": "per-filter", "contrasts": bands, "reference_mjd": 6e4,
+                     "fastest_mas_yr": 9.0, "east_rate_mas_yr": 1.2,
+                     "north_rate_mas_yr": -3.0}  # fmt: skip
+    joint["residuals"] = [{"path": f"{k}/target_of_a_long_name_calints.oifits"}
+                          | dict.fromkeys(RESIDUALS, 1.0) for k in range(3)]  # fmt: skip
+    trials = tally(PLAN, 1, list(answers(PLAN)))
+    figures = {}
+    for name, drawing in validation_pictures(trials).items():
+        save(drawing, tmp_path / f"{name}.png")
+        figures[name] = read_figure(tmp_path / f"{name}.png", name, name)
+    pages = [(search_page(none), 0), (search_page(joint), 0)]
+    pages += [(validation_page(trials, figures, "out"), len(figures))]
+    for page, n_pictures in pages:
+        (tmp_path / "page.html").write_text(page_html(page), encoding="utf-8")
+        looks_right(browser, tmp_path / "page.html", size, "light", n_pictures)
+
+
+def looks_right(browser: Any, path: Path, size, scheme: str, n_pictures: int) -> None:
+    """Nothing wider than the screen, every picture there, every link leads somewhere, no errors."""
+    shown(browser, path, size, scheme)
     wide = browser.execute_script(
         "return [document.scrollingElement.scrollWidth, window.innerWidth]"
     )
@@ -320,7 +355,9 @@ def test_in_a_browser(browser: Any, folder: Path, size, scheme) -> None:
     images = browser.execute_script(
         "return [...document.images].map(i => [i.complete, i.naturalWidth, i.clientWidth])"
     )
-    assert len(images) == len(list(folder.glob("*.png")))
+    assert len(images) == n_pictures
+    captions = "return [...document.querySelectorAll('caption')].map(c => c.clientWidth)"
+    assert max(browser.execute_script(captions)) <= size[0]
     assert all(done and natural > 300 and seen > 200 for done, natural, seen in images)
     loose = browser.execute_script(
         "return [...document.querySelectorAll('a')].map(a => a.hash)"
