@@ -19,9 +19,11 @@ from amibayes.inference.priors import PriorSetting
 from amibayes.inference.results import SearchResult
 from amibayes.inference.significance import ALPHA, Significance
 from amibayes.observables import Observables
+from amibayes.quantities import takes_quantities
 from amibayes.vetting import Vetting
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class SearchOptions:
     """What the main job is asked to do.

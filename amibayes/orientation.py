@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Orientation:
     """How an image lies on the sky.

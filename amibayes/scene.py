@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import j0, j1
 
 from amibayes.errors import DataError
+from amibayes.quantities import takes_quantities
 from amibayes.spectrum import Flat, Spectrum
 from amibayes.units import FloatArray, read_only
 
@@ -39,6 +40,7 @@ class Component(Protocol):
         """Fourier transform at spatial frequencies (cycles per radian), times the flux."""
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Point:
     """A point source.
@@ -76,6 +78,7 @@ class Point:
         return np.ones_like(frequency)
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class UniformDisc(Point):
     """A disc of even brightness, ``diameter_rad`` across."""
@@ -93,6 +96,7 @@ class UniformDisc(Point):
         return _airy(np.pi * self.diameter_rad * frequency)
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class GaussianDisc(Point):
     """A round Gaussian of full width ``fwhm_rad`` at half its maximum."""
@@ -111,6 +115,7 @@ class GaussianDisc(Point):
         return np.asarray(np.exp(-((np.pi * self.fwhm_rad * frequency) ** 2) / (4.0 * np.log(2.0))))
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Ring(Point):
     """A flat ring of mean diameter ``diameter_rad`` and radial width ``width_rad``."""

@@ -21,6 +21,7 @@ from amibayes.calibration.transfer import (
 from amibayes.calibration.weighted import Response, clipped, weighted_response
 from amibayes.errors import DataError
 from amibayes.observables import Observables, join
+from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray
 
 Method = Literal["hierarchical", "weighted"]
@@ -105,6 +106,7 @@ class Calibration:
         )
 
 
+@takes_quantities
 def calibrate(
     targets: Observables | Sequence[Observables],
     calibrators: Sequence[Observables],

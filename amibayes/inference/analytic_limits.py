@@ -38,6 +38,7 @@ from amibayes.inference.recovery import injected_signal
 from amibayes.inference.refine import single_likelihood
 from amibayes.inference.results import SearchResult
 from amibayes.inference.rings import N_SEPARATIONS, Rings, make_rings
+from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
 AnalyticMethod = Literal["absil", "candid", "posterior", "closure-phase"]
@@ -114,6 +115,7 @@ class AnalyticLimit:
         return contrast_to_delta_mag(self.contrast)
 
 
+@takes_quantities
 def analytic_limit(
     result: SearchResult,
     method: AnalyticMethod,

@@ -33,6 +33,7 @@ from amibayes.inference.significance import Significance, clopper_pearson, null_
 from amibayes.notebook import UNITS, html_table, quantity_table
 from amibayes.observables import BoolArray
 from amibayes.parallel import Executor, Journals, Progress
+from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
 __all__ = ["DetectionLimit", "Recovery", "detection_limit", "injected_signal", "recover"]
@@ -194,6 +195,7 @@ class DetectionLimit:
         return np.asarray(stats.beta.ppf(rest, a, b)), np.asarray(stats.beta.isf(rest, a, b))
 
 
+@takes_quantities
 def detection_limit(
     result: SearchResult,
     significance: Significance,

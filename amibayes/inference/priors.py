@@ -16,6 +16,7 @@ import numpy as np
 from amibayes.errors import UsageError
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import nuisance_bounds
+from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray, offset
 
 ContrastForm = Literal["log-uniform", "uniform"]
@@ -24,6 +25,7 @@ PositionForm = Literal["area", "separation"]
 SYNTAX = "contrast=[FORM:]LOW:HIGH, contrast=FORM, position=area|separation or NAME=LOW:HIGH"
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Prior:
     """Prior of the companions and the nuisance parameters.

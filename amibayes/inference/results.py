@@ -15,6 +15,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.robust import Frame, Robustness, frame_of
 from amibayes.inference.samples import YEAR_DAYS
 from amibayes.notebook import UNITS, html_table, pretty, quantity_table
+from amibayes.quantities import takes_quantities
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -23,6 +24,7 @@ from amibayes.units import (
 )
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Companion:
     """A companion's parameters with 1σ errors.

@@ -16,6 +16,7 @@ from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.refine import Box, fit_single, global_check, refine, single_likelihood
 from amibayes.inference.results import Mode, SearchResult, companion_of
 from amibayes.inference.scan import Survey
+from amibayes.quantities import takes_quantities
 from amibayes.units import MAS, FloatArray
 
 IntArray = NDArray[np.intp]
@@ -124,6 +125,7 @@ def resolves_stars(likelihood: Likelihood) -> bool:
     return likelihood.observables.n_vis2 > 0 and bool(z * z / 4.0 > 0.01)
 
 
+@takes_quantities
 def search(
     likelihood: Likelihood,
     separation_mas: tuple[float, float] | None = None,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from amibayes.errors import UsageError
 from amibayes.optics import ShiftedImage
 from amibayes.parallel import Executor, Journal, Progress, child_seeds, run_job, slices
+from amibayes.quantities import takes_quantities
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import read_ramps
 from amibayes.simulation.slopes import SlopeFit
@@ -43,6 +44,7 @@ def refuse_too_many(n_integrations: int) -> None:
         )
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Exposure:
     """How an exposure is taken.
