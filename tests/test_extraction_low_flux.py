@@ -20,7 +20,7 @@ TRIANGLES = INSTRUMENT.mask.triangle_baselines
 
 def bare_sampling() -> OneEach:
     """Pixels that are the numbers: flux, 21 real parts, 21 imaginary parts."""
-    return OneEach.of(np.eye(43), INSTRUMENT.mask, INSTRUMENT.mask.uv_m)
+    return OneEach.of(np.eye(43, 44), INSTRUMENT.mask, INSTRUMENT.mask.uv_m)
 
 
 @pytest.mark.parametrize("relative", [0.01, 1.0, 10.0])

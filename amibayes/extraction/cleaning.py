@@ -61,25 +61,27 @@ class Reference:
     good: BoolArray
     noise: NoiseModel
     n_bad: int
-    sample: FloatArray
+    sample: PixelArray
     has_errors: bool
     source: str
 
     def __post_init__(self) -> None:
         read_only(self, "image", "scatter")
 
-    def outliers(self, images: FloatArray, bad: BoolArray, limit: float) -> BoolArray:
+    def outliers(self, images: PixelArray, bad: BoolArray, limit: float) -> BoolArray:
         """Pixels (n, n_y, n_x) that stand off the reference, scaled to each image's flux."""
-        usable = self.good & ~bad
+        n, usable = len(images), self.good & ~bad
+        image, scatter = (a.astype(images.dtype) for a in (self.image, self.scatter))
         # A single hot pixel must not decide what the flux is.
-        most = 2.0 * np.abs(self.image) + limit * self.scatter
-        believed = np.clip(images, -most, most)
-        believed *= usable
-        flux = believed.reshape(len(images), -1) @ self.image.ravel()
-        own = usable.reshape(len(images), -1) @ self.image.ravel() ** 2
-        off = images - (flux / np.maximum(own, 1e-300))[:, None, None] * self.image
-        np.abs(off, out=off)
-        return np.asarray((off > limit * self.scatter) & usable)
+        most = 2.0 * np.abs(image) + limit * scatter
+        work = np.minimum(images, most)
+        np.maximum(work, -most, out=work)
+        work *= usable
+        flux = work.reshape(n, -1) @ image.ravel()
+        own = usable.reshape(n, -1) @ image.ravel() ** 2
+        scale = flux / np.maximum(own, np.finfo(images.dtype).tiny)
+        np.subtract(images, np.multiply(scale[:, None, None], image, out=work), out=work)
+        return np.asarray((np.abs(work, out=work) > limit * scatter) & usable)
 
 
 def reference_of(file: Source) -> Reference:
@@ -92,14 +94,16 @@ def reference_of(file: Source) -> Reference:
     """
     cube = _sample(file)
     bad = cube.bad
-    keep = bad.mean(axis=(1, 2)) <= max(MOST_BAD, 1.5 * float(np.median(bad.mean(axis=(1, 2)))))
+    share = np.count_nonzero(bad, axis=(1, 2)) / bad[0].size
+    keep = share <= max(MOST_BAD, 1.5 * float(np.median(share)))
     images = np.where(bad, np.nan, cube.images)[keep]
     flux = np.nansum(images, axis=(1, 2)) if len(images) else np.zeros(0)
     lit = flux > 0.2 * max(float(np.median(flux[flux > 0.0])) if np.any(flux > 0.0) else 0.0, 0.0)
     if not lit.any():
         raise DataError("no integration holds light", source=cube.source)
     images, flux = images[lit], flux[lit]
-    good = np.isnan(images).mean(axis=0) <= ALWAYS_BAD
+    missing = np.isnan(images)
+    good = np.count_nonzero(missing, axis=0) <= ALWAYS_BAD * len(images)
     with np.errstate(invalid="ignore"):
         scaled = images * (np.median(flux) / flux)[:, None, None]
     scaled = np.where(good, scaled, 0.0)
@@ -117,8 +121,10 @@ def reference_of(file: Source) -> Reference:
     count = int((~good).sum())
     has_errors = cube.error is not None
     found = Reference(image, scatter, good, noise, count, images, has_errors, cube.source)
-    off = found.outliers(np.nan_to_num(images), np.isnan(images), OUTLIER)
-    return replace(found, sample=np.where(off, np.nan, images))
+    images[missing] = 0.0
+    missing |= found.outliers(images, missing, OUTLIER)
+    images[missing] = np.nan
+    return found
 
 
 def median_and_scatter(values: PixelArray) -> tuple[PixelArray, PixelArray]:

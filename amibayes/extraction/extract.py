@@ -264,11 +264,10 @@ def _noise_and_misfit(
     image, good = reference.image[view.part], reference.good[view.part]
     sample = reference.sample[(slice(None), *view.part)]
     missing = np.isnan(sample) | ~good
-    pixels = fit.fill(
-        np.nan_to_num(sample).reshape(len(sample), -1), missing.reshape(len(sample), -1)
-    )
+    flat = (len(sample), -1)
+    pixels = fit.fill(np.where(missing, 0.0, sample).reshape(flat), missing.reshape(flat))
     coefficients = fit.solve(pixels)
-    residual = fit.without(pixels, coefficients)
+    residual = pixels.astype(np.float32) - coefficients.astype(np.float32) @ fit.model
     mean = residual.mean(axis=0).reshape(image.shape)
     noise = cropped(reference.noise, view.part)
     _refuse_another(image, mean, noise, good, reference)

@@ -110,7 +110,7 @@ def _unique(view: View, level: _Levels, star: FloatArray) -> OneEach:
     wave -= np.outer(wave.sum(axis=1), level.background)
     # Feet of other splodges turn a sample: a point source is to have phase 0.
     wave /= (wave @ star)[:, None]
-    rows = np.concatenate([level.flux[None], wave.real, wave.imag])
+    rows = np.concatenate([level.flux[None], wave.real, wave.imag, level.background[None]])
     return OneEach.of(rows.T, view.instrument.mask, view.frequency_px)
 
 
@@ -131,6 +131,7 @@ def _matched(view: View, half_width: int, level: _Levels, basis: FloatArray) -> 
     seen = rows @ basis
     scale = np.abs(seen).max(axis=1)[:, None]
     alone = np.linalg.inv(seen / scale) @ (rows / scale)
+    alone = np.concatenate([alone, level.background[None]])
     return OneEach.of(alone.T, view.instrument.mask, view.frequency_px)
 
 

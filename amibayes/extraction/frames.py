@@ -15,13 +15,13 @@ from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Referenc
 from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.image_plane import FringeFit, SingleArray, shift_of
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import IntArray, PixelArray, Sampling
+from amibayes.extraction.sampling import IntArray, OneEach, PixelArray, Sampling
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
-CHUNK = 64
+CHUNK = 100
 """Integrations that are worked on together."""
 
 
@@ -89,7 +89,7 @@ class Bench:
     fit : FringeFit
         Also of the Fourier methods, for which it fills bad pixels.
     scatter : (n_pixels,) array
-        Of what that fit leaves of a good integration.
+        Of what a fit leaves of good integrations.
     sampling : Sampling
         What is measured.
     variance : (n_pixels,) array
@@ -115,7 +115,7 @@ class Bench:
         return self.sampling.bias(self.variance)
 
     def look(self, pixels: PixelArray) -> tuple[FloatArray, SingleArray]:
-        """Measure images (n, n_pixels), and tell what the fit leaves of them.
+        """Measure images (n, n_pixels), and tell what the model of the fringes leaves of them.
 
         Both are those of the reference, and those of what an image differs by from it: the
         rounding of single precision is then that of a small number.
@@ -123,13 +123,15 @@ class Bench:
         Returns
         -------
         numbers : (n, m) array
-            Coefficients of the fit, then what else the sampling needs.
+            What the sampling needs first, and perhaps the coefficients of the fit.
         left : (n, n_pixels) array
-            Residual of the fit less that of the reference.
+            Residual less that of the reference.
         """
+        single = pixels.dtype == np.float32
         off = pixels - self._usual
-        beyond = off @ (self._single if pixels.dtype == np.float32 else self._operator)
-        left = self.fit.without(off, beyond[:, : self.fit.n_coefficients])
+        beyond = off @ (self._single if single else self._operator)
+        left = off if single else off.astype(np.float32)
+        left -= (beyond @ self._to_model).astype(np.float32) @ self.fit.model
         return beyond + self._known, left
 
     def standing_off(self, left: SingleArray) -> BoolArray:
@@ -150,19 +152,26 @@ class Bench:
 
     def sampled(self, numbers: FloatArray, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux and samples of images whose `numbers` are known."""
-        first = 0 if self._fitted else self.fit.n_coefficients
-        return self.sampling.completed(numbers[:, first:], pixels)
+        return self.sampling.completed(numbers[:, : self.sampling.linear.shape[1]], pixels)
 
     @property
-    def _fitted(self) -> bool:
-        """Whether the coefficients are what is measured."""
-        return self.options.method == "fringes"
+    def _complete(self) -> bool:
+        """Whether what is measured determines the whole model."""
+        return isinstance(self.sampling, OneEach)
 
     @cached_property
     def _operator(self) -> FloatArray:
         """(n_pixels, m): images times this are the numbers."""
-        parts = [self.fit.inverse] if self._fitted else [self.fit.inverse, self.sampling.linear]
-        return np.concatenate(parts, axis=1)
+        linear = self.sampling.linear
+        return linear if self._complete else np.concatenate([linear, self.fit.inverse], axis=1)
+
+    @cached_property
+    def _to_model(self) -> FloatArray:
+        """(m, n_coefficients): numbers times this are coefficients of the model."""
+        if self._complete:
+            return np.asarray(np.linalg.inv(self.fit.design.T @ self._operator))
+        n = self.fit.n_coefficients
+        return np.eye(self._operator.shape[1], n, n - self._operator.shape[1])
 
     @cached_property
     def _single(self) -> SingleArray:
@@ -181,8 +190,7 @@ class Bench:
     @cached_property
     def _usual_left(self) -> SingleArray:
         """(n_pixels,) what the fit leaves of it."""
-        coefficients = self._known[None, : self.fit.n_coefficients]
-        return np.asarray(self.fit.without(self._usual[None], coefficients)[0])
+        return np.asarray(self._usual - (self._known @ self._to_model).astype(np.float32) @ self.fit.model)
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:

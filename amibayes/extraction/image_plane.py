@@ -61,16 +61,20 @@ class FringeFit:
 
     def solve(self, pixels: PixelArray) -> FloatArray:
         """Coefficients (n, n_coefficients) of images (n, n_pixels)."""
+        if pixels.dtype == np.float32:
+            rows, scale = self._weighted
+            return np.asarray((pixels @ rows.T).astype(float) @ self.covariance * scale)
         return np.asarray((pixels * self.weight) @ self.design @ self.covariance)
 
-    def without(self, pixels: PixelArray, coefficients: PixelArray) -> SingleArray:
-        """Images less the fit, in single precision: what is left is looked at, not measured."""
-        left = pixels.astype(np.float32)
-        left -= coefficients.astype(np.float32, copy=False) @ self._model
-        return left
+    @cached_property
+    def _weighted(self) -> tuple[SingleArray, float]:
+        """Weighted model in single precision, in units of the largest weight."""
+        scale = float(self.weight.max())
+        return self.model * (self.weight / scale).astype(np.float32), scale
 
     @cached_property
-    def _model(self) -> SingleArray:
+    def model(self) -> SingleArray:
+        """(n_coefficients, n_pixels): the design in single precision, to look at residuals."""
         return np.ascontiguousarray(self.design.T, np.float32)
 
     def fill(self, pixels: PixelArray, missing: BoolArray) -> PixelArray:
@@ -142,8 +146,8 @@ def weighted_fit(basis: FringeBasis, weight: FloatArray) -> FringeFit:
 
 
 def fringe_sampling(fit: FringeFit, view: View) -> OneEach:
-    """Coefficients of the fit, but for the pedestal, as flux and a sample per baseline."""
-    return OneEach.of(fit.inverse[:, :-1], view.instrument.mask, view.frequency_px)
+    """Coefficients of the fit as flux, a sample per baseline, and background."""
+    return OneEach.of(fit.inverse, view.instrument.mask, view.frequency_px)
 
 
 def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None) -> FloatArray:

@@ -18,6 +18,9 @@ from amibayes.units import FloatArray, read_only
 
 _ROUNDS = 4
 
+RIDGE = 1e-13
+"""Added to normal matrices of rows of unit length: no image has to have every kind of slope."""
+
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
@@ -59,15 +62,13 @@ def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> Nois
     """
     signal = np.maximum(gaussian_filter(np.where(good, mean, 0.0), 0.5), 0.0)
     slope_y, slope_x = np.gradient(np.where(good, mean, 0.0))
-    columns = np.stack([np.ones_like(signal), signal, slope_x**2, slope_y**2], axis=-1)[good]
+    rows = np.stack([np.ones_like(signal), signal, slope_x**2, slope_y**2])[:, good]
     data = measured[good]
     weight = np.full(len(data), 1.0 / max(float(np.median(data)), 1e-300))
     found = np.zeros(4)
     for _ in range(_ROUNDS):
-        scale = np.linalg.norm(columns * weight[:, None], axis=0)
-        scale[scale == 0.0] = 1.0
-        found = nnls(columns * weight[:, None] / scale, data * weight)[0] / scale
-        model = columns @ found
+        found = _not_negative(rows * weight, data * weight)
+        model = found @ rows
         # Every relative deviation counts alike; outliers count for little.
         level = np.maximum(model, 1e-6 * max(float(model.max()), 1e-300))
         weight = 1.0 / level / np.maximum(1.0, np.abs(data - model) / (4.0 * level))
@@ -75,6 +76,15 @@ def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> Nois
     variance = constant + per_signal * np.maximum(mean, 0.0)
     floor = max(1e-6 * float(variance.max()), 1e-300)
     return NoiseModel(np.maximum(variance, floor), constant, per_signal)
+
+
+def _not_negative(rows: FloatArray, data: FloatArray) -> FloatArray:
+    """Least squares of data (n,) by rows (k, n) with no coefficient below 0."""
+    scale = np.sqrt(np.einsum("kn,kn->k", rows, rows))
+    scale[scale == 0.0] = 1.0
+    normal = rows @ rows.T / np.outer(scale, scale) + RIDGE * np.eye(len(rows))
+    root = np.linalg.cholesky(normal)
+    return np.asarray(nnls(root.T, np.linalg.solve(root, rows @ data / scale))[0] / scale)
 
 
 def scatter_about_pointing(residual: PixelArray, shift_px: FloatArray) -> FloatArray:
@@ -95,8 +105,9 @@ def scatter_about_pointing(residual: PixelArray, shift_px: FloatArray) -> FloatA
     # Never more terms than half of what there is to fit.
     kept = 6 if n >= 12 else 3 if n >= 6 else 1
     basis = np.linalg.qr(np.stack(terms[:kept], axis=1))[0]
+    basis = basis.astype(residual.dtype)
     rest = residual - basis @ (basis.T @ residual)
-    return np.asarray((rest**2).sum(axis=0) / (n - kept))
+    return np.einsum("np,np->p", rest, rest).astype(float) / (n - kept)
 
 
 def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:

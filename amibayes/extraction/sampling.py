@@ -68,27 +68,27 @@ class OneEach:
 
     Parameters
     ----------
-    matrix : (n_pixels, 1 + 2·n_baselines) array
-        Columns: flux; real parts; imaginary parts. Images times matrix.
+    linear : (n_pixels, 2 + 2·n_baselines) array
+        Images times this are flux; real parts; imaginary parts; background.
     triangles : (n_triangles, 3) int array
         Baselines ij, jk, ik of every triangle.
     frequency_px : (n_baselines, 2) array
         Cycles per pixel.
     """
 
-    matrix: FloatArray
+    linear: FloatArray
     triangles: IntArray
     frequency_px: FloatArray
 
     @classmethod
-    def of(cls, matrix: FloatArray, mask: Mask, frequency_px: FloatArray) -> OneEach:
+    def of(cls, linear: FloatArray, mask: Mask, frequency_px: FloatArray) -> OneEach:
         """Sampling with the baselines of a mask."""
-        return cls(matrix, mask.triangle_baselines, frequency_px)
+        return cls(linear, mask.triangle_baselines, frequency_px)
 
     @property
-    def linear(self) -> FloatArray:
-        """The matrix: nothing else is needed."""
-        return self.matrix
+    def matrix(self) -> FloatArray:
+        """(n_pixels, 1 + 2·n_baselines): without the background."""
+        return self.linear[:, :-1]
 
     @property
     def n_samples(self) -> int:
