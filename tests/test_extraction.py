@@ -21,7 +21,7 @@ from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
 from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.extract import make_bench
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
-from amibayes.extraction.image_plane import fringe_fit
+from amibayes.extraction.image_plane import FringeModel, fringe_fit
 from amibayes.extraction.per_integration import integrations, series
 from amibayes.extraction.source import Held
 from amibayes.extraction.view import View
@@ -271,10 +271,11 @@ def test_errors_of_the_geometry_are_those_of_repeated_measurements(niriss: Instr
         cube = cube_of(with_photons(np.stack([image] * 4), 100 + seed), niriss)
         bench = make_bench(Held(cube), ExtractOptions(geometry="stated"))
         variance = np.pi / 2.0 / 4.0 * (np.maximum(image, 0.0) + 10.0)
-        fit = fringe_fit(bench.view.basis(), variance, np.ones(image.shape, dtype=bool))
-        solved = solve_geometry(bench.view, bench.reference.image, fit)
+        basis = bench.view.basis()
+        fit = fringe_fit(FringeModel.of(basis), variance, np.ones(image.shape, dtype=bool))
+        solved = solve_geometry(bench.view, bench.reference.image, fit, basis)
         assert solved is not None
-        found.append((solved[0] - [0.002, 0.0]) / solved[1])
+        found.append((solved.value - [0.002, 0.0]) / solved.error)
     off = np.array(found)
     # 60 numbers: standard deviation to 9 %; the variance of a median is 6 % below π/2 of
     # the mean's at n = 4.

@@ -18,7 +18,7 @@ from amibayes.units import FloatArray, read_only
 
 BoolArray = NDArray[np.bool_]
 
-SAMPLE, RUN = 64, 4
+SAMPLE, RUN = 32, 4
 """Integrations that the reference is the median of: short runs, evenly over the cube."""
 
 MOST_BAD = 0.2

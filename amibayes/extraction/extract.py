@@ -208,11 +208,12 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     view, basis, even = centre_on(view, image, good, template.source)
     geometry = Geometry()
     if options.geometry == "fitted":
-        view, geometry = fit_geometry(view, image, _fit_of_median(view, basis, even, reference))
+        median = _fit_of_median(view, even, reference)
+        view, geometry, known = fit_geometry(view, image, median, basis)
     if not geometry.stated:
-        view, basis, even = centre_on(view, image, good, template.source)
+        view, basis, even = centre_on(view, image, good, template.source, known)
     noise, level, scatter = _noise_and_misfit(view, even, reference)
-    fit = fringe_fit(basis, _fit_variance(basis, image, noise, good) + level, good)
+    fit = fringe_fit(even.model, _fit_variance(basis, image, noise, good) + level, good)
     sampling = (
         fringe_sampling(fit, view)
         if options.method == "fringes"
@@ -222,9 +223,7 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     return Bench(view, geometry, reference, fit, scatter, sampling, variance, third, options)
 
 
-def _fit_of_median(
-    view: View, basis: FringeBasis, even: FringeFit, reference: Reference
-) -> FringeFit:
+def _fit_of_median(view: View, even: FringeFit, reference: Reference) -> FringeFit:
     """Fit of the median image with its own weights, out of one with ``even`` weights."""
     image, good = reference.image[view.part], reference.good[view.part]
     left = image - (even.design @ even.solve(image.reshape(1, -1))[0]).reshape(view.shape)
@@ -232,7 +231,7 @@ def _fit_of_median(
     if not reference.has_errors and len(reference.sample) < 3:
         noise = noise_model(image, left**2, good)
     variance = noise.variance * (np.pi / 2.0 / len(reference.sample))  # of a median
-    return fringe_fit(basis, variance + misfit_level(left, variance, good), good)
+    return fringe_fit(even.model, variance + misfit_level(left, variance, good), good)
 
 
 def _fit_variance(
@@ -267,7 +266,7 @@ def _noise_and_misfit(
     flat = (len(sample), -1)
     pixels = fit.fill(np.where(missing, 0.0, sample).reshape(flat), missing.reshape(flat))
     coefficients = fit.solve(pixels)
-    residual = pixels.astype(np.float32) - coefficients.astype(np.float32) @ fit.model
+    residual = pixels.astype(np.float32) - coefficients.astype(np.float32) @ fit.model.single
     mean = residual.mean(axis=0).reshape(image.shape)
     noise = cropped(reference.noise, view.part)
     _refuse_another(image, mean, noise, good, reference)
@@ -319,9 +318,7 @@ def _refuse_another(
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     """One exposure out of its files: average, covariance, table."""
     view = parts[0].bench.view
-    frames, pointed, physical = _together(parts, options)
-    used = frames.used
-    mean = average(frames.select(used), pointed[used], view.instrument.mask.triangle_baselines)
+    frames, mean, physical = _together(parts, options)
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
@@ -331,23 +328,22 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
 
 
-def _together(
-    parts: list[_Part], options: ExtractOptions
-) -> tuple[Frames, ComplexArray, FloatArray]:
-    """Integrations of all files, those that stand off marked, and what they share."""
+def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Average, FloatArray]:
+    """Integrations of all files, those that stand off marked, their mean, and their noise."""
     frames = concatenated([p.frames for p in parts])
     pointed = np.concatenate([p.pointed for p in parts])
     count = np.array([p.frames.used.sum() for p in parts], dtype=float)
     physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
+    triangles = parts[0].bench.view.instrument.mask.triangle_baselines
+    mean = average(frames.select(frames.used), pointed[frames.used], triangles)
     if not options.keep_all:
-        triangles = parts[0].bench.view.instrument.mask.triangle_baselines
-        found = average(frames.select(frames.used), pointed[frames.used], triangles)
-        sigma = np.sqrt(np.diag(physical))
         off = np.zeros(len(frames), dtype=bool)
-        off[frames.used] = standing_off(found.deviation, sigma, options.clip)
-        reason = np.where(off, "observables stand off the others'", frames.reason)
-        frames = replace(frames, reason=reason)
-    return frames, pointed, np.asarray(physical)
+        off[frames.used] = standing_off(mean.deviation, np.sqrt(np.diag(physical)), options.clip)
+        if off.any():
+            reason = np.where(off, "observables stand off the others'", frames.reason)
+            frames = replace(frames, reason=reason)
+            mean = average(frames.select(frames.used), pointed[frames.used], triangles)
+    return frames, mean, np.asarray(physical)
 
 
 def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:

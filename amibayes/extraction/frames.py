@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr, ndtri
 
 from amibayes.cube import Cube
 from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
@@ -131,7 +131,7 @@ class Bench:
         off = pixels - self._usual
         beyond = off @ (self._single if single else self._operator)
         left = off if single else off.astype(np.float32)
-        left -= (beyond @ self._to_model).astype(np.float32) @ self.fit.model
+        left -= (beyond @ self._to_model).astype(np.float32) @ self.fit.model.single
         return beyond + self._known, left
 
     def standing_off(self, left: SingleArray) -> BoolArray:
@@ -190,7 +190,8 @@ class Bench:
     @cached_property
     def _usual_left(self) -> SingleArray:
         """(n_pixels,) what the fit leaves of it."""
-        return np.asarray(self._usual - (self._known @ self._to_model).astype(np.float32) @ self.fit.model)
+        coefficients = (self._known @ self._to_model).astype(np.float32)
+        return np.asarray(self._usual - coefficients @ self.fit.model.single)
 
 
 def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
@@ -336,4 +337,4 @@ def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
 
 def look_elsewhere(limit: float, n: int) -> float:
     """The limit that one of ``n`` exceeds as rarely as a single one exceeds ``limit``."""
-    return float(norm.isf(norm.sf(limit) / max(n, 1)))
+    return float(-ndtri(ndtr(-limit) / max(n, 1)))

@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.extraction.fine_image import fine_image
-from amibayes.extraction.image_plane import FringeFit, weighted_fit
+from amibayes.extraction.image_plane import FringeFit, FringeModel, weighted_fit
 from amibayes.extraction.view import View
+from amibayes.optics import FringeBasis
 from amibayes.units import FloatArray
 
 STEP_PX = 0.03
@@ -70,7 +71,22 @@ class Geometry:
         return self.scale == 1.0 and self.rotation_rad == 0.0
 
 
-def fit_geometry(view: View, image: FloatArray, fit: FringeFit) -> tuple[View, Geometry]:
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Relative error of the pixel scale and rotation (2,), and their standard deviations.
+
+    ``basis`` is the fringe model of ``at``, the rounded values that were tried last.
+    """
+
+    value: FloatArray
+    error: FloatArray
+    at: FloatArray
+    basis: FringeBasis
+
+
+def fit_geometry(
+    view: View, image: FloatArray, fit: FringeFit, basis: FringeBasis
+) -> tuple[View, Geometry, FringeBasis | None]:
     """Find pixel scale and rotation in an image (n_y, n_x).
 
     Parameters
@@ -82,49 +98,59 @@ def fit_geometry(view: View, image: FloatArray, fit: FringeFit) -> tuple[View, G
     fit : FringeFit
         Of that view; its weights are the inverse variances of the image, what the optics
         add to noise included.
+    basis : FringeBasis
+        Of that view.
 
     Returns
     -------
     View
         With the geometry that was found, or as it was.
     Geometry
+    FringeBasis or None
+        That of the view, where it is known.
     """
-    solved = solve_geometry(view, image, fit)
+    solved = solve_geometry(view, image, fit, basis)
     if solved is None:
-        return view, Geometry()
-    value, error = solved
+        return view, Geometry(), basis
+    value, error = solved.value, solved.error
     limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
-    believed = np.where(np.abs(value) < limit, 0.0, ROUNDED * np.round(value / ROUNDED))
+    believed = np.where(np.abs(value) < limit, 0.0, _rounded(value))
     scale, turn = (float(b) for b in believed)
-    found = _moved(view, np.array([scale, turn, 0.0, 0.0])) if scale or turn else view
-    return found, Geometry(1.0 + scale, turn, float(error[0]), float(error[1]), True)
+    stated = basis if scale == turn == 0.0 else None
+    known = solved.basis if np.array_equal(believed, solved.at) else stated
+    found = Geometry(1.0 + scale, turn, float(error[0]), float(error[1]), True)
+    return _moved(view, believed), found, known
 
 
 def solve_geometry(
-    view: View, image: FloatArray, fit: FringeFit
-) -> tuple[FloatArray, FloatArray] | None:
-    """Relative error of the pixel scale and rotation (2,), and their standard deviations.
-
-    None where the image does not tell them.
-    """
+    view: View, image: FloatArray, fit: FringeFit, basis: FringeBasis
+) -> Solution | None:
+    """Solve for pixel scale and rotation; None where the image does not tell them."""
     pixels = image.reshape(1, -1)
     # The place of the envelope is fitted too, but the fringes say where the star is.
     slopes = geometry_slopes(view, fit.solve(pixels)[0, :-1])
     slopes -= fit.solve(slopes) @ fit.design.T
     covariance = np.linalg.pinv((slopes * fit.weight) @ slopes.T)
-    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not 0.0 < error[:2].min() <= error[:2].max() < CONSTRAINED:
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:2]
+    if not 0.0 < error.min() <= error.max() < CONSTRAINED:
         return None
-    total, residual = np.zeros(4), _residual(fit, pixels)
+    at = np.zeros(2)
     for _ in range(MOST_STEPS):
-        step = covariance @ (slopes * fit.weight) @ residual
-        total = total + step
-        if np.abs(total[:2]).max() > LARGEST:
+        residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]
+        step = (covariance @ (slopes * fit.weight) @ residual)[:2]
+        value = at + step
+        if np.abs(value).max() > LARGEST:
             return None
-        if np.all(SHRINKS * np.abs(step[:2]) < np.maximum(ENOUGH_SIGMA * error[:2], ENOUGH)):
+        if np.all(SHRINKS * np.abs(step) < np.maximum(ENOUGH_SIGMA * error, ENOUGH)):
             break
-        residual = _residual(weighted_fit(_moved(view, total).basis(), fit.weight), pixels)
-    return total[:2], error[:2]
+        at = _rounded(value)
+        basis = _moved(view, at).basis()
+        fit = weighted_fit(FringeModel.of(basis), fit.weight)
+    return Solution(value, error, at, basis)
+
+
+def _rounded(value: FloatArray) -> FloatArray:
+    return np.asarray(ROUNDED * np.round(value / ROUNDED))
 
 
 def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
@@ -132,11 +158,6 @@ def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
     numbers = fit.solve(image.reshape(1, -1))[0, :-1]
     real, imaginary = numbers[1:].reshape(2, -1) / numbers[0]
     return float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
-
-
-def _residual(fit: FringeFit, pixels: FloatArray) -> FloatArray:
-    """What a fit leaves of one image, (n_pixels,)."""
-    return np.asarray((pixels - fit.solve(pixels) @ fit.design.T)[0])
 
 
 def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:
@@ -168,12 +189,14 @@ def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:
 
 
 def _moved(view: View, by: FloatArray) -> View:
-    """A view with another scale (relative), rotation, and centre."""
-    scale, turn = (float(b) for b in by[:2])
+    """A view with another scale (relative) and rotation."""
+    scale, turn = (float(b) for b in by)
+    if not (scale or turn):
+        return view
     instrument = view.instrument
     pixel = instrument.pixel_scale_rad * (1.0 + scale)
     return replace(
-        view.moved(by[2:]),
+        view,
         instrument=replace(instrument, pixel_scale_rad=pixel),
         rotation_rad=view.rotation_rad + turn,
     )

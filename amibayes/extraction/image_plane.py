@@ -27,27 +27,48 @@ SingleArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
+class FringeModel:
+    """Envelope, cosines, sines and a pedestal, as rows (2 + 2·n_baselines, n_pixels)."""
+
+    rows: FloatArray
+
+    @classmethod
+    def of(cls, basis: FringeBasis) -> FringeModel:
+        """Model of a view's basis."""
+        return cls(np.concatenate([basis.matrix.T, np.ones((1, len(basis.matrix)))]))
+
+    @cached_property
+    def single(self) -> SingleArray:
+        """The rows in single precision, to look at residuals."""
+        return self.rows.astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
 class FringeFit:
     """The weighted fit of one view.
 
     Parameters
     ----------
-    design : (n_pixels, 2 + 2·n_baselines) array
-        Columns: envelope, cosines, sines, pedestal.
+    model : FringeModel
     covariance : (2 + 2·n_baselines, 2 + 2·n_baselines) array
         Of the coefficients: inverse of the normal matrix.
     weight : (n_pixels,) array
         Inverse variances; 0 where a pixel is never used.
     """
 
-    design: FloatArray
+    model: FringeModel
     covariance: FloatArray
     weight: FloatArray
 
     @property
+    def design(self) -> FloatArray:
+        """(n_pixels, n_coefficients)."""
+        return self.model.rows.T
+
+    @property
     def n_coefficients(self) -> int:
         """How many numbers are fitted."""
-        return int(self.design.shape[1])
+        return len(self.covariance)
 
     @cached_property
     def used(self) -> BoolArray:
@@ -70,12 +91,7 @@ class FringeFit:
     def _weighted(self) -> tuple[SingleArray, float]:
         """Weighted model in single precision, in units of the largest weight."""
         scale = float(self.weight.max())
-        return self.model * (self.weight / scale).astype(np.float32), scale
-
-    @cached_property
-    def model(self) -> SingleArray:
-        """(n_coefficients, n_pixels): the design in single precision, to look at residuals."""
-        return np.ascontiguousarray(self.design.T, np.float32)
+        return self.model.single * (self.weight / scale).astype(np.float32), scale
 
     def fill(self, pixels: PixelArray, missing: BoolArray) -> PixelArray:
         """Give missing pixels the values that a fit without them predicts.
@@ -112,7 +128,7 @@ class FringeFit:
         return np.asarray(np.linalg.solve(system, start[..., None])[..., 0])
 
 
-def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> FringeFit:
+def fringe_fit(model: FringeModel, variance: FloatArray, good: BoolArray) -> FringeFit:
     """Prepare the fit: pixels of a variance (n_y, n_x), those that are ``good`` only.
 
     Raises
@@ -120,10 +136,10 @@ def fringe_fit(basis: FringeBasis, variance: FloatArray, good: BoolArray) -> Fri
     DataError
         Where the good pixels do not determine it.
     """
-    return weighted_fit(basis, np.where(good, 1.0 / variance, 0.0).ravel())
+    return weighted_fit(model, np.where(good, 1.0 / variance, 0.0).ravel())
 
 
-def weighted_fit(basis: FringeBasis, weight: FloatArray) -> FringeFit:
+def weighted_fit(model: FringeModel, weight: FloatArray) -> FringeFit:
     """Prepare the fit with the inverse variances (n_pixels,).
 
     Raises
@@ -131,8 +147,7 @@ def weighted_fit(basis: FringeBasis, weight: FloatArray) -> FringeFit:
     DataError
         Where they do not determine it.
     """
-    rows = np.concatenate([basis.matrix.T, np.ones((1, len(basis.matrix)))])
-    weighted = rows * np.sqrt(weight)
+    weighted = model.rows * np.sqrt(weight)
     normal = weighted @ weighted.T
     # Fringes of different frequency are nearly orthogonal: columns of like size keep the
     # normal equations well conditioned.
@@ -141,8 +156,7 @@ def weighted_fit(basis: FringeBasis, weight: FloatArray) -> FringeFit:
         factor = cho_factor(normal / np.outer(scale, scale))
     except (LinAlgError, ValueError):
         raise DataError("too few good pixels to tell the fringes apart") from None
-    covariance = cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None]
-    return FringeFit(rows.T, covariance, weight)
+    return FringeFit(model, cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None], weight)
 
 
 def fringe_sampling(fit: FringeFit, view: View) -> OneEach:
@@ -159,9 +173,11 @@ def shift_of(view: View, samples: ComplexArray, weight: FloatArray | None = None
 
 
 def centre_on(
-    view: View, image: FloatArray, good: BoolArray, source: str
+    view: View, image: FloatArray, good: BoolArray, source: str, basis: FringeBasis | None = None
 ) -> tuple[View, FringeBasis, FringeFit]:
     """Move the view's centre to the star, by Gauss–Newton on the phases of its fringes.
+
+    Where the ``basis`` of the view is given, its centre is nearly right already.
 
     Returns
     -------
@@ -175,15 +191,16 @@ def centre_on(
     """
     pixels = np.where(good, image, 0.0)
     even = np.ones(view.shape)
-    view = view.moved(_shift_of_transform(view, pixels))
+    if basis is None:
+        view = view.moved(_shift_of_transform(view, pixels))
     for _ in range(MOST_STEPS):
-        basis = view.basis()
-        fit = fringe_fit(basis, even, good)
+        basis = basis or view.basis()
+        fit = fringe_fit(FringeModel.of(basis), even, good)
         flux, samples = split(fit.solve(pixels.reshape(1, -1)))
         step = shift_of(view, samples, np.abs(samples[0]))[0]
         if np.hypot(*step) < CONVERGED_PX and flux[0] > 0.0:
             return view, basis, fit
-        view = view.moved(step)
+        view, basis = view.moved(step), None
         if not flux[0] > 0.0 or np.abs(view.centre_px).max() > 0.5 * max(view.shape):
             break
     raise DataError(

@@ -107,7 +107,7 @@ def scatter_about_pointing(residual: PixelArray, shift_px: FloatArray) -> FloatA
     basis = np.linalg.qr(np.stack(terms[:kept], axis=1))[0]
     basis = basis.astype(residual.dtype)
     rest = residual - basis @ (basis.T @ residual)
-    return np.einsum("np,np->p", rest, rest).astype(float) / (n - kept)
+    return np.asarray(np.einsum("np,np->p", rest, rest).astype(float) / (n - kept))
 
 
 def cropped(noise: NoiseModel, part: tuple[slice, slice]) -> NoiseModel:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import digamma, gammaln
 
@@ -96,7 +97,7 @@ def shrunk_covariance(
         Where the scatter alone is asked for and has not more than p + 2 integrations.
     """
     lower = np.linalg.cholesky(basis.T @ physical @ basis)
-    white = np.linalg.solve(lower, basis.T @ deviation.T)
+    white = solve_triangular(lower, basis.T @ deviation.T, lower=True)
     white, block, correlation = _uncorrelated(white)
     p, n = white.shape
     groups = np.arange(p) < n_vis2

@@ -126,15 +126,19 @@ def fringe_image(
     """
     recipe = _Recipe.of(instrument, channels, n_pixels, rotation_rad)
     mask, place = recipe.mask, recipe.cells(oversample)
-    weight = np.array([2.0, 2.0j]) @ coefficients[1:].reshape(2, -1)
-    total = np.zeros((len(place), len(place)))
+    size, half = len(place), len(place) // 2
+    real, imaginary = 2.0 * coefficients[1:].reshape(2, -1, 1)
+    total, fringes = np.zeros((size, size)), np.empty((size, size))
     for wavelength, power in zip(channels.wavelength_m, _powers(recipe, oversample), strict=True):
-        x, y = np.exp(2j * np.pi / wavelength * mask.uv_m.T[:, :, None] * place)
-        y *= weight[:, None]
-        # The real part of a sum of waves is one product of real matrices.
-        fringes = np.concatenate([y.real, -y.imag]).T @ np.concatenate([x.real, x.imag])
-        fringes += mask.n_holes * coefficients[0]
-        total += fringes * power
+        turn = 2.0 * np.pi / wavelength * mask.uv_m.T[:, :, None] * place
+        cosine, sine = np.cos(turn[1]), np.sin(turn[1])
+        # Cells lie evenly about the star: what is even and what is odd along x serve both sides.
+        even = (real * cosine - imaginary * sine).T @ np.cos(turn[0, :, half:])
+        odd = (real * sine + imaginary * cosine).T @ np.sin(turn[0, :, half:])
+        even += mask.n_holes * coefficients[0]
+        fringes[:, half:] = even - odd
+        fringes[:, : size - half] = (even + odd)[:, ::-1]
+        total += np.multiply(fringes, power, out=fringes)
     return total
 
 

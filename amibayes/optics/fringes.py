@@ -16,7 +16,7 @@ import numpy as np
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.psf import axis_nodes, pixel_rule
-from amibayes.units import FloatArray, read_only
+from amibayes.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,10 @@ class FringeBasis:
     shape: tuple[int, int]
 
     def __post_init__(self) -> None:
-        read_only(self, "matrix")
+        # Large, and made for this: no copy.
+        view = self.matrix.view()
+        view.flags.writeable = False
+        object.__setattr__(self, "matrix", view)
 
     @property
     def n_baselines(self) -> int:
