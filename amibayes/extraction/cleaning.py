@@ -152,7 +152,7 @@ def _median(values: PixelArray) -> PixelArray:
 def _sample(file: Source) -> Cube:
     """Integrations spread evenly over the cube."""
     n = file.n_integrations
-    if n <= SAMPLE:
+    if n <= 2 * SAMPLE:
         return file.read()
     starts = np.linspace(0, n - RUN, SAMPLE // RUN).astype(int)
     parts = [file.read(int(i), int(i) + RUN) for i in starts]

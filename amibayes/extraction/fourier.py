@@ -125,7 +125,8 @@ def _matched(view: View, half_width: int, level: _Levels, basis: FloatArray) -> 
     share = (own * _brightness(own)).conj()
     level_of = np.sum(share * patches.transform(level.window.reshape(view.shape)), axis=(1, 2))
     weights = np.concatenate([share, -1j * share])
-    waves = patches.repeated(2).combined(weights).reshape(len(weights), -1) * level.window
+    twice = np.tile(np.arange(len(share)), 2)
+    waves = patches.select(twice).combined(weights).reshape(len(weights), -1) * level.window
     waves -= np.outer(np.concatenate([level_of.real, level_of.imag]), level.background)
     rows = np.concatenate([level.flux[None], waves])
     seen = rows @ basis

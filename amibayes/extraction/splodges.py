@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import convolve2d
+from scipy.signal import fftconvolve
 
-from amibayes.extraction.patches import Patches
+from amibayes.extraction.patches import Patches, waves
 from amibayes.extraction.sampling import PixelArray
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
@@ -181,9 +181,9 @@ class Splodges:
     def _pulled(self, slope: ComplexArray, leg: Any = slice(None)) -> FloatArray:
         """Derivatives (m, n_pixels) of Re Σ slope·sample, slopes (m, k, k) of baselines ``leg``."""
         weight = slope * self._factor[leg]
-        waves = Patches(self.patches.along_x[leg], self.patches.along_y[leg]).combined(weight)
+        light = self.patches.select(leg).combined(weight)
         level = (weight * self._level[leg]).sum(axis=(1, 2)).real
-        return waves.reshape(len(weight), -1) * self.window - np.outer(level, self.linear[:, 1])
+        return light.reshape(len(weight), -1) * self.window - np.outer(level, self.linear[:, 1])
 
     def _closure_slopes(self, samples: ComplexArray) -> list[ComplexArray]:
         """Slopes (n_triangles, k, k) of the closure phases by the three legs' samples."""
@@ -201,30 +201,36 @@ class Splodges:
         The noise of the background, the same in all cells and small, is left out of the
         covariance of two cells.
         """
-        power, n = self.power(samples[None])[0] / flux**2, self.n_baselines
-        own, background = self.linear.T
-        first, second = np.triu_indices(n)
-        total = np.zeros((n, n))
-        total[first, second] = self._between(first, second, variance)
-        total = total + np.triu(total, 1).T
+        power, (own, background) = self.power(samples[None])[0] / flux**2, self.linear.T
         common = self._transform(variance * own)
         common -= float(variance @ (own * background)) * self._level
         with_flux = np.sum(np.abs(self._factor * common) ** 2, axis=(1, 2))
         crossed = 2.0 * np.outer(power, with_flux)
-        total += 2.0 * np.outer(power, power) * float(variance @ own**2) ** 2 - crossed - crossed.T
+        total = self._between(variance) - crossed - crossed.T
+        total += 2.0 * np.outer(power, power) * float(variance @ own**2) ** 2
         return np.asarray(total / flux**4)
 
-    def _between(self, first: Any, second: Any, variance: FloatArray) -> FloatArray:
-        """Covariance (m,) of the noise powers of two splodges, summed over their cells.
+    def _between(self, variance: FloatArray) -> FloatArray:
+        """Covariance (n_baselines, n_baselines) of the noise powers of two splodges.
 
-        That of two cells is the transform of the variance at the difference, or the sum, of
-        their frequencies.
+        That of two cells is the transform of the variance at the difference, and at the
+        sum, of their frequencies. Its square, summed over the cells, is the transform at
+        those of the baselines of the variance's correlation with itself, under the squared
+        transform of the gain.
         """
-        frequency, half = self.view.frequency_px, len(self.gain) // 2
-        apart, along = frequency[first] - frequency[second], frequency[first] + frequency[second]
-        patches = Patches.of(self.view, np.concatenate([apart, along]), 2 * half)
         image = (variance * self.window**2).reshape(self.view.shape)
-        power = np.abs(patches.transform(image)) ** 2
-        pairs = (power * convolve2d(self.gain, self.gain)).sum(axis=(1, 2))
-        norm = self._norm.ravel()
-        return np.asarray(pairs.reshape(2, -1).sum(axis=0) / (norm[first] * norm[second]) ** 2)
+        y, x = (np.arange(1 - n, n) for n in self.view.shape)
+        side = (np.arange(len(self.gain)) - len(self.gain) // 2) / max(self.view.shape)
+        gain = (waves(side, y).T @ self.gain @ waves(side, x)).real
+        kernel = fftconvolve(image, image[::-1, ::-1]) * gain**2
+        first, second = np.triu_indices(self.n_baselines)
+        along_x, along_y = (
+            np.concatenate([one[first] * one[second], one[first] * one[second].conj()])
+            for one in map(waves, self.view.frequency_px.T, (x, y))
+        )
+        sums = np.einsum("fx,fx->f", along_y.real @ kernel, along_x.real)
+        sums -= np.einsum("fx,fx->f", along_y.imag @ kernel, along_x.imag)
+        norm = self._norm.ravel() ** 2
+        total = np.zeros((self.n_baselines, self.n_baselines))
+        total[first, second] = sums.reshape(2, -1).sum(axis=0) / (norm[first] * norm[second])
+        return np.asarray(total + np.triu(total, 1).T)
