@@ -21,7 +21,7 @@ from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
-CHUNK = 100
+CHUNK = 64
 """Integrations that are worked on together."""
 
 
