@@ -219,7 +219,7 @@ class Splodges:
         transform of the gain.
         """
         image = (variance * self.window**2).reshape(self.view.shape)
-        y, x = (np.arange(1 - n, n) for n in self.view.shape)
+        y, x = (np.arange(1.0 - n, n) for n in self.view.shape)
         side = (np.arange(len(self.gain)) - len(self.gain) // 2) / max(self.view.shape)
         gain = (waves(side, y).T @ self.gain @ waves(side, x)).real
         kernel = fftconvolve(image, image[::-1, ::-1]) * gain**2
