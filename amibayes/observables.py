@@ -16,6 +16,7 @@ from amibayes.covariance import Covariance, stack_covariances
 from amibayes.errors import DataError
 from amibayes.freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.notebook import observables_html, observables_table
+from amibayes.response import Response
 from amibayes.units import FloatArray
 
 IntArray = NDArray[np.intp]
@@ -49,10 +50,8 @@ class Setup:
         The file the data come from.
     right_ascension_deg, declination_deg : float
         Of the target (0 where unknown).
-    response : (n_stations, n_stations, n_coefficients) float array, optional
-        Logarithm of what the extraction lets through of light off the axis, in
-        `amibayes.response.monomials_at` of east and north (radians): of a baseline's
-        visibility, and on the diagonal of the flux.
+    response : Response, optional
+        What the extraction lets through of light off the axis.
     """
 
     insname: str
@@ -67,7 +66,7 @@ class Setup:
     source: str = ""
     right_ascension_deg: float = 0.0
     declination_deg: float = 0.0
-    response: FloatArray | None = None
+    response: Response | None = None
 
     def __post_init__(self) -> None:
         _freeze(self)

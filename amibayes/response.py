@@ -1,50 +1,105 @@
-"""How an extraction responds to light off the axis: its value at a place.
+"""How an extraction responds to light off the axis: what it makes of a point at a place.
 
 The response of a baseline to a point source is the ratio of the visibility that is
-measured to the one that the source has. The image of a point is symmetric, so that the
-logarithm of the ratio's modulus is even in the place and its phase odd: both are
-polynomials. A baseline taken the other way round has the conjugate.
+measured, smeared over the filter's width, to exp(−2πi(uα + vδ)). It is smooth, but for a
+little of the other baselines' fringes, which turn with the place: known on a lattice of
+places three times finer than a fringe of the longest baseline, and by cubic B-splines between
+(Unser 1999).
+Opposite places have conjugate responses, as has a baseline taken the other way round.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, read_only
 
 ComplexArray = NDArray[np.complex128]
+SmallComplexArray = NDArray[np.complex64]
+IntArray = NDArray[np.intp]
 
-EXPONENTS = np.array([(d - k, k) for d in (2, 4, 6, 1, 3, 5) for k in range(d + 1)])
-"""(n_coefficients, 2): powers of the two coordinates; even degrees, then odd ones."""
-
-IS_PHASE = np.asarray(EXPONENTS.sum(axis=1) % 2 == 1)
-"""Which coefficients are of the phase."""
-
-MODULUS, PHASE = slice(0, int((~IS_PHASE).sum())), slice(int((~IS_PHASE).sum()), len(EXPONENTS))
-"""Where the coefficients of either stand."""
-
-REVERSED = np.where(IS_PHASE, -1.0, 1.0)
-"""Times the coefficients: those of the baseline taken the other way round."""
+TAPS = 4
+"""Coefficients that a value is made of, along each axis."""
 
 
-def monomials_at(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Monomials (n_coefficients, n) of two coordinates (n,)."""
-    (a, b), (i, j) = (_powers(c) for c in (first, second)), EXPONENTS.T
-    return np.asarray(a[i] * b[j])
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Response of one set-up, cubic B-splines on a square lattice of places.
+
+    Parameters
+    ----------
+    coefficients : (n_stations, n_stations, n_nodes, n_nodes) complex array
+        Of a baseline's visibility; on the diagonal, of the flux. The last axes are those of
+        the lattice; ``n_nodes`` is odd and the axis is in the middle. In single
+        precision, which is better than the response is known.
+    to_node : (2, 2) array
+        Times east and north in radians: place on the lattice in steps from its middle.
+    pointing : (2,) array
+        East and north, in radians, of where the light of the integrations had its centre on
+        the average: from there the places of sources are counted.
+    single : bool
+        Whether every baseline has one sample, so that V² is the square of a response. With
+        several, whose powers are summed, it is so to first order in the contrast.
+    """
+
+    coefficients: SmallComplexArray
+    to_node: FloatArray
+    pointing: FloatArray
+    single: bool = True
+
+    def __post_init__(self) -> None:
+        read_only(self, "to_node", "pointing")
+        coefficients = np.array(self.coefficients, dtype=np.complex64)
+        coefficients.flags.writeable = False
+        object.__setattr__(self, "coefficients", coefficients)
+
+    @property
+    def n_nodes(self) -> int:
+        """Coefficients along each axis."""
+        return int(self.coefficients.shape[-1])
 
 
-def slopes_at(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of `monomials_at` by either coordinate, (n_coefficients, n) each."""
-    (a, b), (i, j) = (_powers(c) for c in (first, second)), EXPONENTS.T
-    return (
-        np.asarray(i[:, None] * a[np.maximum(i - 1, 0)] * b[j]),
-        np.asarray(j[:, None] * a[i] * b[np.maximum(j - 1, 0)]),
-    )
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """Which coefficients the values at some places are made of.
+
+    Parameters
+    ----------
+    index : (n, 16) int array
+        Into the lattice, flattened.
+    value, by_first, by_second : (n, 16) array
+        Weights for the value and its derivatives by either coordinate, per step.
+    """
+
+    index: IntArray
+    value: FloatArray
+    by_first: FloatArray
+    by_second: FloatArray
 
 
-def _powers(coordinate: FloatArray) -> FloatArray:
-    """All powers of a coordinate (n,) up to the highest, (n_powers, n)."""
-    powers = np.ones((int(EXPONENTS.max()) + 1, len(coordinate)))
-    powers[1:] = coordinate
-    return np.asarray(np.multiply.accumulate(powers, axis=0))
+def taps(place: FloatArray, n_nodes: int) -> Taps:
+    """Find what values at places (2, n), in steps from the middle, are made of.
+
+    Beyond the lattice a response is that of its edge: it was measured no farther.
+    """
+    reach = 0.5 * (n_nodes - TAPS + 1)
+    (i, a, da), (j, b, db) = (_along_axis(p, reach) for p in place)
+    index = i[:, :, None] * n_nodes + j[:, None, :]
+    products = (np.einsum("ni,nj->nij", p, q) for p, q in ((a, b), (da, b), (a, db)))
+    return Taps(*(t.reshape(len(index), TAPS**2) for t in (index, *products)))
+
+
+def _along_axis(place: FloatArray, reach: float) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Nodes (n, 4), weights of the value, and of its derivative."""
+    inside = np.clip(place, -reach, reach)
+    first = np.minimum(np.floor(inside + reach), 2.0 * reach - 1.0)
+    t = inside + reach - first
+    s = 1.0 - t
+    value = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3])
+    slope = np.stack([-(s**2), -t * (4.0 - 3.0 * t), s * (4.0 - 3.0 * s), t**2])
+    slope = np.where(np.abs(place) <= reach, 0.5 * slope, 0.0)
+    nodes = first.astype(np.intp)[:, None] + np.arange(TAPS)
+    return nodes, np.asarray(value.T / 6.0), np.asarray(slope.T)

@@ -115,7 +115,9 @@ def _observables(quiet: Extraction, star: FineImage, numbers: FloatArray) -> Flo
         square=flux**2,
         bispectrum=sampling.bispectrum(samples),
     )
-    pointed = pointing_response(star, sampling, shift_of(view, sampling.fringes(samples)))
+    pointed = pointing_response(
+        star, sampling, shift_of(view, sampling.fringes(samples), bench.weight)
+    )
     found = average(frames, pointed, view.instrument.mask.triangle_baselines)
     return np.concatenate([found.vis2, found.closure_phase])
 

@@ -30,7 +30,8 @@ from amibayes.inference.search import search
 from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.report.common import data_json
-from amibayes.response import EXPONENTS
+from amibayes.response import Response
+from amibayes.units import MAS
 
 FIELD = (50.0, 400.0)
 TRUTH = [110.0, -75.0, 0.01]
@@ -320,15 +321,15 @@ def test_reader_is_warned_of_few_integrations_and_of_errors_far_too_large() -> N
     assert "n_sigma" in cautions(exact)
 
 
-def test_reader_is_warned_of_bright_companions_in_images() -> None:
-    """The full validation (docs/validation.md) found their intervals too narrow."""
-    for contrast, expected in ((0.01, False), (0.06, True)):
+def test_reader_is_warned_of_bright_companions_in_sums_of_powers() -> None:
+    for contrast in (0.01, 0.06):
         data = simulated(niriss(), [*TRUTH[:2], contrast], np.random.default_rng(3))
-        assert "measured in images" not in cautions(data)
         n = len(data.setups[0].stations)
-        flat = np.zeros((n, n, len(EXPONENTS)))
-        extracted = replace(data, setups=(replace(data.setups[0], response=flat),))
-        assert ("measured in images" in cautions(extracted)) == expected
+        for single in (True, False):
+            flat = Response(np.ones((n, n, 9, 9)), np.eye(2) / MAS / 100.0, np.zeros(2), single)
+            extracted = replace(data, setups=(replace(data.setups[0], response=flat),))
+            warned = contrast > 0.03 and not single
+            assert ("several samples" in cautions(extracted)) == warned
 
 
 def test_result_states_what_the_covariance_rests_on() -> None:

@@ -49,12 +49,13 @@ from amibayes.extraction.view import View, look_at
 from amibayes.observables import Observables, join
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
+from amibayes.response import Response
 from amibayes.units import FloatArray
 
 MOST_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
-SMOOTH_SHARE, SMOOTH_FLOOR = 0.5, 0.01
+SMOOTH_SHARE, SMOOTH_FLOOR = 0.98, 0.003
 """How far the weights follow the envelope only, and its least value in units of its peak."""
 
 JITTER_SLACK = 0.01
@@ -172,7 +173,7 @@ class _Part:
     bench: Bench
     frames: Frames
     physical: FloatArray
-    response: FloatArray
+    response: Response
     pointed: ComplexArray
 
 
@@ -188,7 +189,8 @@ def _measured(
     if not frames.used.any():
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
     star = star_image(bench.view)
-    response = off_axis_response(star, bench.sampling, template.orientation)
+    centre = frames.shift_px[frames.used].mean(axis=0)
+    response = off_axis_response(star, bench.sampling, template.orientation, centre)
     return _Part(
         template,
         bench,

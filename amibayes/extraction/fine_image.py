@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.extraction.view import View
 from amibayes.optics import fringe_image
-from amibayes.optics.sampling import fine_sampling, fine_size, shifted_images
+from amibayes.optics.sampling import fine_sampling, fine_size, lattice_images, shifted_images
 from amibayes.units import FloatArray
 
 COARSER = 0.75
@@ -30,6 +32,11 @@ class FineImage:
         """Images (n, n_y, n_x) of the view, the star moved by (n, 2) from its centre."""
         places = by_px + np.array(self.view.centre_px)
         return shifted_images(self.cells, self.oversample, self.view.shape, places)
+
+    def on_lattice(self, step: int, half: int) -> Iterator[NDArray[np.float32]]:
+        """Yield `lattice_images` of the view about its centre."""
+        view = self.view
+        return lattice_images(self.cells, self.oversample, view.shape, view.centre_px, step, half)
 
 
 def fine_image(view: View, coefficients: FloatArray) -> FineImage:

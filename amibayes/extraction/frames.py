@@ -154,6 +154,12 @@ class Bench:
         """Flux and samples of images whose `numbers` are known."""
         return self.sampling.completed(numbers[:, : self.sampling.linear.shape[1]], pixels)
 
+    @cached_property
+    def weight(self) -> FloatArray:
+        """(n_baselines,) of the phases that tell where an integration points: amplitudes."""
+        _, samples = self.sampled(self._known[None], self._usual[None])
+        return np.abs(self.sampling.fringes(samples)[0])
+
     @property
     def _complete(self) -> bool:
         """Whether what is measured determines the whole model."""
@@ -244,7 +250,7 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     return (
         Frames(
             flux,
-            shift_of(bench.view, bench.sampling.fringes(samples)),
+            shift_of(bench.view, bench.sampling.fringes(samples), bench.weight),
             bench.sampling.power(samples) - extra,
             flux**2 - own,
             bench.sampling.bispectrum(samples),

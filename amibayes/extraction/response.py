@@ -1,31 +1,34 @@
 """What a method makes of a companion: its response to light off the axis.
 
 A window, and the envelope of a fringe fit, let less of a companion's light through than of
-the star's: 2 % less at 150 mas and a fifth at 400 mas in F430M. The images of a point at
-many places, through the very operator that the cube went through, say how much on every
-baseline; the logarithm of that is an even polynomial in the place.
+the star's: 2 % less at 150 mas and a fifth at 400 mas in F430M. The images of a point on a
+lattice of places, through the very operator that the cube went through, say how much on every
+baseline.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import spline_filter1d
 
 from amibayes.extraction.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.sampling import Sampling
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.orientation import Orientation
-from amibayes.response import EXPONENTS, MODULUS, PHASE, monomials_at
+from amibayes.response import Response
 from amibayes.units import FloatArray
 
-RADII = 7
-ANGLES, NEAR_ANGLES = 7, 9
+NODES_PER_FRINGE = 3.0
+"""Places per fringe of the longest baseline, at least."""
+
+RUN_OUT = 6
+"""Places beyond the last, for the splines to start and end in."""
+
+NEAR_ANGLES = 9
 
 REACH_PX = (0.3, 1.5)
 """Pointing errors that the response to the star itself is measured for, at least and most."""
-
-SMALLEST = 1e-3
-"""Responses are not followed below this."""
 
 
 def star_image(view: View) -> FineImage:
@@ -34,7 +37,9 @@ def star_image(view: View) -> FineImage:
     return fine_image(view, np.repeat([1.0, 0.0], [1 + n, n]))
 
 
-def off_axis_response(star: FineImage, sampling: Sampling, orientation: Orientation) -> FloatArray:
+def off_axis_response(
+    star: FineImage, sampling: Sampling, orientation: Orientation, centre_px: FloatArray
+) -> Response:
     """Measure the response of flux and of every baseline.
 
     Parameters
@@ -44,28 +49,50 @@ def off_axis_response(star: FineImage, sampling: Sampling, orientation: Orientat
     sampling : Sampling
     orientation : Orientation
         How the image lies on the sky.
+    centre_px : (2,) array
+        Where the phases of the fringes say that the light is on the average, from the view's
+        centre.
 
     Returns
     -------
-    (1 + n_baselines, n_coefficients) array
-        Of ln(response) in `amibayes.response.monomials_at` of east and north in radians,
-        beyond the smearing over the filter's width (`relative_band`).
+    Response
+        With the smearing over the filter's width; 1 on the axis.
     """
-    view = star.view
-    radius = view.instrument.field_rad * np.linspace(0.12, FARTHEST, RADII)
-    place = _places(radius, np.pi * np.arange(ANGLES) / ANGLES)
-    flux, samples = _measured(star, sampling, place / view.instrument.pixel_scale_rad)
-    turns = view.uv_m @ place.T / view.wavelength_m
-    expected = np.exp(-2j * np.pi * turns) * np.sinc(relative_band(view) * turns)
-    ratio = np.vstack([flux, sampling.fringes(samples).T / expected])
-    east, north = orientation.to_sky(place).T
-    scale = float(np.hypot(east, north).max())
-    monomials = monomials_at(east / scale, north / scale)
-    coefficients = np.zeros((len(ratio), len(EXPONENTS)))
-    log = np.log(np.maximum(np.abs(ratio), SMALLEST))
-    for part, values in ((MODULUS, log), (PHASE, np.angle(ratio))):
-        coefficients[:, part] = np.linalg.lstsq(monomials[part].T, values.T, rcond=None)[0].T
-    return np.asarray(coefficients / scale ** EXPONENTS.sum(axis=1))
+    view, pixel = star.view, star.view.instrument.pixel_scale_rad
+    cell = pixel / star.oversample
+    fringe = view.wavelength_m / float(np.hypot(*view.uv_m.T).max())
+    step = max(int(fringe / (NODES_PER_FRINGE * cell)), 1)
+    half = int(FARTHEST * view.instrument.field_rad / (step * cell))
+    axis = step * cell * np.arange(-half, half + 1)
+    rows = [sampling.apply(r.reshape(len(r), -1)) for r in star.on_lattice(step, half)]
+    flux, samples = (np.concatenate(each) for each in zip(*rows, strict=True))
+    x, y = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
+    turns = view.uv_m @ np.stack([x, y]) / view.wavelength_m
+    ratio = np.vstack([flux, sampling.fringes(samples).T * np.exp(2j * np.pi * turns)])
+    ratio /= ratio[:, [len(x) // 2]]
+    spline = _interpolating(ratio.reshape(-1, len(axis), len(axis)))
+    n = view.instrument.mask.n_holes
+    between = np.empty((n, n, *spline.shape[1:]), dtype=np.complex64)
+    between[np.arange(n), np.arange(n)] = spline[0]
+    a, b = view.instrument.mask.pairs.T
+    between[a, b], between[b, a] = spline[1:], spline[1:].conj()
+    pointing = orientation.to_sky(pixel * centre_px)
+    single = sampling.n_samples == view.instrument.mask.n_baselines
+    return Response(between, orientation.matrix.T / (step * cell), pointing, single)
+
+
+def _interpolating(values: ComplexArray) -> ComplexArray:
+    """Coefficients (n, m + 2, m + 2) of the cubic splines through values (n, m, m).
+
+    Bent at the ends by nothing. A pixel grid is not quite symmetric about the star; what
+    is kept of a response is the part of it that is.
+    """
+    side = [(RUN_OUT, RUN_OUT)] * 2
+    padded = np.pad(values, [(0, 0), *side], mode="reflect", reflect_type="odd")
+    for axis in (1, 2):
+        padded = spline_filter1d(padded, order=3, axis=axis, output=complex, mode="mirror")
+    kept = padded[:, RUN_OUT - 1 : 1 - RUN_OUT, RUN_OUT - 1 : 1 - RUN_OUT]
+    return np.asarray(0.5 * (kept + kept[:, ::-1, ::-1].conj()))
 
 
 def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:
@@ -77,7 +104,8 @@ def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray)
     """
     reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
     angle = 2.0 * np.pi * np.arange(NEAR_ANGLES) / NEAR_ANGLES
-    place = _places(reach * np.array([0.35, 0.75, 1.4]), angle)
+    radius, angle = np.meshgrid(reach * np.array([0.35, 0.75, 1.4]), angle)
+    place = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2).reshape(-1, 2)
     flux, samples = _measured(star, sampling, place)
     turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)
     seen = sampling.fringes(samples) * turn / flux[:, None]
@@ -102,9 +130,3 @@ def _monomials(place: FloatArray) -> FloatArray:
 def relative_band(view: View) -> float:
     """Δλ/λ of the box that a model is smeared with."""
     return view.instrument.bandpass.effective_width_m / view.wavelength_m
-
-
-def _places(radius: FloatArray, angle: FloatArray) -> FloatArray:
-    """Points (n, 2) at all of these distances and angles."""
-    r, a = (grid.ravel() for grid in np.meshgrid(radius, angle))
-    return np.stack([r * np.cos(a), r * np.sin(a)], axis=1)

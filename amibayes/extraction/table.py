@@ -13,7 +13,7 @@ from amibayes.extraction.response import relative_band
 from amibayes.extraction.view import View
 from amibayes.freedom import Freedom
 from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
-from amibayes.response import REVERSED
+from amibayes.response import Response
 from amibayes.units import FloatArray
 
 
@@ -38,7 +38,7 @@ def observables_of(
     kind: CovarianceKind,
     freedom: Freedom | None,
     scatter: csr_array | None,
-    response: FloatArray,
+    response: Response,
     mjd: float,
     integration_s: float,
     notes: tuple[str, ...],
@@ -72,14 +72,10 @@ def target_of(template: Cube) -> str:
     ).strip()
 
 
-def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) -> Setup:
+def _setup(view: View, template: Cube, holes: FloatArray, response: Response) -> Setup:
     mask, header = view.instrument.mask, template.header
     n = mask.n_holes
     right, down = (header.get(key) for key in ("TARG_RA", "TARG_DEC"))
-    between = np.zeros((n, n, response.shape[1]))
-    between[np.arange(n), np.arange(n)] = response[0]
-    a, b = mask.pairs.T
-    between[a, b], between[b, a] = response[1:], response[1:] * REVERSED
     return Setup(
         f"{template.instrument.upper()}_{view.instrument.bandpass.name}",
         mask.name[:40],
@@ -93,7 +89,7 @@ def _setup(view: View, template: Cube, holes: FloatArray, response: FloatArray) 
         template.source,
         float(right) if isinstance(right, int | float) else 0.0,
         float(down) if isinstance(down, int | float) else 0.0,
-        response=between,
+        response=response,
     )
 
 

@@ -289,7 +289,7 @@ class TemplateBank:
         """
         if self._samples.off_axis is None:
             return
-        fringe, flux = self._samples.off_axis.at(east_mas, north_mas)
+        fringe, flux = self._samples.off_axis.at((east_mas, north_mas))
         turned = (cosine - 1j * sine) * fringe
         cosine[...] = turned.real - (flux - 1.0) * self._primary[:, None]
         sine[...] = -turned.imag

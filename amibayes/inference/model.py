@@ -10,13 +10,14 @@ at once: points of the (u, v) plane down the rows, parameter sets across the col
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.disc import uniform_disc
+from amibayes.inference.off_axis import Place
 from amibayes.inference.samples import Samples
 from amibayes.units import MAS, FloatArray
 
@@ -121,14 +122,18 @@ class BinaryModel:
     def visibility(self, samples: Samples, theta: FloatArray) -> ComplexArray:
         """Complex visibilities, (n_samples, n), of parameter sets theta (n, n_dim)."""
         pairs, diameter, background = self.split(theta)
-        total = 1.0 + background
-        light = disc(samples, diameter).astype(complex)
-        for block in pairs:
-            contrast = self._contrast(samples, block)
-            wave, seen = self._seen(samples, *self._place(samples, block))
-            light += contrast * wave
-            total = total + contrast * seen
+        points = [_star(disc(samples, diameter))]
+        points += [self._point(samples, block) for block in pairs]
+        light, total = _mixed(samples, background, points, _start(samples))
+        if samples.off_axis is not None:
+            centre = samples.off_axis.centre(light)
+            light, total = _mixed(samples, background, points, centre)
         return np.asarray(light / total)
+
+    def _point(self, samples: Samples, block: FloatArray) -> _Point:
+        """A companion (width, n)."""
+        place = self._place(samples, block)
+        return _Point(self._contrast(samples, block), place, self.companion(samples, *place))
 
     def _place(self, samples: Samples, block: FloatArray) -> tuple[FloatArray, FloatArray]:
         """East and north of a companion (width, n): (n,), or (n_samples, n) where it moves."""
@@ -140,16 +145,6 @@ class BinaryModel:
     def _contrast(self, samples: Samples, block: FloatArray) -> FloatArray:
         """Contrast of a companion (width, n): (n,), or (n_samples, n) with several bands."""
         return block[2] if self.n_contrasts == 1 else block[2 + samples.band]
-
-    def _seen(
-        self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
-    ) -> tuple[ComplexArray, FloatArray | float]:
-        """Visibility and flux of a point as the extraction lets them through."""
-        wave = self.companion(samples, east_mas, north_mas)
-        if samples.off_axis is None:
-            return wave, 1.0
-        fringe, flux = samples.off_axis.at(east_mas, north_mas)
-        return np.asarray(wave * fringe), flux
 
     def companion(
         self, samples: Samples, east_mas: FloatArray, north_mas: FloatArray
@@ -164,32 +159,69 @@ class BinaryModel:
     def gradient(self, samples: Samples, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
         pairs, diameter, background = self.split(theta)
-        total = 1.0 + background
         primary, by_diameter = uniform_disc(samples.frequency[:, None], diameter)
-        light, found = primary.astype(complex), []
-        for block in pairs:
-            place, contrast = self._place(samples, block), self._contrast(samples, block)
-            wave, slope = self._companion_slope(samples, *place)
-            seen = _Seen.of(samples, *place, wave, slope)
-            light = light + contrast * seen.wave
-            total = total + contrast * seen.flux
-            found.append((contrast, seen))
-        value = np.asarray(light / total, dtype=complex)
-        out: list[ComplexArray] = []
-        for contrast, seen in found:
-            moved = [w - value * f for w, f in zip(seen.wave_slopes, seen.flux_slopes, strict=True)]
-            by_place = [contrast * m / total for m in moved]
-            brighter = (seen.wave - value * seen.flux) / total
-            out += [*by_place, *self._by_band(samples, brighter)]
-            if self.moves:
-                out += [samples.years(self.reference_mjd)[:, None] * s for s in by_place]
-        if self.diameter_mas == "free":
-            out.append((by_diameter / total).astype(complex))
-        if self.background == "free":
-            out.append(np.asarray(-value / total, dtype=complex))
-        return value, np.array(out).reshape(len(out), *value.shape)
+        points = [_star(primary)]
+        points += [self._sloping_point(samples, block) for block in pairs]
+        mixed = self._mixed_slopes(samples, background, points, by_diameter, _start(samples))
+        if samples.off_axis is not None:
+            centre = samples.off_axis.centre(mixed.light)
+            moves = samples.off_axis.centre_slopes(mixed.light, mixed.light_slopes)
+            mixed = self._mixed_slopes(samples, background, points, by_diameter, centre)
+            mixed = mixed.pulled(moves)
+        value = np.asarray(mixed.light / mixed.total, dtype=complex)
+        return value, np.asarray((mixed.light_slopes - value * mixed.total_slopes) / mixed.total)
 
-    def _by_band(self, samples: Samples, by_contrast: ComplexArray) -> list[ComplexArray]:
+    def _sloping_point(self, samples: Samples, block: FloatArray) -> _Point:
+        """A companion (width, n) with the slopes of its wave by place."""
+        place = self._place(samples, block)
+        wave, slope = self._companion_slope(samples, *place)
+        by_angle = slope * (2.0 * np.pi * MAS)
+        slopes = (by_angle * samples.u[:, None], by_angle * samples.v[:, None])
+        return _Point(self._contrast(samples, block), place, wave, slopes)
+
+    def _mixed_slopes(
+        self,
+        samples: Samples,
+        background: FloatArray,
+        points: list[_Point],
+        by_diameter: FloatArray,
+        centre: Place,
+    ) -> _Mixed:
+        """Light and flux of star and companions, with slopes by every parameter."""
+        light, total = _mixed(samples, background, points, centre)
+        by_light: list[Any] = []
+        by_total: list[Any] = []
+        pulls: list[tuple[Any, Any]] = []
+        for point in points:
+            fringe, flux = _let_through(samples, point.place, centre)
+            of_place = _let_through_slopes(samples, point.place, centre)
+            shine = point.contrast * point.wave
+            pull = [
+                (shine * of_fringe, point.contrast * of_flux) for of_fringe, of_flux in of_place
+            ]
+            pulls += pull
+            if not point.wave_slopes:
+                continue
+            placed = [
+                (point.contrast * slope * fringe + p, q)
+                for slope, (p, q) in zip(point.wave_slopes, pull, strict=True)
+            ]
+            by_light += [p for p, _ in placed] + self._by_band(samples, point.wave * fringe)
+            by_total += [q for _, q in placed]
+            by_total += self._by_band(samples, np.broadcast_to(flux, light.shape))
+            if self.moves:
+                years = samples.years(self.reference_mjd)[:, None]
+                by_light += [years * p for p, _ in placed]
+                by_total += [years * q for _, q in placed]
+        if self.diameter_mas == "free":
+            by_light.append(by_diameter * _let_through(samples, points[0].place, centre)[0])
+            by_total.append(0.0)
+        if self.background == "free":
+            by_light.append(0.0)
+            by_total.append(1.0)
+        return _Mixed.of(light, total, by_light, by_total, pulls)
+
+    def _by_band(self, samples: Samples, by_contrast: NDArray[Any]) -> list[NDArray[Any]]:
         """Derivatives by each contrast from that by one common to all bands."""
         if self.n_contrasts == 1:
             return [by_contrast]
@@ -209,39 +241,112 @@ class BinaryModel:
         return value * wave, (half * slope - 1j * value) * wave
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """Visibility and flux of a point as the extraction lets them through; slopes per mas."""
+CENTRED: Place = (np.zeros(1), np.zeros(1))
+"""On the star."""
 
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """The star or a companion: contrast, place, wave, and slopes of a wave by place."""
+
+    contrast: FloatArray | float
+    place: Place
     wave: ComplexArray
-    flux: FloatArray | float
-    wave_slopes: tuple[ComplexArray, ComplexArray]
-    flux_slopes: tuple[FloatArray | float, FloatArray | float]
+    wave_slopes: tuple[ComplexArray, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Mixed:
+    """Light (n_samples, n) and flux of star and companions, and their slopes.
+
+    ``pulls`` are those by the places as the extraction sees them, from the centre of the
+    image: east and north of star and companions in turn, (k, n_samples, n).
+    """
+
+    light: ComplexArray
+    total: FloatArray
+    light_slopes: ComplexArray
+    total_slopes: FloatArray
+    light_pulls: ComplexArray
+    total_pulls: FloatArray
 
     @classmethod
     def of(
         cls,
-        samples: Samples,
-        east_mas: FloatArray,
-        north_mas: FloatArray,
-        wave: ComplexArray,
-        slope: ComplexArray,
-    ) -> _Seen:
-        by_angle = slope * (2.0 * np.pi * MAS)
-        slopes = (by_angle * samples.u[:, None], by_angle * samples.v[:, None])
-        if samples.off_axis is None:
-            return cls(wave, 1.0, slopes, (0.0, 0.0))
-        fringe, flux = samples.off_axis.at(east_mas, north_mas)
-        of_fringe, of_flux = samples.off_axis.slopes(east_mas, north_mas)
+        light: ComplexArray,
+        total: FloatArray,
+        by_light: list[Any],
+        by_total: list[Any],
+        pulls: list[tuple[Any, Any]],
+    ) -> _Mixed:
+        def stacked(rows: list[Any], kind: type) -> Any:
+            out = np.empty((len(rows), *light.shape), dtype=kind)
+            for row, values in zip(out, rows, strict=True):
+                row[...] = values
+            return out
+
         return cls(
-            wave * fringe,
-            flux,
-            (
-                fringe * (slopes[0] + wave * of_fringe[0]),
-                fringe * (slopes[1] + wave * of_fringe[1]),
-            ),
-            (flux * of_flux[0], flux * of_flux[1]),
+            light,
+            total,
+            stacked(by_light, complex),
+            stacked(by_total, float),
+            stacked([p for p, _ in pulls], complex),
+            stacked([q for _, q in pulls], float),
         )
+
+    def pulled(self, moves: FloatArray) -> _Mixed:
+        """Add what parameters do by moving the centre, (n_dim, 2, n_samples, n) mas each."""
+        by = np.tile(moves, (1, len(self.light_pulls) // 2, 1, 1))
+        return replace(
+            self,
+            light_slopes=self.light_slopes - np.einsum("qksn,ksn->qsn", by, self.light_pulls),
+            total_slopes=self.total_slopes - np.einsum("qksn,ksn->qsn", by, self.total_pulls),
+        )
+
+
+def _star(disc: FloatArray) -> _Point:
+    """The star itself."""
+    return _Point(1.0, CENTRED, disc.astype(complex))
+
+
+def _start(samples: Samples) -> Place:
+    """Where the axis is from a lone star."""
+    return CENTRED if samples.off_axis is None else samples.off_axis.start
+
+
+def _mixed(
+    samples: Samples, background: FloatArray, points: list[_Point], centre: Place
+) -> tuple[ComplexArray, FloatArray]:
+    """Light (n_samples, n) and flux of star and companions seen from a centre."""
+    light, total = np.zeros(1, dtype=complex), background
+    for point in points:
+        fringe, flux = _let_through(samples, point.place, centre)
+        light = light + point.contrast * (point.wave * fringe)
+        total = total + point.contrast * flux
+    return light, total
+
+
+def _let_through(
+    samples: Samples, place: Place, centre: Place
+) -> tuple[ComplexArray | float, FloatArray | float]:
+    """What the extraction makes of a point's visibility and flux."""
+    if samples.off_axis is None:
+        return 1.0, 1.0
+    return samples.off_axis.at(_seen_from(centre, place))
+
+
+def _let_through_slopes(
+    samples: Samples, place: Place, centre: Place
+) -> list[tuple[ComplexArray | float, FloatArray | float]]:
+    """Derivatives of both by east and by north, per mas."""
+    if samples.off_axis is None:
+        return [(0.0, 0.0)] * 2
+    return list(zip(*samples.off_axis.slopes(_seen_from(centre, place)), strict=True))
+
+
+def _seen_from(centre: Place, place: Place) -> Place:
+    """Places of a companion from the centre of the image instead of from the star."""
+    return place[0] - centre[0], place[1] - centre[1]
 
 
 def _angle(samples: Samples, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:

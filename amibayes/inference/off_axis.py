@@ -1,95 +1,202 @@
-"""What the extraction let through of a companion's light, where the data say it."""
+"""What the extraction let through of a companion's light, where the data say it.
+
+An image has its centre where the phases of its fringes say that the light is. A companion
+pulls that place towards itself, and is itself seen from there: nearer than it is to the star.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from amibayes.observables import IntArray, Observables
-from amibayes.response import (
-    EXPONENTS,
-    MODULUS,
-    PHASE,
-    REVERSED,
-    ComplexArray,
-    monomials_at,
-    slopes_at,
-)
-from amibayes.units import MAS, FloatArray
+from amibayes.response import ComplexArray, Taps, taps
+from amibayes.units import MAS, FloatArray, read_only
+
+Place = tuple[FloatArray, FloatArray]
+"""East and north, mas: (n,), or (n_samples, n) where points of the (u, v) plane differ."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Points of one exposure, which share a response, a date and a centre.
+
+    Parameters
+    ----------
+    rows : (m,) int array
+        Which of the samples.
+    uv : (m, 2) array
+        Their spatial frequencies, cycles per mas.
+    coefficients : (n_nodes², 2·m + 1) array
+        Splines of the real parts, the imaginary parts, and the flux, in units of what a
+        lone star is seen with, whose pointing has been allowed for.
+    n_nodes : int
+    to_node : (2, 2) array
+        Times east and north in mas: steps of the lattice.
+    pointing : (2,) array
+        East and north of the centre of light from the axis, mas.
+    """
+
+    rows: IntArray
+    uv: FloatArray
+    coefficients: FloatArray
+    n_nodes: int
+    to_node: FloatArray
+    pointing: FloatArray
+
+    def __post_init__(self) -> None:
+        read_only(self, "uv", "coefficients", "to_node", "pointing")
+
+    def taps(self, place: Place) -> Taps:
+        """What the values at places are made of."""
+        here = [c[self.rows[0]] if c.ndim == 2 else c for c in place]
+        return taps(self.to_node @ np.stack(here), self.n_nodes)
+
+    def sum(self, index: IntArray, weight: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Fringes (m, n) and flux (n,) of taps."""
+        n, k = index.shape
+        start = np.arange(0, n * k + 1, k)
+        operator = csr_array((weight.ravel(), index.ravel(), start), (n, len(self.coefficients)))
+        values = (operator @ self.coefficients).T
+        m = len(self.rows)
+        return np.asarray(values[:m] + 1j * values[m : 2 * m]), np.asarray(values[2 * m])
 
 
 @dataclass(frozen=True, eq=False)
 class OffAxis:
-    """Response at the points of a data set.
+    """Response at the points of a data set; 1 at those that come from no extraction.
 
     Parameters
     ----------
-    fringe, flux : (n_samples, n_coefficients) array
-        Logarithm of the response of the visibility and of the flux that it is divided by,
-        as `amibayes.response` has it, of east and north in radians.
+    n_samples : int
+    exposures : tuple of Exposure
     """
 
-    fringe: FloatArray
-    flux: FloatArray
+    n_samples: int
+    exposures: tuple[Exposure, ...]
 
-    def at(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Response of visibility and flux, (n_samples, n) each, at places (n,).
+    @cached_property
+    def start(self) -> Place:
+        """Where the axis is from a lone star, (n_samples, 1) each: where it was pointed at."""
+        found = np.zeros((2, self.n_samples, 1))
+        for exposure in self.exposures:
+            found[:, exposure.rows] = -exposure.pointing[:, None, None]
+        return found[0], found[1]
 
-        Moving places are (n_samples, n), here and below.
-        """
-        terms = monomials_at(*_radians(east_mas, north_mas))
-        modulus, phase = (_sum(self.fringe, terms, p, east_mas) for p in (MODULUS, PHASE))
-        flux = np.exp(_sum(self.flux, terms, MODULUS, east_mas))
-        fringe = np.empty(phase.shape, dtype=complex)
-        np.cos(phase, out=fringe.real)
-        np.sin(phase, out=fringe.imag)
-        fringe *= np.exp(modulus)
+    def at(self, place: Place) -> tuple[ComplexArray, FloatArray]:
+        """Response of visibility and flux, (n_samples, n) each."""
+        shape = (self.n_samples, place[0].shape[-1])
+        fringe, flux = np.ones(shape, dtype=complex), np.ones(shape)
+        for exposure in self.exposures:
+            t = exposure.taps(place)
+            fringe[exposure.rows], flux[exposure.rows] = exposure.sum(t.index, t.value)
         return fringe, flux
 
     def slopes(
-        self, east_mas: FloatArray, north_mas: FloatArray
+        self, place: Place
     ) -> tuple[tuple[ComplexArray, ComplexArray], tuple[FloatArray, FloatArray]]:
-        """Derivatives of both logarithms by east and north, per mas, (n_samples, n) each."""
-        slopes = slopes_at(*_radians(east_mas, north_mas))
-        modulus = [_sum(self.fringe, s, MODULUS, east_mas) * MAS for s in slopes]
-        phase = [_sum(self.fringe, s, PHASE, east_mas) * MAS for s in slopes]
-        flux = [_sum(self.flux, s, MODULUS, east_mas) * MAS for s in slopes]
-        east, north = (m + 1j * p for m, p in zip(modulus, phase, strict=True))
-        return (east, north), (flux[0], flux[1])
+        """Derivatives of both by east and north, per mas, (n_samples, n) each."""
+        shape = (2, self.n_samples, place[0].shape[-1])
+        fringe, flux = np.zeros(shape, dtype=complex), np.zeros(shape)
+        for exposure in self.exposures:
+            t = exposure.taps(place)
+            for by_node, weight in zip(exposure.to_node, (t.by_first, t.by_second), strict=True):
+                of_fringe, of_flux = exposure.sum(t.index, weight)
+                fringe[:, exposure.rows] += by_node[:, None, None] * of_fringe
+                flux[:, exposure.rows] += by_node[:, None, None] * of_flux
+        return (fringe[0], fringe[1]), (flux[0], flux[1])
+
+    def centre(self, visibility: ComplexArray) -> Place:
+        """Where the axis is, from the star, in an image of these visibilities (n_samples, n).
+
+        East and north, mas, (n_samples, n) each. The centre of the light follows from least
+        squares on the phases, weighted with the amplitudes, as in
+        `amibayes.extraction.image_plane.shift_of`.
+        """
+        found = np.zeros((2, *visibility.shape))
+        for exposure, weight, phase, inverse in self._phases(visibility):
+            found[:, exposure.rows] = _solved(exposure, inverse, weight * phase)[:, None]
+        return self.start[0] + found[0], self.start[1] + found[1]
+
+    def centre_slopes(self, visibility: ComplexArray, slopes: ComplexArray) -> FloatArray:
+        """Derivatives (k, 2, n_samples, n) of `centre`, of those of the visibilities.
+
+        ``slopes`` are (k, n_samples, n).
+        """
+        found = np.zeros((len(slopes), 2, *visibility.shape))
+        for exposure, weight, phase, inverse in self._phases(visibility):
+            turned = _solved(exposure, inverse, weight * phase)
+            left = phase + 2.0 * np.pi * exposure.uv @ turned
+            for k, slope in enumerate(slopes):
+                log = slope[exposure.rows] / visibility[exposure.rows]
+                change = weight * (log.imag + 2.0 * log.real * left)
+                found[k][:, exposure.rows] = _solved(exposure, inverse, change)[:, None]
+        return found
+
+    def _phases(
+        self, visibility: ComplexArray
+    ) -> Iterator[tuple[Exposure, FloatArray, FloatArray, FloatArray]]:
+        """Yield exposures, weights and phases (m, n), and inverse normal matrices (n, 2, 2)."""
+        for exposure in self.exposures:
+            seen = visibility[exposure.rows]
+            weight = seen.real**2 + seen.imag**2
+            outer = exposure.uv[:, :, None] * exposure.uv[:, None, :]
+            normal = np.tensordot(weight.T, outer, axes=1)
+            inverse = np.asarray(np.linalg.pinv(normal, hermitian=True), dtype=float)
+            yield exposure, weight, np.angle(seen), inverse
 
 
-def _radians(east_mas: FloatArray, north_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return (east_mas * MAS).ravel(), (north_mas * MAS).ravel()
+def _solved(exposure: Exposure, inverse: FloatArray, phase: FloatArray) -> FloatArray:
+    """Displacement (2, n) that weighted phases (m, n) tell of, mas."""
+    turns = exposure.uv.T @ phase / (-2.0 * np.pi)
+    return np.asarray(np.einsum("nij,jn->in", inverse, turns))
 
 
-def _sum(
-    coefficients: FloatArray, monomials: FloatArray, part: slice, like: FloatArray
-) -> FloatArray:
-    """Polynomials of each sample, (n_samples, n), at places shaped like (n,) or (n_samples, n)."""
-    if like.ndim == 1:
-        return np.asarray(coefficients[:, part] @ monomials[part])
-    at_own = monomials[part].reshape(-1, *like.shape)
-    return np.asarray(np.einsum("sk,ksn->sn", coefficients[:, part], at_own))
-
-
-def off_axis_of(data: Observables, first: IntArray, sign: FloatArray) -> OffAxis | None:
+def off_axis_of(
+    data: Observables, first: IntArray, sign: FloatArray, uv: FloatArray
+) -> OffAxis | None:
     """Response at points ``first`` of a list of all V² and then all legs of the triangles.
 
-    ``sign`` (n,) is −1 where the point is the opposite of the baseline's own.
+    ``sign`` (n,) is −1 where the point is the opposite of the baseline's own; ``uv`` (n, 2)
+    are the points, cycles per radian.
     """
     if all(s.response is None for s in data.setups):
         return None
     v2, cp = data.vis2, data.closure_phase
     # The third leg closes the triangle: from its last station back to its first.
     legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)])[first]
-    setup = np.concatenate([v2.setup, np.repeat(cp.setup, 3)])[first]
-    fringe = np.zeros((len(first), len(EXPONENTS)))
-    flux = np.zeros_like(fringe)
-    for number, described in enumerate(data.setups):
-        if described.response is not None:
-            here = setup == number
-            a, b = legs[here].T
-            fringe[here], flux[here] = described.response[a, b], described.response[a, a]
-    fringe = np.where(sign[:, None] < 0.0, fringe * REVERSED, fringe)
-    return OffAxis(fringe, flux)
+    label = np.concatenate(
+        [_exposure(v2.setup, v2.mjd), np.repeat(_exposure(cp.setup, cp.mjd), 3, axis=0)]
+    )
+    exposures = []
+    for setup, mjd in np.unique(label[first], axis=0):
+        response = data.setups[int(setup)].response
+        if response is None:
+            continue
+        rows = np.flatnonzero((label[first] == (setup, mjd)).all(axis=1))
+        a, b = legs[rows].T
+        fringe = response.coefficients[a, b].astype(complex)
+        fringe = np.where(sign[rows, None, None] < 0.0, fringe.conj(), fringe)
+        seen = taps((response.to_node @ response.pointing)[:, None], response.n_nodes)
+        whole = np.stack([*fringe, response.coefficients[a[0], a[0]]]).reshape(len(rows) + 1, -1)
+        whole /= whole[:, seen.index[0]] @ seen.value[0][:, None]
+        exposures.append(
+            Exposure(
+                rows,
+                uv[rows] * MAS,
+                np.vstack([whole[:-1].real, whole[:-1].imag, whole[-1:].real]).T,
+                response.n_nodes,
+                response.to_node * MAS,
+                response.pointing / MAS,
+            )
+        )
+    return OffAxis(len(first), tuple(exposures))
+
+
+def _exposure(setup: IntArray, mjd: FloatArray) -> FloatArray:
+    """Labels (n, 2) of exposures."""
+    return np.column_stack([setup, mjd])

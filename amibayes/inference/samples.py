@@ -32,7 +32,7 @@ class Samples:
     u, v : (n,) float array
         Spatial frequencies, cycles per radian.
     relative_band : (n,) float array
-        Δλ/λ of the channel.
+        Δλ/λ of the channel; 0 where ``off_axis`` has the smearing.
     squares : (n_vis2, n) sparse array
         V² = squares · |V|²; one entry 1 in each row.
     legs : (n_closure, n) sparse array
@@ -109,18 +109,22 @@ def samples_of(
     mjd = np.concatenate([v2.mjd, np.repeat(cp.mjd, 3)])
     bands = None if band_of_setup is None else band_of_setup[setup]
     labels = ([] if bands is None else [bands]) + ([mjd] if dated else [])
+    extracted = np.array([s.response is not None for s in data.setups])[setup]
+    if extracted.any():
+        labels += [setup, mjd]  # each exposure has a response, and a centre, of its own
     first, index, sign = _distinct(u, v, band / wavelength, labels)
     n, n2, n3 = len(first), len(v2), len(cp)
     rows = np.repeat(np.arange(n3), 3)
     legs = csr_array((sign[n2:], (rows, index[n2:])), shape=(n3, n))
     orientation = sign[first]
+    uv = np.stack([u[first], v[first]], axis=1) * orientation[:, None]
     return Samples(
-        u[first] * orientation,
-        v[first] * orientation,
-        (band / wavelength)[first],
+        uv[:, 0],
+        uv[:, 1],
+        np.where(extracted[first], 0.0, (band / wavelength)[first]),
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
-        off_axis_of(data, first, orientation),
+        off_axis_of(data, first, orientation, uv),
         None if bands is None else bands[first],
         mjd[first] if dated else None,
     )

@@ -69,8 +69,9 @@ def look_outside(result: SearchResult) -> float | None:
         Its separation in mas; None where nothing outside is better.
     """
     likelihood, grid = result.likelihood, result.grid
-    smallest_band = float(likelihood.samples.relative_band.min())
-    reach = resolution_mas(likelihood) / max(smallest_band, 1e-6)
+    data = likelihood.observables
+    bands = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase)]
+    reach = resolution_mas(likelihood) / max(float(np.concatenate(bands).min()), 1e-6)
     step = 2.0 * grid.step_mas
     area = MOST_LOOKED_AT / np.pi
     farthest = min(reach, float(np.hypot(grid.outer_mas, step * np.sqrt(area))))

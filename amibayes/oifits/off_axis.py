@@ -14,9 +14,13 @@ from astropy.io import fits
 from amibayes.observables import Setup
 from amibayes.oifits.layout import Layout
 from amibayes.oifits.tables import OWN_KEY, OIFits
-from amibayes.response import EXPONENTS, REVERSED
+from amibayes.response import TAPS, Response
+from amibayes.units import FloatArray
 
 RESPONSE = "AMIBAYES_RESPONSE"
+
+LATTICE = ("NODE_XE", "NODE_XN", "NODE_YE", "NODE_YN", "POINT_E", "POINT_N")
+"""Keywords of the matrix from east and north to the lattice, and of the mean pointing."""
 
 
 def response_tables(layout: Layout, setups: tuple[Setup, ...]) -> list[Any]:
@@ -25,33 +29,40 @@ def response_tables(layout: Layout, setups: tuple[Setup, ...]) -> list[Any]:
     for number, setup in enumerate(setups):
         if setup.response is None:
             continue
-        n = len(setup.stations)
+        n, size = len(setup.stations), setup.response.n_nodes**2
         first, second = np.triu_indices(n)
         index = np.asarray(layout.station_index(number))
         pairs = np.stack([index[first], index[second]], axis=1)
-        width = setup.response.shape[2]
+        half = setup.response.coefficients[first, second].reshape(len(first), size)
+        half = half[:, : size // 2 + 1]
         table = fits.BinTableHDU.from_columns(
             [
                 fits.Column("STA_INDEX", "2I", array=pairs),
-                fits.Column("COEFF", f"{width}D", array=setup.response[first, second]),
+                fits.Column("COEFF", f"{half.shape[1]}C", array=half),
             ],
             name=RESPONSE,
         )
         table.header["INSNAME"] = layout.insnames[layout.channel[number]]
         table.header["ARRNAME"] = layout.arrnames[layout.array[number]]
         table.header[f"HIERARCH {OWN_KEY} SETUP"] = number + 1
-        _explain(table)
+        numbers = (*setup.response.to_node.ravel(), *setup.response.pointing)
+        for key, value in zip(LATTICE, numbers, strict=True):
+            table.header[f"HIERARCH {OWN_KEY} {key}"] = float(value)
+        table.header[f"HIERARCH {OWN_KEY} SINGLE"] = setup.response.single
+        _explain(table, setup.response.n_nodes)
         tables.append(table)
     return tables
 
 
-def _explain(table: Any) -> None:
-    powers = " ".join(f"{i},{j}" for i, j in EXPONENTS)
+def _explain(table: Any, n_nodes: int) -> None:
     for line in (
         "Response to light off the axis: visibility of a pair of stations, and flux",
-        "(a station with itself). ln(response) = sum of COEFF east^i north^j, radians,",
-        "times the imaginary unit where i + j is odd.",
-        f"i,j = {powers}.",
+        "(a station with itself). COEFF are coefficients of cubic B-splines on a square",
+        f"lattice of {n_nodes} x {n_nodes} places (x, y), y running faster, up to the middle",
+        "one, which is the axis; opposite ones are conjugate. x and y are steps:",
+        "x = XE east + XN north, y = YE east + YN north, from east and north in radians.",
+        "The light of the star and its companions had its centre at POINT_E, POINT_N.",
+        "SINGLE is F where V2 sums the powers of several samples.",
     ):
         table.header["COMMENT"] = line
 
@@ -62,14 +73,30 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
     found = [t for t in found if own and t.header.get(f"{OWN_KEY} SETUP", 0) == own]
     if not found or not {"STA_INDEX", "COEFF"} <= set(found[0].columns):
         return setup
-    index, coefficients = found[0].columns["STA_INDEX"], found[0].columns["COEFF"]
-    if coefficients.shape[1:] != (len(EXPONENTS),) or not np.isfinite(coefficients).all():
+    index, half = found[0].columns["STA_INDEX"], found[0].columns["COEFF"]
+    lattice = _lattice(found[0].header)
+    n_nodes = round(np.sqrt(2 * half.shape[-1] - 1)) if half.ndim == 2 else 0
+    if lattice is None or n_nodes <= TAPS or n_nodes**2 != 2 * half.shape[1] - 1:
         return setup
+    if not np.isfinite(half).all() or not np.iscomplexobj(half):
+        return setup
+    single = bool(found[0].header.get(f"{OWN_KEY} SINGLE", True))
     place = {int(k): i for i, k in enumerate(setup.station_index)}
-    response = np.zeros((len(setup.stations), len(setup.stations), len(EXPONENTS)))
-    for (a, b), row in zip(index, coefficients, strict=True):
+    n = len(setup.stations)
+    response = np.zeros((n, n, n_nodes, n_nodes), dtype=np.complex64)
+    whole = np.concatenate([half, half[:, -2::-1].conj()], axis=1).reshape(-1, n_nodes, n_nodes)
+    for (a, b), row in zip(index, whole, strict=True):
         if int(a) in place and int(b) in place:
             i, j = place[int(a)], place[int(b)]
-            response[j, i] = row * REVERSED
+            response[j, i] = row.conj()
             response[i, j] = row
-    return replace(setup, response=response)
+    return replace(setup, response=Response(response, *lattice, single))
+
+
+def _lattice(header: Any) -> tuple[FloatArray, FloatArray] | None:
+    """Matrix from east and north to the lattice, and pointing, where the header has them."""
+    values = [header.get(f"{OWN_KEY} {key}") for key in LATTICE]
+    numbers = [float(v) for v in values if isinstance(v, int | float)]
+    if len(numbers) < len(LATTICE) or not np.isfinite(numbers).all():
+        return None
+    return np.array(numbers[:4]).reshape(2, 2), np.array(numbers[4:])

@@ -10,6 +10,7 @@ another such matrix.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -94,6 +95,38 @@ def shifted_images(
         wide = sliding_window_view(rows, across.shape[1], axis=1)
         image[:] = wide[:, left[k] :: oversample][:, : shape[1]] @ across[k]
     return out
+
+
+def lattice_images(
+    fine: FloatArray,
+    oversample: int,
+    shape: tuple[int, int],
+    centre_px: tuple[float, float],
+    step: int,
+    half: int,
+) -> Iterator[NDArray[np.float32]]:
+    """Yield images (2·half + 1, n_y, n_x) of fine cells displaced to a square lattice of places.
+
+    The places are ``centre_px`` (x, y) and up to ``half`` times ``step`` cells to either side:
+    x from the first of what is yielded to the last, y within it. Displacements by whole
+    cells share one interpolation, so that an image is a choice of pixels, in single precision.
+    """
+    starts, kernels = zip(
+        *(
+            _kernels(n, size, oversample, np.array([c]))
+            for n, size, c in zip(shape, fine.shape, centre_px[::-1], strict=True)
+        ),
+        strict=True,
+    )
+    pixels = fine
+    for axis, kernel in enumerate(kernels):
+        pixels = sliding_window_view(pixels, kernel.shape[1], axis=axis) @ kernel[0]
+    small = np.ascontiguousarray(pixels, dtype=np.float32)
+    (top,), (left,) = starts
+    windows = sliding_window_view(small, [(n - 1) * oversample + 1 for n in shape])
+    to_side = step * np.arange(half, -half - 1, -1)
+    for x in left + to_side:
+        yield windows[top + to_side, x, ::oversample, ::oversample]
 
 
 def _kernels(
