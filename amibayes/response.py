@@ -62,44 +62,33 @@ class Response:
         return int(self.coefficients.shape[-1])
 
 
-@dataclass(frozen=True, eq=False)
-class Taps:
-    """Which coefficients the values at some places are made of.
-
-    Parameters
-    ----------
-    index : (n, 16) int array
-        Into the lattice, flattened.
-    value, by_first, by_second : (n, 16) array
-        Weights for the value and its derivatives by either coordinate, per step.
-    """
-
-    index: IntArray
-    value: FloatArray
-    by_first: FloatArray
-    by_second: FloatArray
-
-
-def taps(place: FloatArray, n_nodes: int) -> Taps:
+def taps(place: FloatArray, n_nodes: int) -> tuple[IntArray, FloatArray]:
     """Find what values at places (2, n), in steps from the middle, are made of.
 
     Beyond the lattice a response is that of its edge: it was measured no farther.
+
+    Returns
+    -------
+    index : (n, 16) int array
+        Into the coefficients, flattened.
+    weight : (n, 3, 16) array
+        For the value, and its derivatives by the two coordinates, per step.
     """
     reach = 0.5 * (n_nodes - TAPS + 1)
-    (i, a, da), (j, b, db) = (_along_axis(p, reach) for p in place)
-    index = i[:, :, None] * n_nodes + j[:, None, :]
-    products = (np.einsum("ni,nj->nij", p, q) for p, q in ((a, b), (da, b), (a, db)))
-    return Taps(*(t.reshape(len(index), TAPS**2) for t in (index, *products)))
-
-
-def _along_axis(place: FloatArray, reach: float) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Nodes (n, 4), weights of the value, and of its derivative."""
     inside = np.clip(place, -reach, reach)
     first = np.minimum(np.floor(inside + reach), 2.0 * reach - 1.0)
     t = inside + reach - first
     s = 1.0 - t
-    value = np.stack([s**3, 4.0 - 6.0 * t**2 + 3.0 * t**3, 4.0 - 6.0 * s**2 + 3.0 * s**3, t**3])
-    slope = np.stack([-(s**2), -t * (4.0 - 3.0 * t), s * (4.0 - 3.0 * s), t**2])
-    slope = np.where(np.abs(place) <= reach, 0.5 * slope, 0.0)
-    nodes = first.astype(np.intp)[:, None] + np.arange(TAPS)
-    return nodes, np.asarray(value.T / 6.0), np.asarray(slope.T)
+    weight = np.empty((2, TAPS, *place.shape))
+    value, slope = weight
+    value[0], value[3] = s**3 / 6.0, t**3 / 6.0
+    value[1] = 2.0 / 3.0 - t * t * (1.0 - 0.5 * t)
+    value[2] = 2.0 / 3.0 - s * s * (1.0 - 0.5 * s)
+    slope[0], slope[3] = -0.5 * s * s, 0.5 * t * t
+    slope[1], slope[2] = -t * (2.0 - 1.5 * t), s * (2.0 - 1.5 * s)
+    slope *= inside == place
+    (a, b), (da, db) = value.transpose(1, 2, 0), slope.transpose(1, 2, 0)
+    both = np.stack([a, da, a], axis=1)[..., None] * np.stack([b, b, db], axis=1)[:, :, None, :]
+    along = first.astype(np.intp)[..., None] + np.arange(TAPS)
+    index = along[0][:, :, None] * n_nodes + along[1][:, None, :]
+    return index.reshape(-1, TAPS**2), both.reshape(-1, 3, TAPS**2)

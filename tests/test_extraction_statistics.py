@@ -143,7 +143,7 @@ def test_calibrated_pulls(photons: float, method: str, flat: str) -> None:
 )
 def test_scatter_is_near_the_cramer_rao_bound(photons: float) -> None:
     cube = pair(photons, 60, 5)[0]
-    for method, worst in (("fringes", 1.1), ("matched", 1.4)):
+    for method, worst in (("fringes", 1.15), ("matched", 1.4)):
         found = extract_all(cube, ExtractOptions(method=method))[0]  # type: ignore[arg-type]
         ratio = found.average.deviation.std(axis=0, ddof=1) / bound(found, cube)
         for part in (VIS2, CLOSURE):

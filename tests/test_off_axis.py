@@ -42,18 +42,18 @@ def test_splines_are_those_of_scipy(rng: np.random.Generator) -> None:
     knots = np.arange(-7.0, 8.0)
     known = interpolate.NdBSpline((knots, knots), coefficients, 3)
     place = rng.uniform(-4.0, 4.0, (2, 200))
-    found = taps(place, 11)
-    for weight, nu in ((found.value, (0, 0)), (found.by_first, (1, 0)), (found.by_second, (0, 1))):
-        values = (coefficients.ravel()[found.index] * weight).sum(axis=1)
+    index, weight = taps(place, 11)
+    for k, nu in enumerate([(0, 0), (1, 0), (0, 1)]):
+        values = (coefficients.ravel()[index] * weight[:, k]).sum(axis=1)
         np.testing.assert_allclose(values, known(place.T, nu=nu), atol=1e-12)
 
 
-def test_the_edge_goes_on_for_ever(rng: np.random.Generator) -> None:
-    outside, edge = taps(np.array([[4.0, 30.0], [1.0, 1.0]]), 11), taps(np.ones((2, 1)), 11)
-    np.testing.assert_array_equal(outside.index[0], outside.index[1])
-    np.testing.assert_allclose(outside.value[0], outside.value[1])
-    assert not outside.by_first[1].any()
-    assert edge.value.sum() == pytest.approx(1.0)
+def test_the_edge_goes_on_for_ever() -> None:
+    index, weight = taps(np.array([[4.0, 30.0], [1.0, 1.0]]), 11)
+    np.testing.assert_array_equal(index[0], index[1])
+    np.testing.assert_allclose(weight[0, [0, 2]], weight[1, [0, 2]])
+    assert not weight[1, 1].any()
+    assert weight[0, 0].sum() == pytest.approx(1.0)
 
 
 def test_lattice_images_are_shifted_images(rng: np.random.Generator) -> None:

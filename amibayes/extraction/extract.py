@@ -244,8 +244,9 @@ def _fit_variance(
     The image's own fringes have no part in it. Light off the axis is let through in a way
     that hangs on the weights; were those of a binary to follow its fringes, and those of its
     calibrator another pattern, a contrast of 0.4 would come out half a percent too small.
-    Half of the variance is that of the envelope, since weights that follow every fringe let
-    a companion's light through in a way that no smooth function of its place describes.
+    All but a fiftieth of it is the envelope's: weights that follow the fringes have up to a
+    tenth less noise, but let a companion's light through as the fringes of other baselines
+    too, by some percent that hang on where in a pixel the star stands.
     """
     envelope, star = (a.reshape(image.shape) for a in (basis.matrix[:, 0], basis.image()))
     light = float(image[good].sum() / max(float(envelope[good].sum()), 1e-300))

@@ -188,33 +188,33 @@ class BinaryModel:
         centre: Place,
     ) -> _Mixed:
         """Light and flux of star and companions, with slopes by every parameter."""
-        light, total = _mixed(samples, background, points, centre)
+        light: Any = 0.0
+        total: Any = background
         by_light: list[Any] = []
         by_total: list[Any] = []
         pulls: list[tuple[Any, Any]] = []
         for point in points:
-            fringe, flux = _let_through(samples, point.place, centre)
-            of_place = _let_through_slopes(samples, point.place, centre)
+            fringe, flux = _let_through_slopes(samples, point.place, centre)
             shine = point.contrast * point.wave
-            pull = [
-                (shine * of_fringe, point.contrast * of_flux) for of_fringe, of_flux in of_place
-            ]
+            light = light + shine * fringe[0]
+            total = total + point.contrast * flux[0]
+            pull = [(shine * fringe[k], point.contrast * flux[k]) for k in (1, 2)]
             pulls += pull
             if not point.wave_slopes:
                 continue
             placed = [
-                (point.contrast * slope * fringe + p, q)
+                (point.contrast * slope * fringe[0] + p, q)
                 for slope, (p, q) in zip(point.wave_slopes, pull, strict=True)
             ]
-            by_light += [p for p, _ in placed] + self._by_band(samples, point.wave * fringe)
+            by_light += [p for p, _ in placed] + self._by_band(samples, point.wave * fringe[0])
             by_total += [q for _, q in placed]
-            by_total += self._by_band(samples, np.broadcast_to(flux, light.shape))
+            by_total += self._by_band(samples, np.broadcast_to(flux[0], point.wave.shape))
             if self.moves:
                 years = samples.years(self.reference_mjd)[:, None]
                 by_light += [years * p for p, _ in placed]
                 by_total += [years * q for _, q in placed]
         if self.diameter_mas == "free":
-            by_light.append(by_diameter * _let_through(samples, points[0].place, centre)[0])
+            by_light.append(by_diameter * _let_through(samples, CENTRED, centre)[0])
             by_total.append(0.0)
         if self.background == "free":
             by_light.append(0.0)
@@ -326,26 +326,22 @@ def _mixed(
     return light, total
 
 
-def _let_through(
-    samples: Samples, place: Place, centre: Place
-) -> tuple[ComplexArray | float, FloatArray | float]:
+def _let_through(samples: Samples, place: Place, centre: Place) -> tuple[Any, Any]:
     """What the extraction makes of a point's visibility and flux."""
     if samples.off_axis is None:
         return 1.0, 1.0
     return samples.off_axis.at(_seen_from(centre, place))
 
 
-def _let_through_slopes(
-    samples: Samples, place: Place, centre: Place
-) -> list[tuple[ComplexArray | float, FloatArray | float]]:
-    """Derivatives of both by east and by north, per mas."""
+def _let_through_slopes(samples: Samples, place: Place, centre: Place) -> tuple[Any, Any]:
+    """Both with their derivatives by east and by north, per mas."""
     if samples.off_axis is None:
-        return [(0.0, 0.0)] * 2
-    return list(zip(*samples.off_axis.slopes(_seen_from(centre, place)), strict=True))
+        return (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)
+    return samples.off_axis.with_slopes(_seen_from(centre, place))
 
 
 def _seen_from(centre: Place, place: Place) -> Place:
-    """Places of a companion from the centre of the image instead of from the star."""
+    """Places of a companion from the axis of the image instead of from the star."""
     return place[0] - centre[0], place[1] - centre[1]
 
 

@@ -11,14 +11,18 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from amibayes.observables import IntArray, Observables
-from amibayes.response import ComplexArray, Taps, taps
+from amibayes.response import ComplexArray, taps
 from amibayes.units import MAS, FloatArray, read_only
 
 Place = tuple[FloatArray, FloatArray]
 """East and north, mas: (n,), or (n_samples, n) where points of the (u, v) plane differ."""
+
+CHUNK = 512
+"""Places that are worked on together."""
+
+NEGLIGIBLE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +55,19 @@ class Exposure:
     def __post_init__(self) -> None:
         read_only(self, "uv", "coefficients", "to_node", "pointing")
 
-    def taps(self, place: Place) -> Taps:
-        """What the values at places are made of."""
-        here = [c[self.rows[0]] if c.ndim == 2 else c for c in place]
-        return taps(self.to_node @ np.stack(here), self.n_nodes)
+    def seen(self, place: Place, *, slopes: bool = False) -> FloatArray:
+        """Real parts, imaginary parts and flux at places, (1, 2·m + 1, n).
 
-    def sum(self, index: IntArray, weight: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Fringes (m, n) and flux (n,) of taps."""
-        n, k = index.shape
-        start = np.arange(0, n * k + 1, k)
-        operator = csr_array((weight.ravel(), index.ravel(), start), (n, len(self.coefficients)))
-        values = (operator @ self.coefficients).T
-        m = len(self.rows)
-        return np.asarray(values[:m] + 1j * values[m : 2 * m]), np.asarray(values[2 * m])
+        With ``slopes``, (3, 2·m + 1, n): their derivatives by east and north too, per mas.
+        """
+        here = [c[self.rows[0]] if c.ndim == 2 else c for c in place]
+        index, weight = taps(self.to_node @ np.stack(here), self.n_nodes)
+        if slopes:
+            weight[:, 1:] = self.to_node.T @ weight[:, 1:]
+        kept = weight if slopes else weight[:, :1]
+        parts = [slice(k, k + CHUNK) for k in range(0, len(index), CHUNK)]
+        found = [kept[p] @ self.coefficients[index[p]] for p in parts]
+        return np.asarray(np.concatenate(found).transpose(1, 2, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,26 +93,25 @@ class OffAxis:
 
     def at(self, place: Place) -> tuple[ComplexArray, FloatArray]:
         """Response of visibility and flux, (n_samples, n) each."""
-        shape = (self.n_samples, place[0].shape[-1])
-        fringe, flux = np.ones(shape, dtype=complex), np.ones(shape)
-        for exposure in self.exposures:
-            t = exposure.taps(place)
-            fringe[exposure.rows], flux[exposure.rows] = exposure.sum(t.index, t.value)
-        return fringe, flux
+        fringe, flux = self._seen(place, slopes=False)
+        return fringe[0], flux[0]
 
-    def slopes(
-        self, place: Place
-    ) -> tuple[tuple[ComplexArray, ComplexArray], tuple[FloatArray, FloatArray]]:
-        """Derivatives of both by east and north, per mas, (n_samples, n) each."""
-        shape = (2, self.n_samples, place[0].shape[-1])
+    def with_slopes(self, place: Place) -> tuple[ComplexArray, FloatArray]:
+        """Response of visibility and flux, (3, n_samples, n) each: values and derivatives.
+
+        The derivatives are by east and north, per mas.
+        """
+        return self._seen(place, slopes=True)
+
+    def _seen(self, place: Place, *, slopes: bool) -> tuple[ComplexArray, FloatArray]:
+        shape = (1 + 2 * slopes, self.n_samples, place[0].shape[-1])
         fringe, flux = np.zeros(shape, dtype=complex), np.zeros(shape)
+        fringe[0] = flux[0] = 1.0
         for exposure in self.exposures:
-            t = exposure.taps(place)
-            for by_node, weight in zip(exposure.to_node, (t.by_first, t.by_second), strict=True):
-                of_fringe, of_flux = exposure.sum(t.index, weight)
-                fringe[:, exposure.rows] += by_node[:, None, None] * of_fringe
-                flux[:, exposure.rows] += by_node[:, None, None] * of_flux
-        return (fringe[0], fringe[1]), (flux[0], flux[1])
+            found, m = exposure.seen(place, slopes=slopes), len(exposure.rows)
+            fringe[:, exposure.rows] = found[:, :m] + 1j * found[:, m : 2 * m]
+            flux[:, exposure.rows] = found[:, 2 * m :]
+        return fringe, flux
 
     def centre(self, visibility: ComplexArray) -> Place:
         """Where the axis is, from the star, in an image of these visibilities (n_samples, n).
@@ -140,20 +143,22 @@ class OffAxis:
     def _phases(
         self, visibility: ComplexArray
     ) -> Iterator[tuple[Exposure, FloatArray, FloatArray, FloatArray]]:
-        """Yield exposures, weights and phases (m, n), and inverse normal matrices (n, 2, 2)."""
+        """Yield exposures, weights and phases (m, n), and inverse normal matrices (2, 2, n)."""
         for exposure in self.exposures:
             seen = visibility[exposure.rows]
             weight = seen.real**2 + seen.imag**2
-            outer = exposure.uv[:, :, None] * exposure.uv[:, None, :]
-            normal = np.tensordot(weight.T, outer, axes=1)
-            inverse = np.asarray(np.linalg.pinv(normal, hermitian=True), dtype=float)
+            u, v = exposure.uv.T
+            uu, uv, vv = np.stack([u * u, u * v, v * v]) @ weight
+            # Baselines on one line say nothing of the other direction: of that nothing moves.
+            uu, vv = uu + NEGLIGIBLE * (uu + vv), vv + NEGLIGIBLE * (uu + vv)
+            inverse = np.array([[vv, -uv], [-uv, uu]]) / (uu * vv - uv * uv)
             yield exposure, weight, np.angle(seen), inverse
 
 
 def _solved(exposure: Exposure, inverse: FloatArray, phase: FloatArray) -> FloatArray:
     """Displacement (2, n) that weighted phases (m, n) tell of, mas."""
     turns = exposure.uv.T @ phase / (-2.0 * np.pi)
-    return np.asarray(np.einsum("nij,jn->in", inverse, turns))
+    return np.asarray(np.einsum("ijn,jn->in", inverse, turns))
 
 
 def off_axis_of(
@@ -181,9 +186,9 @@ def off_axis_of(
         a, b = legs[rows].T
         fringe = response.coefficients[a, b].astype(complex)
         fringe = np.where(sign[rows, None, None] < 0.0, fringe.conj(), fringe)
-        seen = taps((response.to_node @ response.pointing)[:, None], response.n_nodes)
+        index, weight = taps((response.to_node @ response.pointing)[:, None], response.n_nodes)
         whole = np.stack([*fringe, response.coefficients[a[0], a[0]]]).reshape(len(rows) + 1, -1)
-        whole /= whole[:, seen.index[0]] @ seen.value[0][:, None]
+        whole /= whole[:, index[0]] @ weight[0, 0][:, None]
         exposures.append(
             Exposure(
                 rows,
