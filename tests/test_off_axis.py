@@ -134,6 +134,6 @@ def test_file_keeps_the_response(tmp_path, rng: np.random.Generator) -> None:
     assert before is not None
     # Opposite places are conjugate, to rounding; half of them are written.
     np.testing.assert_allclose(after.coefficients, before.coefficients, rtol=1e-6)
-    np.testing.assert_allclose(after.to_node, before.to_node, rtol=1e-14)
-    np.testing.assert_allclose(after.pointing, before.pointing, rtol=1e-14)
+    np.testing.assert_allclose(after.to_node, before.to_node, rtol=1e-12)
+    np.testing.assert_allclose(after.pointing, before.pointing, rtol=1e-12)
     assert after.single

@@ -158,7 +158,7 @@ class Bench:
     def weight(self) -> FloatArray:
         """(n_baselines,) of the phases that tell where an integration points: amplitudes."""
         _, samples = self.sampled(self._known[None], self._usual[None])
-        return np.abs(self.sampling.fringes(samples)[0])
+        return np.asarray(np.abs(self.sampling.fringes(samples)[0]))
 
     @property
     def _complete(self) -> bool:
