@@ -78,6 +78,16 @@ def test_mistyped_words_are_guessed(words: list[str], meant: str, capsys) -> Non
     assert captured.err.count("\n") == 1
 
 
+def test_every_command_stands_beside_what_it_does(capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run("--help") == 0
+    lines = capsys.readouterr().out.splitlines()
+    column = {line.index(s[:12]) for n, s in COMMANDS.items() for line in lines
+              if line.startswith(f"    {n} ")}  # fmt: skip
+    assert len(column) == 1
+    assert sum(line.strip().split(" ")[0] in COMMANDS for line in lines) >= len(COMMANDS)
+
+
 def completed(script: Path, line: str, folder: Path) -> set[str]:
     """What bash offers for the last word of a line."""
     words = line.split(" ")

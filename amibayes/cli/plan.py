@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--separation",
         type=number_range,
         default=(50.0, 400.0),
-        metavar="LOW:HIGH",
+        metavar="MIN:MAX",
         help="range of the contrast curve in mas (default: 50:400)",
     )
     add_output_options(parser, "plan")
