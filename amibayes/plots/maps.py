@@ -66,7 +66,7 @@ def detection_map(
     -------
     matplotlib.figure.Figure
     """
-    figure = new_figure(6.6 if contrast is None else 11.6)
+    figure = new_figure(6.1 if contrast is None else 11.6)
     axes = figure.subplots(1 if contrast is None else 2, 1, squeeze=False)[:, 0]
     gain = result.bank_delta_chi2
     values = np.sqrt(gain) if quantity == "sqrt_delta_chi2" else gain
@@ -101,7 +101,7 @@ def sky_map(
     -------
     matplotlib.figure.Figure
     """
-    figure = new_figure(6.6)
+    figure = new_figure(6.1)
     ax = figure.subplots()
     _paint(figure, ax, result.grid, values, label, cmap=SEQUENTIAL, vmin=vmin)
     _mark(ax, result)
