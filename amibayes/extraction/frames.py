@@ -21,7 +21,7 @@ from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
-CHUNK = 64
+CHUNK = 128
 """Integrations that are worked on together."""
 
 
