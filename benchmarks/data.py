@@ -59,7 +59,7 @@ def write_all(folder: Path) -> dict[str, Path]:
     rng = np.random.default_rng(1)
     cube = simulate(Scene(), instrument, Exposure(19, N_IMAGES), rng, count_rate_e_s=1e6)
     paths["cube"] = folder / "cube.fits"
-    primary = fits.PrimaryHDU(np.tile(cube.images.astype(np.float64), (N_COPIES, 1, 1)))
+    primary = fits.PrimaryHDU(np.tile(cube.images.astype(np.float32), (N_COPIES, 1, 1)))
     primary.header.update({"INSTRUME": "NIRISS", "FILTER": "F480M", "PIXELSCL": 65.6})
     primary.writeto(paths["cube"], overwrite=True)
     return paths

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from amibayes import BinaryModel, Cube, Likelihood, read_oifits, sample, search
+from amibayes import BinaryModel, Likelihood, read_oifits, sample, search
 from amibayes.extraction import ExtractOptions, extract_all
 from amibayes.inference.bank import TemplateBank
 from amibayes.inference.priors import default_prior
@@ -58,13 +58,12 @@ def searches(path: Path, field: tuple[float, float], model: BinaryModel) -> dict
 
 
 def extraction(path: Path) -> dict[str, float]:
-    """The default extraction of a cube that is in memory, beside one FFT of every image."""
+    """The default extraction of a file, beside one FFT of every image."""
     from astropy.io import fits
 
     images = fits.getdata(path).astype(np.float64)
-    scale = 65.6 * np.pi / 180 / 3.6e6
-    cube = Cube(images=images, pixel_scale_rad=scale, instrument="NIRISS", filter="F480M")
-    seconds, _ = cpu(lambda: extract_all(cube, ExtractOptions()))
+    header = {"instrument": "niriss", "filter": "F480M"}
+    seconds, _ = cpu(lambda: extract_all(path, ExtractOptions(), **header))
     fourier, _ = cpu(lambda: np.fft.rfft2(images))
     return {
         "extraction_per_integration": seconds / len(images),
