@@ -62,7 +62,8 @@ def extraction(path: Path) -> dict[str, float]:
     from astropy.io import fits
 
     images = fits.getdata(path).astype(np.float64)
-    header = {"instrument": "niriss", "filter": "F480M"}
+    scale = 65.6 * np.pi / 180 / 3.6e6
+    header = {"instrument": "niriss", "filter": "F480M", "pixel_scale_rad": scale}
     seconds, _ = cpu(lambda: extract_all(path, ExtractOptions(), **header))
     fourier, _ = cpu(lambda: np.fft.rfft2(images))
     return {
