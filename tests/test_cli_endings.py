@@ -49,6 +49,8 @@ def start(
 
     command = [*before, sys.executable, "-m", "amibayes", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    if largest is not None:  # what is covered could not be written either
+        environment = {k: v for k, v in environment.items() if not k.startswith("COVERAGE")}
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
         preexec_fn=prepared,
