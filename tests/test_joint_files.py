@@ -132,7 +132,13 @@ def test_one_calibrator_of_each_filter_tells_no_scatter(files, tmp_path) -> None
 
 
 def test_tied_contrast_and_summary(files, tmp_path) -> None:
-    result = result_json(found(files[:2], contrast="tied", file_noise=False))
+    tied = found(files[:2], contrast="tied", file_noise=False)
+    assert any(
+        "one contrast for NIRISS_4.29um, NIRISS_4.82um" in x for x in summary(tied, tmp_path)
+    )
+    moving = found(files[1:], motion=True, null_draws=0)
+    assert any(line.startswith("motion      E ") for line in summary(moving, tmp_path))
+    result = result_json(tied)
     assert result["fit"]["contrast_kind"] == "tied"
     assert {c["contrast"] for c in result["fit"]["contrasts"]} == {result["fit"]["contrast"]}
     lines = summary(found(files[:2]), tmp_path)

@@ -260,3 +260,15 @@ def test_limits_of_an_estimated_covariance_do_not_feel_the_companion_that_is_the
     assert beside.threshold == pytest.approx(without.threshold, rel=0.25)
     error = np.hypot(without.log_error, beside.log_error)
     assert (np.abs(np.log(beside.contrast / without.contrast)) < 0.15 + 4.0 * error).all()
+
+
+def test_a_kind_of_observable_that_cannot_carry_a_fit_is_left_out_and_named(tmp_path) -> None:
+    """Two squared visibilities say nothing by themselves of a companion's three numbers."""
+    data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    few = data.select(np.arange(data.n_vis2) < 2, np.ones(data.n_closure_phases, dtype=bool))
+    path = tmp_path / "few.oifits"
+    write_oifits(path, few)
+    search = SearchOptions(separation_mas=(60.0, 200.0), null_draws=500)
+    report = measure_limits([path], [], LimitsOptions(search, method="candid", n_separations=3))
+    assert [limit.observables for limit in report.limits] == [("vis2", "cp"), ("cp",)]
+    assert any("no limit from vis2 alone" in said for said in report.warnings)
