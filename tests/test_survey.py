@@ -111,6 +111,7 @@ def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
     [
         ({"file": ["a"]}, 3, "no column 'target'"),
         ({"target": ["a.oifits", "b/a.oifits"]}, 3, "two targets are called 'a'"),
+        ({"target": np.array([], dtype=str)}, 3, "holds no target"),
         ({"target": ["a"], "diametre": ["1"]}, 2, "did you mean 'diameter'"),
         ({"target": ["a"], "diameter": ["wide"]}, 2, "neither a number nor 'free'"),
         ({"target": ["a"], "out": ["elsewhere"]}, 2, "no option of a target"),
