@@ -211,9 +211,9 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
     geometry = Geometry()
     if options.geometry == "fitted":
         median = _fit_of_median(view, even, reference)
-        view, geometry, known = fit_geometry(view, image, median, basis)
+        view, geometry, basis = fit_geometry(view, image, median, basis)
     if not geometry.stated:
-        view, basis, even = centre_on(view, image, good, template.source, known)
+        view, basis, even = centre_on(view, image, good, template.source, basis)
     noise, level, scatter = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(even.model, _fit_variance(basis, image, noise, good) + level, good)
     sampling = (

@@ -34,12 +34,6 @@ LARGEST = 0.02
 CONSTRAINED = 3e-3
 """A fit with larger errors says less than the header does."""
 
-SHRINKS = 0.02
-"""Every step is at most so much of the one before: the slopes are that good."""
-
-ENOUGH, ENOUGH_SIGMA = 2e-5, 0.05
-"""Steps below this, or so many standard deviations, change nothing."""
-
 MOST_STEPS = 4
 
 BELIEVED, SIGNIFICANT = 2.5e-4, 4.0
@@ -75,18 +69,18 @@ class Geometry:
 class Solution:
     """Relative error of the pixel scale and rotation (2,), and their standard deviations.
 
-    ``basis`` is the fringe model of ``at``, the rounded values that were tried last.
+    ``believed`` is what is believed of them, and ``basis`` the fringe model with that.
     """
 
     value: FloatArray
     error: FloatArray
-    at: FloatArray
+    believed: FloatArray
     basis: FringeBasis
 
 
 def fit_geometry(
     view: View, image: FloatArray, fit: FringeFit, basis: FringeBasis
-) -> tuple[View, Geometry, FringeBasis | None]:
+) -> tuple[View, Geometry, FringeBasis]:
     """Find pixel scale and rotation in an image (n_y, n_x).
 
     Parameters
@@ -106,26 +100,24 @@ def fit_geometry(
     View
         With the geometry that was found, or as it was.
     Geometry
-    FringeBasis or None
-        That of the view, where it is known.
+    FringeBasis
+        Of that view.
     """
     solved = solve_geometry(view, image, fit, basis)
     if solved is None:
         return view, Geometry(), basis
-    value, error = solved.value, solved.error
-    limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
-    believed = np.where(np.abs(value) < limit, 0.0, _rounded(value))
-    scale, turn = (float(b) for b in believed)
-    stated = basis if scale == turn == 0.0 else None
-    known = solved.basis if np.array_equal(believed, solved.at) else stated
-    found = Geometry(1.0 + scale, turn, float(error[0]), float(error[1]), True)
-    return _moved(view, believed), found, known
+    (scale, turn), error = solved.believed, solved.error
+    found = Geometry(1.0 + float(scale), float(turn), float(error[0]), float(error[1]), True)
+    return _moved(view, solved.believed), found, solved.basis
 
 
 def solve_geometry(
     view: View, image: FloatArray, fit: FringeFit, basis: FringeBasis
 ) -> Solution | None:
-    """Solve for pixel scale and rotation; None where the image does not tell them."""
+    """Solve for pixel scale and rotation; None where the image does not tell them.
+
+    What is believed is tried, until what is found there is no reason to believe else.
+    """
     pixels = image.reshape(1, -1)
     # The place of the envelope is fitted too, but the fringes say where the star is.
     slopes = geometry_slopes(view, fit.solve(pixels)[0, :-1])
@@ -134,23 +126,22 @@ def solve_geometry(
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:2]
     if not 0.0 < error.min() <= error.max() < CONSTRAINED:
         return None
-    at = np.zeros(2)
+    limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
+    believed = np.zeros(2)
     for _ in range(MOST_STEPS):
         residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]
         step = (covariance @ (slopes * fit.weight) @ residual)[:2]
-        value = at + step
+        # Scales multiply: what the slopes are linear in is their logarithm.
+        scale = (1.0 + believed[0]) * np.exp(step[0]) - 1.0
+        value = np.array([scale, believed[1] + step[1]])
         if np.abs(value).max() > LARGEST:
             return None
-        if np.all(SHRINKS * np.abs(step) < np.maximum(ENOUGH_SIGMA * error, ENOUGH)):
+        rounded = np.where(np.abs(value) < limit, 0.0, ROUNDED * np.round(value / ROUNDED))
+        if np.array_equal(rounded, believed):
             break
-        at = _rounded(value)
-        basis = _moved(view, at).basis()
+        believed, basis = rounded, _moved(view, rounded).basis()
         fit = weighted_fit(FringeModel.of(basis), fit.weight)
-    return Solution(value, error, at, basis)
-
-
-def _rounded(value: FloatArray) -> FloatArray:
-    return np.asarray(ROUNDED * np.round(value / ROUNDED))
+    return Solution(value, error, believed, basis)
 
 
 def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
