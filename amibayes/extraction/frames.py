@@ -21,7 +21,7 @@ from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 
-CHUNK = 128
+CHUNK = 64
 """Integrations that are worked on together."""
 
 
@@ -114,11 +114,19 @@ class Bench:
         """What noise adds to flux² and to the power of every baseline."""
         return self.sampling.bias(self.variance)
 
-    def look(self, pixels: PixelArray) -> tuple[FloatArray, SingleArray]:
+    def look(
+        self, pixels: PixelArray, room: SingleArray | None = None
+    ) -> tuple[FloatArray, SingleArray]:
         """Measure images (n, n_pixels), and tell what the model of the fringes leaves of them.
 
         Both are those of the reference, and those of what an image differs by from it: the
         rounding of single precision is then that of a small number.
+
+        Parameters
+        ----------
+        pixels : (n, n_pixels) array
+        room : (2, n or more, n_pixels) array, optional
+            Memory to work in; ``left`` is part of it.
 
         Returns
         -------
@@ -127,11 +135,15 @@ class Bench:
         left : (n, n_pixels) array
             Residual less that of the reference.
         """
+        room = np.empty((2, *pixels.shape), np.float32) if room is None else room
+        left, model = room[:, : len(pixels)]
         single = pixels.dtype == np.float32
-        off = pixels - self._usual
+        off = np.subtract(pixels, self._usual, out=left if single else None)
         beyond = off @ (self._single if single else self._operator)
-        left = off if single else off.astype(np.float32)
-        left -= (beyond @ self._to_model).astype(np.float32) @ self.fit.model.single
+        if not single:
+            left[...] = off
+        coefficients = (beyond @ self._to_model).astype(np.float32)
+        left -= np.matmul(coefficients, self.fit.model.single, out=model)
         return beyond + self._known, left
 
     def standing_off(self, left: SingleArray) -> BoolArray:
@@ -213,8 +225,9 @@ def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArra
     """
     parts, flux, count = [], 0.0, 0
     total = np.zeros(bench.sampling.n_samples, dtype=complex)
+    room = np.empty((2, min(CHUNK, file.n_integrations), len(bench.scatter)), np.float32)
     for cube in _chunks(file):
-        frames, samples = _measure_chunk(bench, cube)
+        frames, samples = _measure_chunk(bench, cube, room)
         lit = frames.used
         total += bench.sampling.centred(samples[lit], frames.shift_px[lit])
         flux, count = flux + float(frames.flux[lit].sum()), count + int(lit.sum())
@@ -240,8 +253,8 @@ def _chunks(file: Source) -> Iterator[Cube]:
         yield file.read(start, min(start + CHUNK, file.n_integrations))
 
 
-def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
-    pixels, numbers, misfit, n_bad = _cleaned(bench, cube)
+def _measure_chunk(bench: Bench, cube: Cube, room: SingleArray) -> tuple[Frames, ComplexArray]:
+    pixels, numbers, misfit, n_bad = _cleaned(bench, cube, room)
     flux, samples = bench.sampled(numbers, pixels)
     own, extra = bench.bias
     n = cube.n_integrations
@@ -265,7 +278,9 @@ def _measure_chunk(bench: Bench, cube: Cube) -> tuple[Frames, ComplexArray]:
     )
 
 
-def _cleaned(bench: Bench, cube: Cube) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
+def _cleaned(
+    bench: Bench, cube: Cube, room: SingleArray
+) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
     """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
     Only where the fit of an integration leaves something that it does not of others is it
@@ -287,7 +302,7 @@ def _cleaned(bench: Bench, cube: Cube) -> tuple[PixelArray, FloatArray, FloatArr
     part = np.s_[:, view.rows, view.columns]
     pixels, missing = images[part].reshape(n, -1), bad[part].reshape(n, -1)
     filled = _filled(fit, pixels, missing)
-    numbers, left = bench.look(filled)
+    numbers, left = bench.look(filled, room)
     hit = np.flatnonzero(bench.standing_off(left).any(axis=1))
     if len(hit):
         wrong = missing[hit] | bench.outliers(images[hit], bad[hit])
