@@ -525,6 +525,27 @@ def test_command_writes_what_it_says(
     assert CLI_METHODS == METHODS
 
 
+def test_temperature_sets_the_wavelength(niriss: Instrument, tmp_path: Path) -> None:
+    """Against Planck's law over the filter's table, integrated here."""
+    images = with_photons(binary_images(niriss, jittered(3, 19), (0.0, 0.0), 0.0), 20)
+    write_cube(tmp_path / "star.fits", cube_of(images, niriss))
+    wavelength, throughput = niriss.bandpass.wavelength_m, niriss.bandpass.throughput
+    grid = np.linspace(wavelength[0], wavelength[-1], 20001)
+    through = np.interp(grid, wavelength, throughput)
+    for kelvin in (None, "600"):
+        out = tmp_path / f"out_{kelvin}"
+        option = [] if kelvin is None else ["--temperature", kelvin]
+        assert main(["extract", str(tmp_path / "star.fits"), *option, "--out", str(out)]) == 0
+        x = 0.014387769 / (grid * 600.0)
+        photons = through * (1.0 if kelvin is None else grid**-4 / np.expm1(x))
+        expected = photons.sum() / (photons / grid).sum()
+        found = read_oifits(out / "star.oifits").vis2.wavelength_m[0]
+        # The quadrature of the band serves images, to 1e-6 of the wavelength.
+        assert found == pytest.approx(expected, rel=2e-6)
+    hopeless = ["extract", str(tmp_path / "star.fits"), "--temperature", "1"]
+    assert main([*hopeless, "--out", str(tmp_path / "o2")]) == 2
+
+
 def test_search_takes_cubes(niriss: Instrument, tmp_path: Path) -> None:
     for name, contrast, seed in (("target", 0.02, 21), ("cal", 0.0, 22)):
         images = binary_images(niriss, jittered(8, seed), (120.0, 160.0), contrast)

@@ -68,6 +68,13 @@ def add_image_options(parser: argparse.ArgumentParser, method: str = "--method")
         help="of the image's +y, east of north",
     )
     group.add_argument(
+        "--temperature",
+        type=positive_float,
+        metavar="K",
+        help="blackbody that stands for the stars' spectrum (default: as many photons at every "
+        "wavelength of the filter)",
+    )
+    group.add_argument(
         method,
         dest="extraction",
         choices=METHODS,
@@ -89,7 +96,8 @@ def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
         "pixel_scale_rad": arguments.pixel_scale * MAS if arguments.pixel_scale else None,
         "position_angle_deg": arguments.position_angle,
     }
-    return ImageOptions(ExtractOptions(method=arguments.extraction), header)
+    extraction = ExtractOptions(method=arguments.extraction, temperature_k=arguments.temperature)
+    return ImageOptions(extraction, header)
 
 
 def finite_float(text: str) -> float:

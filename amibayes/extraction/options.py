@@ -13,6 +13,10 @@ Method = Literal["fringes", "matched", "fft", "gauss", "square", "unique"]
 METHODS: tuple[str, ...] = get_args(Method)
 
 
+COLDEST_K = 100.0
+"""A blackbody that is colder has no light in these filters."""
+
+
 @dataclass(frozen=True)
 class ExtractOptions:
     """What an extraction is asked to do.
@@ -64,6 +68,10 @@ class ExtractOptions:
                 raise UsageError(f"{name} is {getattr(self, name):g}; it must be above 0")
         if self.window_px is not None and not self.window_px >= 0.0:
             raise UsageError(f"window is {self.window_px:g} pixels; it must be at least 0")
+        if self.temperature_k is not None and not self.temperature_k >= COLDEST_K:
+            raise UsageError(
+                f"temperature is {self.temperature_k:g} K; it must be at least {COLDEST_K:g}"
+            )
 
     def as_mapping(self) -> Mapping[str, Any]:
         """Every option with its value."""

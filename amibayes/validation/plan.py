@@ -62,14 +62,14 @@ class ValidationPlan:
         return [name for _, name in turns]
 
 
-QUICK = ValidationPlan("quick", (Setting("F430M", 14, 40, 1),), 8, 24, 2000)
+QUICK = ValidationPlan("quick", (Setting("F430M", 14, 40, 3),), 8, 24, 2000)
 
 FULL = ValidationPlan(
     "full",
     (
-        Setting("F380M", 7, 60, 1),
-        Setting("F430M", 14, 40, 2),
-        Setting("F480M", 19, 120, 1),
+        Setting("F380M", 7, 60, 3),
+        Setting("F430M", 14, 40, 4),
+        Setting("F480M", 19, 120, 3),
     ),
     60,
     300,

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 from amibayes.calibration import calibrate
 from amibayes.cube import Cube
 from amibayes.errors import AmibayesError, RunError
-from amibayes.extraction import extract
+from amibayes.extraction import ExtractOptions, extract
 from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
 from amibayes.inference.limits import detection_limit
 from amibayes.inference.priors import Prior
@@ -35,6 +35,9 @@ COVERED = ("separation_mas", "position_angle_deg", "delta_mag")
 LEVELS = (0.68, 0.95)
 
 TRIALS_PER_CELL = 64
+
+STAR_K = 5800.0
+"""Blackbody that the extraction takes for the simulated spectrum, which is that of a G2 star."""
 
 Piece = tuple[int, str, np.random.SeedSequence]
 """Number of the trial, kind, and its randomness."""
@@ -79,7 +82,7 @@ def observe(
     stars = [_scene(truth), *[_scene(None)] * setting.n_calibrators]
     of_maps, *seeds = child_seeds(seed, 1 + len(stars))
     target, *calibrators = (
-        extract(_cube(setting, scene, of_maps, child))
+        extract(_cube(setting, scene, of_maps, child), options=ExtractOptions(temperature_k=STAR_K))
         for scene, child in zip(stars, seeds, strict=True)
     )
     return calibrate([target], calibrators).observables
