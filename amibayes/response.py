@@ -3,8 +3,8 @@
 The response of a baseline to a point source is the ratio of the visibility that is
 measured, smeared over the filter's width, to exp(−2πi(uα + vδ)). It is smooth, but for a
 little of the other baselines' fringes, which turn with the place: known on a lattice of
-places three times finer than a fringe of the longest baseline, and by cubic B-splines between
-(Unser 1999).
+places nearly three times finer than a fringe of the longest baseline, and by cubic B-splines
+between (Unser 1999).
 Opposite places have conjugate responses, as has a baseline taken the other way round.
 """
 

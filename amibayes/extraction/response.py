@@ -19,7 +19,7 @@ from amibayes.orientation import Orientation
 from amibayes.response import Response
 from amibayes.units import FloatArray
 
-NODES_PER_FRINGE = 3.0
+NODES_PER_FRINGE = 2.8
 """Places per fringe of the longest baseline, at least."""
 
 RUN_OUT = 6
