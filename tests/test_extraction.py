@@ -525,6 +525,15 @@ def test_command_writes_what_it_says(
     assert CLI_METHODS == METHODS
 
 
+@pytest.mark.parametrize(("name", "coarse"), [("F277W", True), ("F380M", False)])
+def test_reader_is_told_of_pixels_too_large_for_the_fringes(name: str, coarse: bool) -> None:
+    """Two pixels of 65.6 mas are 0.131 arcsec; λ/B of the longest baseline 0.109 and 0.149."""
+    instrument = load_instrument("niriss", name)
+    images = with_photons(binary_images(instrument, jittered(3, 19), (0.0, 0.0), 0.0), 20)
+    notes = " ".join(extract(cube_of(images, instrument)).notes)
+    assert ("too large for the fringes" in notes) == coarse
+
+
 def test_temperature_sets_the_wavelength(niriss: Instrument, tmp_path: Path) -> None:
     """Against Planck's law over the filter's table, integrated here."""
     images = with_photons(binary_images(niriss, jittered(3, 19), (0.0, 0.0), 0.0), 20)

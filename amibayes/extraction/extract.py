@@ -61,6 +61,9 @@ SMOOTH_SHARE, SMOOTH_FLOOR = 0.98, 0.003
 JITTER_SLACK = 0.01
 """Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
+NYQUIST = 0.5
+"""Cycles per pixel beyond which fringes look like others."""
+
 LARGEST_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
 
@@ -364,7 +367,7 @@ def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Obser
         response=part.response,
         mjd=_mjd(frames, part.template),
         integration_s=n * (part.template.integration_time_s or 0.0),
-        notes=_notes(frames, shrunk),
+        notes=_notes(part.bench.view, frames, shrunk),
     )
 
 
@@ -380,8 +383,15 @@ def _mjd(frames: Frames, template: Cube) -> float:
     return 0.0
 
 
-def _notes(frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
+def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
     notes = []
+    coarse = int((np.abs(view.frequency_px).max(axis=1) > NYQUIST).sum())
+    if coarse:
+        notes.append(
+            f"the pixels are too large for the fringes of {coarse} of {len(view.frequency_px)} "
+            "baselines: what is measured of light off the axis hangs on where in a pixel the star "
+            "stands, by some percent of a faint companion's light and more of a bright one's"
+        )
     lost = int((~frames.used).sum())
     if lost:
         notes.append(f"{lost} of {len(frames)} integrations not used")
