@@ -18,8 +18,8 @@ from amibayes.cli.common import METHODS as CLI_METHODS
 from amibayes.cube import Cube, cube_stream, read_cube, write_cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
+from amibayes.extraction.bench import make_bench
 from amibayes.extraction.cleaning import median_and_scatter
-from amibayes.extraction.extract import make_bench
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import FringeModel, fringe_fit
 from amibayes.extraction.per_integration import integrations, series

@@ -37,6 +37,8 @@ def test_containers_hold_the_same_numbers() -> None:
     assert Point(0.1, 30 * u.mas).east_rad == pytest.approx(Point(0.1, 30 * MAS).east_rad)
     options = ab.SearchOptions(separation_mas=(0.05 * u.arcsec, 400 * u.mas))
     assert options == ab.SearchOptions(separation_mas=(50.0, 400.0))
+    assert ab.BinaryModel(diameter_mas=3e-4 * u.arcsec).diameter_mas == pytest.approx(0.3)
+    assert ab.BinaryModel(diameter_mas="free").diameter_mas == "free"
     with pytest.raises(UsageError, match="contrast_min is a plain number"):
         ab.Prior(50.0, 400.0, 1e-5 * u.mas)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from amibayes.cube import Cube
 from amibayes.errors import DataError
-from amibayes.extraction.extract import make_bench
+from amibayes.extraction.bench import make_bench
 from amibayes.extraction.frames import Frames, measure
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.source import Held

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from amibayes.disc import uniform_disc
 from amibayes.inference.off_axis import Place
 from amibayes.inference.samples import Samples
+from amibayes.quantities import takes_quantities
 from amibayes.units import MAS, FloatArray
 
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class BinaryModel:
     """What is fitted and what is held fixed.

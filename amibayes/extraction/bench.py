@@ -1,0 +1,164 @@
+"""What all integrations of a cube go through, prepared by one look at it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from amibayes.errors import DataError
+from amibayes.extraction.cleaning import (
+    BoolArray,
+    Reference,
+    median_and_scatter,
+    reference_of,
+)
+from amibayes.extraction.fourier import fourier_sampling
+from amibayes.extraction.frames import Bench
+from amibayes.extraction.geometry import Geometry, fit_geometry
+from amibayes.extraction.image_plane import (
+    FringeFit,
+    SingleArray,
+    centre_on,
+    fringe_fit,
+    fringe_sampling,
+    shift_of,
+)
+from amibayes.extraction.noise import (
+    NoiseModel,
+    cropped,
+    misfit_level,
+    noise_model,
+    scatter_about_pointing,
+)
+from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.sampling import split
+from amibayes.extraction.source import Source
+from amibayes.extraction.view import View, look_at
+from amibayes.optics import FringeBasis
+from amibayes.units import FloatArray
+
+MOST_LEFT = 0.25
+"""An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
+
+SMOOTH_SHARE, SMOOTH_FLOOR = 0.98, 0.003
+"""How far the weights follow the envelope only, and its least value in units of its peak."""
+
+JITTER_SLACK = 0.01
+"""Share of the light about a pixel by which the pointing may change its residual, 1σ."""
+
+
+def make_bench(file: Source, options: ExtractOptions) -> Bench:
+    """Look at a cube once, and prepare all that its integrations go through."""
+    template = file.template
+    reference = reference_of(file)
+    view = look_at(reference.image, template, options)
+    image, good = reference.image[view.part], reference.good[view.part]
+    view, basis, even = centre_on(view, image, good, template.source)
+    geometry = Geometry()
+    if options.geometry == "fitted":
+        median = _fit_of_median(view, even, reference)
+        view, geometry, basis = fit_geometry(view, image, median, basis)
+    if not geometry.stated:
+        view, basis, even = centre_on(view, image, good, template.source, basis)
+    noise, level, scatter = _noise_and_misfit(view, even, reference)
+    fit = fringe_fit(even.model, _fit_variance(basis, image, noise, good) + level, good)
+    sampling = (
+        fringe_sampling(fit, view)
+        if options.method == "fringes"
+        else fourier_sampling(view, basis, options)
+    )
+    variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
+    return Bench(view, geometry, reference, fit, scatter, sampling, variance, third, options)
+
+
+def _fit_of_median(view: View, even: FringeFit, reference: Reference) -> FringeFit:
+    """Fit of the median image with its own weights, out of one with ``even`` weights."""
+    image, good = reference.image[view.part], reference.good[view.part]
+    left = image - (even.design @ even.solve(image.reshape(1, -1))[0]).reshape(view.shape)
+    noise = cropped(reference.noise, view.part)
+    if not reference.has_errors and len(reference.sample) < 3:
+        noise = noise_model(image, left**2, good)
+    variance = noise.variance * (np.pi / 2.0 / len(reference.sample))  # of a median
+    return fringe_fit(even.model, variance + misfit_level(left, variance, good), good)
+
+
+def _fit_variance(
+    basis: FringeBasis, image: FloatArray, noise: NoiseModel, good: BoolArray
+) -> FloatArray:
+    """Variance that the fit's weights are made of: that of a single star of the same light.
+
+    The image's own fringes have no part in it. Light off the axis is let through in a way
+    that hangs on the weights; were those of a binary to follow its fringes, and those of its
+    calibrator another pattern, a contrast of 0.4 would come out half a percent too small.
+    All but a fiftieth of it is the envelope's: weights that follow the fringes have up to a
+    tenth less noise, but let a companion's light through as the fringes of other baselines
+    too, by some percent that hang on where in a pixel the star stands.
+    """
+    envelope, star = (a.reshape(image.shape) for a in (basis.matrix[:, 0], basis.image()))
+    light = float(image[good].sum() / max(float(envelope[good].sum()), 1e-300))
+    smooth = envelope + SMOOTH_FLOOR * envelope.max()
+    shape = (1.0 - SMOOTH_SHARE) * np.maximum(star, 0.0) + SMOOTH_SHARE * smooth
+    return np.asarray(noise.constant + noise.per_signal * max(light, 0.0) * shape)
+
+
+def _noise_and_misfit(
+    view: View, fit: FringeFit, reference: Reference
+) -> tuple[NoiseModel, float, SingleArray]:
+    """Noise of a pixel, and what the model cannot follow, from residuals of single fits.
+
+    Where the cube has no errors of its own, the noise is what differs between the
+    residuals: the fits, whose weights are even, have followed the pointing.
+    """
+    image, good = reference.image[view.part], reference.good[view.part]
+    sample = reference.sample[(slice(None), *view.part)]
+    missing = np.isnan(sample) | ~good
+    flat = (len(sample), -1)
+    pixels = fit.fill(np.where(missing, 0.0, sample).reshape(flat), missing.reshape(flat))
+    coefficients = fit.solve(pixels)
+    residual = pixels.astype(np.float32) - coefficients.astype(np.float32) @ fit.model.single
+    mean = residual.mean(axis=0).reshape(image.shape)
+    noise = cropped(reference.noise, view.part)
+    _refuse_another(image, mean, noise, good, reference)
+    if not reference.has_errors and len(sample) < 3:
+        noise = noise_model(image, (residual[0] ** 2).reshape(image.shape), good)
+    elif not reference.has_errors:
+        _, samples = split(coefficients)
+        spread = scatter_about_pointing(residual, shift_of(view, samples)).reshape(view.shape)
+        noise = noise_model(image, spread * good.sum() / (good.sum() - fit.design.shape[1]), good)
+    level = misfit_level(mean, noise.variance / len(sample), good)
+    return noise, level, _scatter(residual, image, noise)
+
+
+def _scatter(residual: SingleArray, image: FloatArray, noise: NoiseModel) -> SingleArray:
+    """Robust scatter (n_pixels,) of the residuals (n, n_pixels) of some integrations."""
+    spread = median_and_scatter(residual)[1].reshape(image.shape)
+    # A scatter of few integrations may be small by chance: its surroundings have a say.
+    around = np.sqrt(uniform_filter(spread**2, 5))
+    slack = JITTER_SLACK * maximum_filter(np.abs(image), 3)
+    scatter = np.maximum(spread, around) + np.sqrt(noise.variance) + slack
+    return np.asarray(scatter.astype(np.float32).ravel())
+
+
+def _refuse_another(
+    image: FloatArray,
+    residual: FloatArray,
+    noise: NoiseModel,
+    good: BoolArray,
+    reference: Reference,
+) -> None:
+    """Refuse images that this mask and filter did not make.
+
+    Raises
+    ------
+    DataError
+        Where the fit leaves too much of the light.
+    """
+    expected = float(noise.variance[good].sum()) / len(reference.sample)
+    left = float((residual[good] ** 2).sum()) - expected
+    share = np.sqrt(max(left, 0.0) / max(float((image[good] ** 2).sum()), 1e-300))
+    if share > MOST_LEFT:
+        raise DataError(
+            f"the fringes of this mask and filter leave {100.0 * share:.0f} % of the image",
+            source=reference.source,
+            remedy="check instrument, filter and pixel scale",
+        )
