@@ -135,8 +135,8 @@ class OffAxis:
             turned = _solved(exposure, inverse, weight * phase)
             left = phase + 2.0 * np.pi * exposure.uv @ turned
             for k, slope in enumerate(slopes):
-                log = slope[exposure.rows] / visibility[exposure.rows]
-                change = weight * (log.imag + 2.0 * log.real * left)
+                along = slope[exposure.rows] * visibility[exposure.rows].conj()
+                change = along.imag + 2.0 * along.real * left
                 found[k][:, exposure.rows] = _solved(exposure, inverse, change)[:, None]
         return found
 
