@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from amibayes.calibration import Calibration
 from amibayes.inference.grid_posterior import integrable
 from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.posterior import Posterior, modes_to_sample
@@ -28,6 +29,19 @@ BRIGHT = 0.03
 
 FAR_TOO_SMALL = 1e-6
 """Probability of a χ² as small, below which the errors are far too large."""
+
+
+def calibration_cautions(calibration: Calibration | None) -> list[str]:
+    """Say what a single calibrator cannot tell."""
+    used = [] if calibration is None else [c for c in calibration.calibrators if c.n_used]
+    if len(used) != 1:
+        return []
+    return [
+        "one calibrator says nothing of how well it calibrates: the errors hold the noise of both "
+        "stars, but not what else differs between them (pointing on the flat field, drift, air); "
+        "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators what "
+        "they say"
+    ]
 
 
 def vetting_cautions(vetting: Vetting | None) -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.calibration import Calibration, calibrate
-from amibayes.cautions import vetting_cautions
+from amibayes.cautions import calibration_cautions, vetting_cautions
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import read_observations
 from amibayes.job import SearchOptions
@@ -93,7 +93,7 @@ def prepare(
         *different_targets(parts),
     )
     vetting, calibration, observables = _calibrated(parts, references, options, rng, clock)
-    cautions = (*vetting_cautions(vetting), *joined)
+    cautions = (*vetting_cautions(vetting), *calibration_cautions(calibration), *joined)
     return Prepared(observables, tuple(references), calibration, vetting, cautions)
 
 

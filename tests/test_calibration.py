@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import niriss, simulated
 from oi_builders import random_observables
 from scipy.sparse import csr_array
 from scipy.special import j1
@@ -16,6 +17,7 @@ from amibayes.calibration.hierarchical import population_of, predictive, sample_
 from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.transfer import Transfer, transfer_of, uniform_disc, wrapped
 from amibayes.calibration.weighted import clipped, weighted_response
+from amibayes.cautions import calibration_cautions
 from amibayes.closure import canonical, closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance, as_blocks
 from amibayes.errors import DataError
@@ -688,3 +690,12 @@ def test_coverage_of_the_whole_calibration(
         # errors below nominal, and the allowed over-coverage of 6 % (and 4 errors) above.
         for limit, nominal in ((1.0, 0.6827), (2.0, 0.9545)):
             assert nominal - 0.03 - 0.04 < (x < limit).mean() < nominal + 0.06 + 0.06
+
+
+def test_reader_is_told_what_one_calibrator_cannot_tell() -> None:
+    rng = np.random.default_rng(5)
+    target, *stars = (simulated(niriss(), [100.0, 0.0, 0.0], rng) for _ in range(3))
+    said = [calibration_cautions(calibrate(target, stars[:n])) for n in (1, 2)]
+    assert len(said[0]) == 1
+    assert "one calibrator says nothing" in said[0][0]
+    assert said[1] == calibration_cautions(None) == []

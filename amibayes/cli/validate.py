@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     size.add_argument(
         "--quick", action="store_true", help="48 stars, under two minutes of one core (the default)"
     )
-    size.add_argument("--full", action="store_true", help="480 stars, a quarter of an hour")
+    size.add_argument("--full", action="store_true", help="480 stars, half an hour")
     common.add_seed_option(parser)
     common.add_parallel_options(parser)
     parser.add_argument(
