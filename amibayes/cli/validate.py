@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXAMPLES
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
-        "--quick", action="store_true", help="48 stars, under two minutes of one core (the default)"
+        "--quick", action="store_true", help="36 stars, under two minutes of one core (the default)"
     )
     size.add_argument("--full", action="store_true", help="480 stars, half an hour")
     common.add_seed_option(parser)
