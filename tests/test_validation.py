@@ -78,10 +78,10 @@ def test_few_trials_claim_nothing() -> None:
 
 def test_kinds_take_turns() -> None:
     kinds = QUICK.kinds
-    assert {k: kinds.count(k) for k in kinds} == dict.fromkeys(RANGES, 8) | {"alone": 24}
+    assert {k: kinds.count(k) for k in kinds} == dict.fromkeys(RANGES, 8) | {"alone": 12}
     half = kinds[: len(kinds) // 2]
     assert half.count("faint") == 4
-    assert half.count("alone") == 12
+    assert half.count("alone") == 6
 
 
 def test_sum_of_tosses() -> None:
