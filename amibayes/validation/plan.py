@@ -62,7 +62,7 @@ class ValidationPlan:
         return [name for _, name in turns]
 
 
-QUICK = ValidationPlan("quick", (Setting("F430M", 7, 30, 3),), 8, 12, 2000)
+QUICK = ValidationPlan("quick", (Setting("F430M", 7, 30, 2),), 8, 12, 1000)
 
 FULL = ValidationPlan(
     "full",
