@@ -125,8 +125,3 @@ def _monomials(place: FloatArray) -> FloatArray:
     """Products (n, 15) of powers of x and y, up to degree 4."""
     x, y = place.T
     return np.stack([x ** (d - k) * y**k for d in range(5) for k in range(d + 1)], axis=1)
-
-
-def relative_band(view: View) -> float:
-    """Δλ/λ of the box that a model is smeared with."""
-    return view.instrument.bandpass.effective_width_m / view.wavelength_m

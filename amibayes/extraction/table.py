@@ -9,7 +9,6 @@ from amibayes.closure import closure_matrix, kernel_basis
 from amibayes.covariance import Block, BlockCovariance
 from amibayes.cube import Cube
 from amibayes.extraction.averaging import Average
-from amibayes.extraction.response import relative_band
 from amibayes.extraction.view import View
 from amibayes.freedom import Freedom
 from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
@@ -83,7 +82,7 @@ def _setup(view: View, template: Cube, holes: FloatArray, response: Response) ->
         tuple(f"H{k + 1}" for k in range(n)),
         np.arange(1, n + 1),
         np.array([view.wavelength_m]),
-        np.array([view.wavelength_m * relative_band(view)]),
+        np.array([view.instrument.bandpass.effective_width_m]),
         np.column_stack([holes, np.zeros(n)]),
         np.full(n, mask.size_m),
         template.source,

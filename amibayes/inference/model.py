@@ -195,8 +195,8 @@ class BinaryModel:
         by_light: list[Any] = []
         by_total: list[Any] = []
         pulls: list[tuple[Any, Any]] = []
-        for point in points:
-            fringe, flux = _let_through_slopes(samples, point.place, centre)
+        through = [_let_through_slopes(samples, p.place, centre) for p in points]
+        for point, (fringe, flux) in zip(points, through, strict=True):
             shine = point.contrast * point.wave
             light = light + shine * fringe[0]
             total = total + point.contrast * flux[0]
@@ -216,7 +216,7 @@ class BinaryModel:
                 by_light += [years * p for p, _ in placed]
                 by_total += [years * q for _, q in placed]
         if self.diameter_mas == "free":
-            by_light.append(by_diameter * _let_through(samples, CENTRED, centre)[0])
+            by_light.append(by_diameter * through[0][0][0])
             by_total.append(0.0)
         if self.background == "free":
             by_light.append(0.0)

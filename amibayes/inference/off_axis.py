@@ -162,27 +162,24 @@ def _solved(exposure: Exposure, inverse: FloatArray, phase: FloatArray) -> Float
 
 
 def off_axis_of(
-    data: Observables, first: IntArray, sign: FloatArray, uv: FloatArray
+    data: Observables, first: IntArray, sign: FloatArray, uv: FloatArray, exposure: FloatArray
 ) -> OffAxis | None:
     """Response at points ``first`` of a list of all V² and then all legs of the triangles.
 
     ``sign`` (n,) is −1 where the point is the opposite of the baseline's own; ``uv`` (n, 2)
-    are the points, cycles per radian.
+    are the points, cycles per radian, and ``exposure`` (n, 2) their setup and date.
     """
     if all(s.response is None for s in data.setups):
         return None
     v2, cp = data.vis2, data.closure_phase
     # The third leg closes the triangle: from its last station back to its first.
     legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)])[first]
-    label = np.concatenate(
-        [_exposure(v2.setup, v2.mjd), np.repeat(_exposure(cp.setup, cp.mjd), 3, axis=0)]
-    )
     exposures = []
-    for setup, mjd in np.unique(label[first], axis=0):
+    for setup, mjd in np.unique(exposure, axis=0):
         response = data.setups[int(setup)].response
         if response is None:
             continue
-        rows = np.flatnonzero((label[first] == (setup, mjd)).all(axis=1))
+        rows = np.flatnonzero((exposure == (setup, mjd)).all(axis=1))
         a, b = legs[rows].T
         fringe = response.coefficients[a, b].astype(complex)
         fringe = np.where(sign[rows, None, None] < 0.0, fringe.conj(), fringe)
@@ -200,8 +197,3 @@ def off_axis_of(
             )
         )
     return OffAxis(len(first), tuple(exposures))
-
-
-def _exposure(setup: IntArray, mjd: FloatArray) -> FloatArray:
-    """Labels (n, 2) of exposures."""
-    return np.column_stack([setup, mjd])

@@ -124,7 +124,7 @@ def samples_of(
         np.where(extracted[first], 0.0, (band / wavelength)[first]),
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
-        off_axis_of(data, first, orientation, uv),
+        off_axis_of(data, first, orientation, uv, np.column_stack([setup, mjd])[first]),
         None if bands is None else bands[first],
         mjd[first] if dated else None,
     )
