@@ -71,3 +71,7 @@ def sleep_after_saying_who(task: tuple[Path, int]) -> int:
     (folder / f"pid-{os.getpid()}").touch()
     time.sleep(60.0)
     return x
+
+
+def whether_interrupts_are_blocked(x: int) -> bool:
+    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])

@@ -155,6 +155,24 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     assert wait_until(lambda: not any(alive(pid) for pid in pids), 5.0)
 
 
+INTERRUPTED = """
+import parallel_work as work
+from amibayes.parallel import ProcessExecutor
+
+if __name__ == "__main__":
+    print(list(ProcessExecutor(2).map(work.whether_interrupts_are_blocked, [1, 2])))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_no_worker_ever_hears_an_interrupt(tmp_path: Path) -> None:
+    """Not even the first of a process, with which Python starts a helper of its own."""
+    script = tmp_path / "parent.py"
+    script.write_text(INTERRUPTED)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("[True, True]\n", "")
+
+
 def test_journal_resumes_where_a_run_was_killed(tmp_path: Path) -> None:
     pieces = [(tmp_path, x) for x in range(6)]
     key = digest("squares", 6)
