@@ -17,7 +17,6 @@ from amibayes.extraction.frames import Bench
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
     FringeFit,
-    SingleArray,
     centre_on,
     fringe_fit,
     fringe_sampling,
@@ -35,7 +34,7 @@ from amibayes.extraction.sampling import split
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View, look_at
 from amibayes.optics import FringeBasis
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, SingleArray
 
 MOST_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""

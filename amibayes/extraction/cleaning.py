@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from amibayes.cube import Cube
 from amibayes.errors import DataError
@@ -184,19 +184,13 @@ def _hot(image: FloatArray, good: BoolArray) -> BoolArray:
     is called hot or dead where it differs from what its neighbours predict by more than
     the neighbours differ among themselves, several times over.
     """
-    padded = np.pad(np.where(good, image, np.nan), 2, constant_values=np.nan)
-    ny, nx = image.shape
-    around = np.stack(
-        [
-            padded[2 + dy : 2 + dy + ny, 2 + dx : 2 + dx + nx]
-            for dy in range(-2, 3)
-            for dx in range(-2, 3)
-            if (dy, dx) != (0, 0)
-        ]
+    around = np.ones((5, 5), dtype=bool)
+    around[2, 2] = False
+    high, low = (
+        extreme(np.where(good, image, empty), footprint=around, mode="constant", cval=empty)
+        for extreme, empty in ((maximum_filter, -np.inf), (minimum_filter, np.inf))
     )
-    with np.errstate(invalid="ignore"):
-        high, low = np.nanmax(around, axis=0), np.nanmin(around, axis=0)
-        size = high - low
+    size = high - low
     found = good & ((image > high + 2.0 * size) | (image < low - 2.0 * size)) & (size > 0.0)
     return np.asarray(found)
 

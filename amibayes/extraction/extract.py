@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
+from amibayes.covariance import Block
 from amibayes.cube import Cube
 from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average, average, standing_off
@@ -177,7 +178,7 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
-    observables = _tabled(parts[0], frames, mean, shrunk)
+    observables = _tabled(parts[0], frames, mean, shrunk, basis)
     benches = tuple(p.bench for p in parts)
     sources = tuple(p.template.source for p in parts)
     return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
@@ -201,14 +202,16 @@ def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Aver
     return frames, mean, np.asarray(physical)
 
 
-def _tabled(part: _Part, frames: Frames, mean: Average, shrunk: Shrunk) -> Observables:
+def _tabled(
+    part: _Part, frames: Frames, mean: Average, shrunk: Shrunk, basis: FloatArray
+) -> Observables:
     n = int(frames.used.sum())
     scatter = None if shrunk.carried is None else csr_array(shrunk.scatter / n)
     return observables_of(
         part.bench.view,
         part.template,
         mean,
-        shrunk.matrix / n,
+        Block(np.arange(len(basis)), shrunk.matrix / n, basis),
         n_integrations=n if n > 1 else None,
         kind="estimated" if n > 1 else "given",
         freedom=shrunk.carried,

@@ -52,7 +52,8 @@ def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) 
         gain = np.exp(-0.25 * (side[:, None] ** 2 + side**2) / GAUSS_SIGMA**2)
     if options.method == "fft":
         patches = Patches.of(view, view.frequency_px, half_width)
-        gain = _trimmed(_brightness(_own(view, patches, level, fringes.matrix)))
+        flat = patches.transform(level.window.reshape(view.shape))
+        gain = _trimmed(_brightness(_own(view, patches, level, fringes.matrix, flat)))
     linear = np.column_stack([level.flux, level.background])
     return Splodges(view, linear, level.window, gain, star)
 
@@ -121,28 +122,34 @@ def _matched(view: View, half_width: int, level: _Levels, basis: FloatArray) -> 
     known from the model and taken out.
     """
     patches = Patches.of(view, view.frequency_px, half_width)
-    own = _own(view, patches, level, basis)
+    flat = patches.transform(level.window.reshape(view.shape))
+    own = _own(view, patches, level, basis, flat)
     share = (own * _brightness(own)).conj()
-    level_of = np.sum(share * patches.transform(level.window.reshape(view.shape)), axis=(1, 2))
+    level_of = np.sum(share * flat, axis=(1, 2))
     weights = np.concatenate([share, -1j * share])
     twice = np.tile(np.arange(len(share)), 2)
-    waves = patches.select(twice).combined(weights).reshape(len(weights), -1) * level.window
-    waves -= np.outer(np.concatenate([level_of.real, level_of.imag]), level.background)
-    rows = np.concatenate([level.flux[None], waves])
-    seen = rows @ basis
-    scale = np.abs(seen).max(axis=1)[:, None]
-    alone = np.linalg.inv(seen / scale) @ (rows / scale)
-    alone = np.concatenate([alone, level.background[None]])
-    return OneEach.of(alone.T, view.instrument.mask, view.frequency_px)
+    waves = patches.select(twice).combined(weights).reshape(len(weights), -1)
+    waves *= level.window
+    rows = np.concatenate([level.flux[None], waves, level.background[None]])
+    mixed = np.eye(len(rows))
+    mixed[1:-1, -1] = -np.concatenate([level_of.real, level_of.imag])
+    seen = (mixed @ (rows @ basis))[:-1]
+    scale = np.abs(seen).max(axis=1)
+    mixed[:-1] = np.linalg.inv(seen / scale[:, None]) / scale @ mixed[:-1]
+    return OneEach.of((mixed @ rows).T, view.instrument.mask, view.frequency_px)
 
 
-def _own(view: View, patches: Patches, level: _Levels, basis: FloatArray) -> ComplexArray:
-    """Transform (n_baselines, k, k) of every baseline's own fringe, less its background."""
+def _own(
+    view: View, patches: Patches, level: _Levels, basis: FloatArray, flat: ComplexArray
+) -> ComplexArray:
+    """Transform (n_baselines, k, k) of every baseline's own fringe, less its background.
+
+    ``flat`` is that of a background of 1.
+    """
     n = basis.shape[1] // 2
     background = (level.background @ basis)[1:].reshape(2, n)
     fringes = (basis.T[1:] * level.window).reshape(2, n, *view.shape)
     real, imaginary = (patches.transform(f) for f in fringes)
-    flat = patches.transform(level.window.reshape(view.shape))
     below = background[0] - 1j * background[1]
     return np.asarray(real - 1j * imaginary - below[:, None, None] * flat)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -13,16 +12,16 @@ from scipy.special import ndtr, ndtri
 from amibayes.cube import Cube
 from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
 from amibayes.extraction.geometry import Geometry
-from amibayes.extraction.image_plane import FringeFit, SingleArray, shift_of
+from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.sampling import IntArray, OneEach, PixelArray, Sampling
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, SingleArray
 
-CHUNK = 64
-"""Integrations that are worked on together."""
+CHUNK, CHUNK_PIXELS = 64, 2**23
+"""Integrations that are worked on together; fewer where they are large."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +157,8 @@ class Bench:
     def misfit(self, flux: FloatArray, left: SingleArray) -> FloatArray:
         """Residual of images of a flux (n,) in units of the reference at that flux, rms."""
         usual = self._usual_left
-        power = np.einsum("np,np->n", left, left) + 2.0 * (left @ usual) + usual @ usual
+        own = (left[:, None] @ left[:, :, None]).ravel()
+        power = own + 2.0 * (left @ usual) + usual @ usual
         size = np.abs(flux / self._known[0]) * np.sqrt(float(self._usual @ self._usual))
         return np.asarray(np.sqrt(np.maximum(power, 0.0)) / np.maximum(size, 1e-300))
 
@@ -186,13 +186,15 @@ class Bench:
     @cached_property
     def _to_model(self) -> FloatArray:
         """(m, n_coefficients): numbers times this are coefficients of the model."""
-        if self._complete:
+        if self._complete and self.options.method != "fringes":  # which are coefficients
             return np.asarray(np.linalg.inv(self.fit.design.T @ self._operator))
         n = self.fit.n_coefficients
         return np.eye(self._operator.shape[1], n, n - self._operator.shape[1])
 
     @cached_property
     def _single(self) -> SingleArray:
+        if isinstance(self.sampling, OneEach):
+            return self.sampling.single
         return np.ascontiguousarray(self._operator, dtype=np.float32)
 
     @cached_property
@@ -225,8 +227,10 @@ def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArra
     """
     parts, flux, count = [], 0.0, 0
     total = np.zeros(bench.sampling.n_samples, dtype=complex)
-    room = np.empty((2, min(CHUNK, file.n_integrations), len(bench.scatter)), np.float32)
-    for cube in _chunks(file):
+    size = _chunk_size(file)
+    room = np.empty((2, size, len(bench.scatter)), np.float32)
+    for start in range(0, file.n_integrations, size):
+        cube = file.read(start, min(start + size, file.n_integrations))
         frames, samples = _measure_chunk(bench, cube, room)
         lit = frames.used
         total += bench.sampling.centred(samples[lit], frames.shift_px[lit])
@@ -248,9 +252,9 @@ def concatenated(parts: list[Frames]) -> Frames:
     )
 
 
-def _chunks(file: Source) -> Iterator[Cube]:
-    for start in range(0, file.n_integrations, CHUNK):
-        yield file.read(start, min(start + CHUNK, file.n_integrations))
+def _chunk_size(file: Source) -> int:
+    n_y, n_x = file.template.images.shape[1:]
+    return min(CHUNK, file.n_integrations, max(int(CHUNK_PIXELS // (n_y * n_x)), 1))
 
 
 def _measure_chunk(bench: Bench, cube: Cube, room: SingleArray) -> tuple[Frames, ComplexArray]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
@@ -19,11 +18,9 @@ from amibayes.extraction.sampling import BoolArray, IntArray, OneEach, PixelArra
 from amibayes.extraction.view import CONVERGED_PX, View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, SingleArray
 
 MOST_STEPS = 12
-
-SingleArray = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

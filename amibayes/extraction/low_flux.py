@@ -52,8 +52,9 @@ def expected_covariance(
     -------
     (n_baselines + n_triangles, n_baselines + n_triangles) array
     """
-    if isinstance(sampling, OneEach):
-        return _of_one_each(sampling, flux, samples, variance, skewness)
+    if isinstance(sampling, OneEach):  # in units of the flux, so that single precision holds it
+        relative = samples / flux, variance / flux**2, skewness / flux**3
+        return _of_one_each(sampling, *relative)
     assert isinstance(sampling, Splodges)
     slopes = sampling.slopes(flux, samples) * np.sqrt(variance)
     total = slopes @ slopes.T
@@ -63,10 +64,10 @@ def expected_covariance(
 
 
 def _of_one_each(
-    sampling: OneEach, flux: float, samples: ComplexArray, variance: FloatArray, third: FloatArray
+    sampling: OneEach, samples: ComplexArray, variance: FloatArray, third: FloatArray
 ) -> FloatArray:
     noise = sampling.covariance(variance)
-    share, slope = sampling.shares(flux, samples), sampling.jacobian(flux, samples)
+    share, slope = sampling.shares(1.0, samples), sampling.jacobian(1.0, samples)
     legs = _Legs.of(sampling, samples, noise)
     n = len(share)
     skewed = slope @ _curved(sampling, samples, share, third)
@@ -89,15 +90,15 @@ def _curved(
     The second order that a unit in one pixel makes with itself is Σ pairs x·y of the legs'
     changes: (Σ Re)(Σ Im) − Σ Re·Im is its imaginary part.
     """
-    columns, n = sampling.matrix.T, sampling.n_samples
-    of_real, of_imaginary = (1.0 / samples)[:, None].real, (1.0 / samples)[:, None].imag
+    columns, n = sampling.single.T[:-1], sampling.n_samples
+    of_leg = (1.0 / samples)[:, None].astype(np.complex64)
     a, b = columns[1 : 1 + n], columns[1 + n :]
-    real, imaginary = a * of_real - b * of_imaginary, a * of_imaginary + b * of_real
-    turned = signs(sampling.triangles, n)
+    real, imaginary = a * of_leg.real - b * of_leg.imag, a * of_leg.imag + b * of_leg.real
+    turned, share = signs(sampling.triangles, n).astype(np.float32), share.astype(np.float32)
     curved = np.concatenate([share @ columns**2, (np.abs(turned) @ real) * (turned @ imaginary)])
     curved[n:] -= turned @ (real * imaginary)
-    curved *= third
-    return np.asarray(columns @ curved.T)
+    curved *= third.astype(np.float32)
+    return np.asarray(columns @ curved.T, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,9 @@ NODES_PER_FRINGE = 2.8
 RUN_OUT = 6
 """Places beyond the last, for the splines to start and end in."""
 
-NEAR_ANGLES = 9
+NEAR_RADII, NEAR_ANGLES = (0.7, 1.4), 9
+"""Rings of places about the star, in units of the pointing error that they serve, and how
+many places on each: a polynomial of degree 4 has waves of order 4 around a ring."""
 
 REACH_PX = (0.3, 1.5)
 """Pointing errors that the response to the star itself is measured for, at least and most."""
@@ -64,8 +66,8 @@ def off_axis_response(
     step = max(int(fringe / (NODES_PER_FRINGE * cell)), 1)
     half = int(FARTHEST * view.instrument.field_rad / (step * cell))
     axis = step * cell * np.arange(-half, half + 1)
-    rows = [sampling.apply(r.reshape(len(r), -1)) for r in star.on_lattice(step, half)]
-    flux, samples = (np.concatenate(each) for each in zip(*rows, strict=True))
+    parts = [sampling.apply(i.reshape(len(i), -1)) for i in star.on_lattice(step, half)]
+    flux, samples = (np.concatenate(each) for each in zip(*parts, strict=True))
     x, y = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
     turns = view.uv_m @ np.stack([x, y]) / view.wavelength_m
     ratio = np.vstack([flux, sampling.fringes(samples).T * np.exp(2j * np.pi * turns)])
@@ -104,8 +106,8 @@ def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray)
     """
     reach = float(np.clip(np.abs(shift_px).max(initial=0.0), *REACH_PX))
     angle = 2.0 * np.pi * np.arange(NEAR_ANGLES) / NEAR_ANGLES
-    radius, angle = np.meshgrid(reach * np.array([0.35, 0.75, 1.4]), angle)
-    place = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2).reshape(-1, 2)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    place = reach * np.concatenate([np.zeros((1, 2)), *(r * ring for r in NEAR_RADII)])
     flux, samples = _measured(star, sampling, place)
     turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)
     seen = sampling.fringes(samples) * turn / flux[:, None]
@@ -117,7 +119,7 @@ def _measured(
     star: FineImage, sampling: Sampling, place_px: FloatArray
 ) -> tuple[FloatArray, ComplexArray]:
     """Flux and samples of the star at places (n, 2) from the centre."""
-    images = star.moved(place_px)
+    images = star.moved(place_px).astype(float)
     return sampling.apply(images.reshape(len(images), -1))
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from amibayes.instrument import Mask
 from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, SingleArray
 
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
@@ -102,11 +102,12 @@ class OneEach:
     def apply(self, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux (n,) and samples (n, n_samples) of images (n, n_pixels)."""
         single = pixels.dtype == np.float32
-        return split(pixels @ (self._single if single else self.matrix))
+        return split(pixels @ (self.single if single else self.matrix))
 
     @cached_property
-    def _single(self) -> NDArray[np.float32]:
-        return np.ascontiguousarray(self.matrix, dtype=np.float32)
+    def single(self) -> SingleArray:
+        """`linear` in single precision, for the products that it is needed in most."""
+        return np.ascontiguousarray(self.linear, dtype=np.float32)
 
     def power(self, samples: ComplexArray) -> FloatArray:
         """V² times flux², (n, n_baselines), with its noise bias."""

@@ -31,7 +31,7 @@ def observables_of(
     view: View,
     template: Cube,
     average: Average,
-    covariance: FloatArray,
+    covariance: Block,
     *,
     n_integrations: int | None,
     kind: CovarianceKind,
@@ -49,11 +49,10 @@ def observables_of(
     timing = (mjd, integration_s)
     vis2 = _rows(setup, holes, mask.pairs, [(0, 1)], average.vis2, timing)
     closure = _rows(setup, holes, mask.triangles, [(0, 1), (1, 2)], average.closure_phase, timing)
-    block = Block(np.arange(len(covariance)), covariance, independent_basis(view))
     return Observables(
         vis2,
         closure,
-        BlockCovariance(len(covariance), [block]),
+        BlockCovariance(len(covariance.index), [covariance]),
         kind,
         (setup,),
         n_integrations,

@@ -12,7 +12,7 @@ from amibayes.cube import Cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import Channels, Instrument, load_instrument
-from amibayes.optics import FringeBasis, fringe_field, psf
+from amibayes.optics import FringeBasis, fringe_field, fringe_image
 from amibayes.spectrum import Blackbody
 from amibayes.units import FloatArray
 
@@ -153,8 +153,9 @@ def _refuse_small(image: FloatArray, instrument: Instrument, source: str) -> Non
 def _peak(image: FloatArray, instrument: Instrument, channels: Channels) -> tuple[int, int]:
     """Pixel (y, x) at which the image is most like that of a star."""
     side = min(*image.shape, 31)
+    n = instrument.mask.n_baselines
     few = Channels.monochromatic(channels.mean_m)
-    star = psf(instrument, few, side - 1 + side % 2)
+    star = fringe_image(instrument, few, np.repeat([1.0, 0.0], [1 + n, n]), side - 1 + side % 2, 1)
     found = fftconvolve(image - np.median(image), star, mode="same")
     y, x = np.unravel_index(int(found.argmax()), image.shape)
     return int(y), int(x)

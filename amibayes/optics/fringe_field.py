@@ -20,7 +20,7 @@ from amibayes.optics.fringes import FringeBasis
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.psf import ComplexArray
 from amibayes.optics.sampling import HALF_WIDTH, LARGEST_FREQUENCY, interpolator, pixel_weights
-from amibayes.units import FloatArray, read_only
+from amibayes.units import FloatArray, SingleArray, read_only
 
 REACH_STEP_PX = 8
 """Fields come in sizes that differ by so much, so that few are made."""
@@ -59,13 +59,11 @@ class FringeField:
             )
         )
         real, imaginary = up @ (self.hills @ across.T)
-        wave = wave_y[1:, :, None] * wave_x[1:, None, :]
-        n = len(wave)
-        columns = np.empty((1 + 2 * n, *shape))
-        columns[0] = real[0]
-        columns[1 : 1 + n] = wave.real * real[1:] - wave.imag * imaginary[1:]
-        columns[1 + n :] = -wave.real * imaginary[1:] - wave.imag * real[1:]
-        columns[1:] *= 2.0
+        fringe = np.empty((len(real) - 1, *shape), dtype=complex)
+        fringe.real, fringe.imag = real[1:], imaginary[1:]
+        fringe *= 2.0 * wave_y[1:, :, None]
+        fringe *= wave_x[1:, None, :]
+        columns = np.concatenate([real[:1], fringe.real, -fringe.imag])
         return FringeBasis(columns.reshape(len(columns), -1).T, shape)
 
     def _along(
@@ -112,13 +110,14 @@ def fringe_image(
     oversample: int,
     *,
     rotation_rad: float = 0.0,
-) -> FloatArray:
+) -> SingleArray:
     """Image of coefficients (1 + 2·n_baselines,) of the fringe model, on cells of pixels.
 
     Returns
     -------
     (n_pixels·oversample, n_pixels·oversample) array
-        Photons per cell, by what its centre gets; the star is in the middle.
+        Photons per cell, by what its centre gets, in single precision; the star is in the
+        middle.
 
     Notes
     -----
@@ -127,15 +126,17 @@ def fringe_image(
     recipe = _Recipe.of(instrument, channels, n_pixels, rotation_rad)
     mask, place = recipe.mask, recipe.cells(oversample)
     size, half = len(place), len(place) // 2
-    real, imaginary = 2.0 * coefficients[1:].reshape(2, -1, 1)
-    total, fringes = np.zeros((size, size)), np.empty((size, size))
+    real, imaginary = 2.0 * coefficients[1:].reshape(2, -1, 1).astype(np.float32)
+    total, fringes = np.zeros((2, size, size), np.float32)
     for wavelength, power in zip(channels.wavelength_m, _powers(recipe, oversample), strict=True):
-        turn = 2.0 * np.pi / wavelength * mask.uv_m.T[:, :, None] * place
-        cosine, sine = np.cos(turn[1]), np.sin(turn[1])
+        turns = mask.uv_m.T[:, :, None] / wavelength * place
+        turns -= np.rint(turns)
+        phase = (2.0 * np.pi * turns).astype(np.float32)
+        cosine, sine = np.cos(phase[1]), np.sin(phase[1])
         # Cells lie evenly about the star: what is even and what is odd along x serve both sides.
-        even = (real * cosine - imaginary * sine).T @ np.cos(turn[0, :, half:])
-        odd = (real * sine + imaginary * cosine).T @ np.sin(turn[0, :, half:])
-        even += mask.n_holes * coefficients[0]
+        even = (real * cosine - imaginary * sine).T @ np.cos(phase[0, :, half:])
+        odd = (real * sine + imaginary * cosine).T @ np.sin(phase[0, :, half:])
+        even += np.float32(mask.n_holes * coefficients[0])
         fringes[:, half:] = even - odd
         fringes[:, : size - half] = (even + odd)[:, ::-1]
         total += np.multiply(fringes, power, out=fringes)
@@ -143,7 +144,7 @@ def fringe_image(
 
 
 @lru_cache(maxsize=4)
-def _powers(recipe: _Recipe, oversample: int) -> tuple[FloatArray, ...]:
+def _powers(recipe: _Recipe, oversample: int) -> tuple[SingleArray, ...]:
     """Photons of one hole per cell, for every wavelength."""
     place, channels, mask = recipe.cells(oversample), recipe.channels, recipe.mask
     step = place[1] - place[0]
@@ -152,8 +153,8 @@ def _powers(recipe: _Recipe, oversample: int) -> tuple[FloatArray, ...]:
         f = place / wavelength
         power = hole_transform(mask, f[None, :], f[:, None]) ** 2
         power *= share * step**2 / (wavelength**2 * mask.area_m2)
-        power.flags.writeable = False
-        powers.append(power)
+        powers.append(power.astype(np.float32))
+        powers[-1].flags.writeable = False
     return tuple(powers)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, SingleArray
 
 IntArray = NDArray[np.intp]
 
@@ -29,6 +29,9 @@ LARGEST_FREQUENCY = 0.15
 
 _KAISER_BETA = 17.7
 """Errors below 1e-8 up to the largest frequency, for this width."""
+
+LATTICE_IMAGES = 64
+"""Of a lattice, about so many images are given at a time."""
 
 _NODES = 8
 """Gauss–Legendre nodes across a pixel; the mask's fringes turn by 1.5 rad at most."""
@@ -77,14 +80,14 @@ def pixel_operator(
 
 
 def shifted_images(
-    fine: FloatArray, oversample: int, shape: tuple[int, int], shift_px: FloatArray
-) -> FloatArray:
+    fine: SingleArray, oversample: int, shape: tuple[int, int], shift_px: FloatArray
+) -> SingleArray:
     """Images (n, n_y, n_x) of fine cells displaced by (x, y), pixels.
 
     As `pixel_operator` along both axes. Pixels are whole numbers of cells apart, so that
     one short kernel along an axis serves all of them.
     """
-    out = np.empty((len(shift_px), *shape))
+    out = np.empty((len(shift_px), *shape), np.float32)
     (first, up), (left, across) = (
         _kernels(n, size, oversample, s)
         for n, size, s in zip(shape, fine.shape, shift_px.T[::-1], strict=True)
@@ -92,24 +95,24 @@ def shifted_images(
     high = sliding_window_view(fine, up.shape[1], axis=0)
     for k, image in enumerate(out):
         rows = high[first[k] :: oversample][: shape[0]] @ up[k]
-        wide = sliding_window_view(rows, across.shape[1], axis=1)
-        image[:] = wide[:, left[k] :: oversample][:, : shape[1]] @ across[k]
+        wide = sliding_window_view(np.ascontiguousarray(rows.T), across.shape[1], axis=0)
+        image[:] = (wide[left[k] :: oversample][: shape[1]] @ across[k]).T
     return out
 
 
 def lattice_images(
-    fine: FloatArray,
+    fine: SingleArray,
     oversample: int,
     shape: tuple[int, int],
     centre_px: tuple[float, float],
     step: int,
     half: int,
-) -> Iterator[NDArray[np.float32]]:
-    """Yield images (2·half + 1, n_y, n_x) of fine cells displaced to a square lattice of places.
+) -> Iterator[SingleArray]:
+    """Yield images (n, n_y, n_x) of fine cells displaced to a square lattice of places.
 
-    The places are ``centre_px`` (x, y) and up to ``half`` times ``step`` cells to either side:
-    x from the first of what is yielded to the last, y within it. Displacements by whole
-    cells share one interpolation, so that an image is a choice of pixels, in single precision.
+    The places are ``centre_px`` (x, y) and up to ``half`` times ``step`` cells to either side,
+    (2·half + 1)² in all, x outside and y within. Displacements by whole cells share one
+    interpolation, so that an image is a choice of pixels.
     """
     starts, kernels = zip(
         *(
@@ -119,19 +122,25 @@ def lattice_images(
         strict=True,
     )
     pixels = fine
-    for axis, kernel in enumerate(kernels):
-        pixels = sliding_window_view(pixels, kernel.shape[1], axis=axis) @ kernel[0]
-    small = np.ascontiguousarray(pixels, dtype=np.float32)
-    (top,), (left,) = starts
-    windows = sliding_window_view(small, [(n - 1) * oversample + 1 for n in shape])
+    for kernel in kernels:
+        along_first = sliding_window_view(pixels, kernel.shape[1], axis=0) @ kernel[0]
+        pixels = np.ascontiguousarray(along_first.T)
+    # Cells a whole number of pixels apart are laid side by side: rows of images are copied whole.
+    padded = np.pad(pixels, [(0, -n % oversample) for n in pixels.shape])
+    phases = padded.reshape(len(padded) // oversample, oversample, -1, oversample)
+    apart = np.ascontiguousarray(phases.transpose(1, 3, 0, 2))
+    windows = sliding_window_view(apart, shape, axis=(2, 3))
     to_side = step * np.arange(half, -half - 1, -1)
-    for x in left + to_side:
-        yield windows[top + to_side, x, ::oversample, ::oversample]
+    (y, own_y), (x, own_x) = (np.divmod(first + to_side, oversample) for first in starts)
+    at_once = max(LATTICE_IMAGES // len(to_side), 1)
+    for k in range(0, len(to_side), at_once):
+        part = slice(k, k + at_once), None
+        yield windows[own_y, own_x[part], y, x[part]].reshape(-1, *shape)
 
 
 def _kernels(
     n_pixels: int, n_fine: int, oversample: int, shift_px: FloatArray
-) -> tuple[IntArray, FloatArray]:
+) -> tuple[IntArray, SingleArray]:
     """First cell (n,) of the first pixel along an axis, and the weights (n, k) from there on."""
     nodes, response = pixel_weights()
     place = -0.5 * (n_pixels - 1) - shift_px[:, None] + nodes
@@ -141,7 +150,7 @@ def _kernels(
     kernel = np.zeros((len(start), int(at.max()) + 1))
     row = np.arange(len(start))[:, None, None]
     np.add.at(kernel, (row, at), oversample * response[:, None] * weight)
-    return start, kernel
+    return start, kernel.astype(np.float32)
 
 
 def pixel_transform(frequency_per_px: FloatArray, pixel_response: float = 0.0) -> FloatArray:
