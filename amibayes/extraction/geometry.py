@@ -169,7 +169,7 @@ def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:
         To a percent, and but for the flux.
     """
     step = STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    here, *sides = fine_image(view, coefficients, STEP_PX).moved(step)
+    here, *sides = fine_image(view, coefficients, STEP_PX).moved(step).astype(float)
     right, left, up, down = sides
     by_x, by_y = (left - right) / (2.0 * STEP_PX), (down - up) / (2.0 * STEP_PX)
     bend = (sum(sides) - 4.0 * here) / STEP_PX**2

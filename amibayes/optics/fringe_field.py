@@ -143,7 +143,7 @@ def fringe_image(
     return total
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=6)
 def _powers(recipe: _Recipe, oversample: int) -> tuple[SingleArray, ...]:
     """Photons of one hole per cell, for every wavelength."""
     place, channels, mask = recipe.cells(oversample), recipe.channels, recipe.mask
