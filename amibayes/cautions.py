@@ -187,9 +187,11 @@ def search_cautions(
     if posterior is not None and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:
+            leaps = posterior.mode_method == "grid"
+            held = "takes in all modes" if leaps else "is that of the reported position alone"
             found.append(
-                f"the posterior is that of the reported position, whose probability among "
-                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
+                f"the posterior {held}: among {len(posterior.mode_probability)} modes the reported "
+                f"position has a probability of {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
         exact = "; posterior.integrated in result.json does not rest on the chain"

@@ -18,10 +18,12 @@ GROUP = "mcmc"
 """Name of the HDF5 group, as emcee's own backend has it."""
 
 
-def digest_of(likelihood: Likelihood, prior: Prior, start: FloatArray, seed: int) -> str:
-    """Say in short which data, model, prior and start a chain belongs to."""
+def digest_of(
+    likelihood: Likelihood, prior: Prior, start: FloatArray, seed: int, *, leaps: bool
+) -> str:
+    """Say in short which data, model, prior, start and moves a chain belongs to."""
     kind = type(likelihood).__name__
-    text = repr((kind, likelihood.model, prior, seed, emcee.__version__)).encode()
+    text = repr((kind, likelihood.model, prior, seed, leaps, emcee.__version__)).encode()
     return sha256(text + likelihood.observables.data.tobytes() + start.tobytes()).hexdigest()
 
 

@@ -20,6 +20,7 @@ from amibayes.errors import DataError, UsageError
 from amibayes.inference.chain_file import digest_of, load_chain, save_chain
 from amibayes.inference.grid_posterior import GridPosterior
 from amibayes.inference.laplace import gaussian_of, log_masses, physical
+from amibayes.inference.leaps import Leaps
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.priors import Prior
 from amibayes.inference.results import Mode, SearchResult
@@ -214,7 +215,8 @@ def sample(
     resume : bool
         Go on from ``path`` if it holds the chain of the same data, prior and seed.
     grid : GridPosterior, optional
-        Of the same likelihood and prior: gives the modes' probabilities.
+        Of the same likelihood and prior: gives the modes' probabilities, and `Leaps` from
+        any of them to any other.
     max_steps : int
         Steps after which a chain that has not converged is given up (and said to be so).
     progress : callable, optional
@@ -223,14 +225,14 @@ def sample(
     likelihood = result.likelihood
     start = _start(result, prior, rng)
     seed = int(rng.integers(2**32))
-    digest = digest_of(likelihood, prior, start, seed)
+    digest = digest_of(likelihood, prior, start, seed, leaps=grid is not None)
     backend = load_chain(path, digest) if path and resume else None
     sampler = emcee.EnsembleSampler(
         len(start),
         start.shape[1],
         _log_posterior(likelihood, prior),
         vectorize=True,
-        moves=[(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)],
+        moves=_moves(grid),
         backend=backend,
     )
     state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
@@ -241,6 +243,14 @@ def sample(
         if progress:
             progress(sampler.iteration, int(ENOUGH * _time(sampler)))
     return _posterior(sampler, result, prior, grid, done)
+
+
+def _moves(grid: GridPosterior | None) -> list[tuple[emcee.moves.Move, float]]:
+    """Moves and how often each is made."""
+    along = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    if grid is None:
+        return along
+    return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(Leaps(grid)), 0.5)]
 
 
 def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray], FloatArray]:
@@ -278,10 +288,10 @@ def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
 
 
 def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
-    """Choose the modes that one chain explores.
+    """Choose the modes that one chain explores without `Leaps`.
 
-    A chain never passes between modes that are both strong: then it is that of the
-    reported one. Weak ones are joined by the sea of noise around them.
+    It never passes between modes that are both strong: then it is that of the reported one.
+    Weak ones are joined by the sea of noise around them.
     """
     strong = result.modes[0].delta_chi2 > STRONG
     return result.modes[:1] if strong else result.modes

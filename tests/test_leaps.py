@@ -1,0 +1,89 @@
+"""Leaps: drawn as the grid says, with the density that they state, and harmless where wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+
+from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
+from amibayes.inference.leaps import Leaps
+from amibayes.inference.likelihood import Likelihood
+from amibayes.inference.model import BinaryModel
+from amibayes.inference.posterior import sample
+from amibayes.inference.priors import default_prior
+from amibayes.inference.search import search
+
+FIELD = (120.0, 220.0)
+TRUTH = [150.0, -80.0, 0.01]
+DRAWS = 20_000
+
+
+@pytest.fixture(scope="module", params=["", "background"])
+def likelihood(request) -> Likelihood:
+    free = request.param
+    model = BinaryModel(**({free: "free"} if free else {}))
+    theta = TRUTH + [0.02] * bool(free)
+    return Likelihood(simulated(niriss(), theta, np.random.default_rng(5), model), model)
+
+
+@pytest.fixture(scope="module")
+def grid(likelihood: Likelihood) -> GridPosterior:
+    return grid_posterior(likelihood, default_prior(likelihood, *FIELD), step=2.0)
+
+
+def names(grid: GridPosterior) -> tuple[str, ...]:
+    return ("east_mas", "north_mas", "ln_contrast", *grid.nuisance_names)
+
+
+def test_draws_have_the_distribution_of_the_grid(grid: GridPosterior) -> None:
+    """Kolmogorov–Smirnov distance below 2.7/√n, p = 1e-6, and what cells are spread by."""
+    places, _ = Leaps(grid).draw(DRAWS, np.random.RandomState(1))
+    share = (np.arange(DRAWS) + 0.5) / DRAWS
+    for name, values in zip(names(grid), places.T, strict=True):
+        distance = np.abs(grid.marginal(name).cdf(np.sort(values)) - share).max()
+        assert distance < 0.01 + 2.7 / np.sqrt(DRAWS), name
+
+
+def test_stated_density_is_that_of_the_draws(grid: GridPosterior) -> None:
+    """Its integral over a box about the mode, by Monte Carlo, is the share of draws there."""
+    leaps, rng = Leaps(grid), np.random.default_rng(2)
+    places, stated = leaps.draw(DRAWS, np.random.RandomState(2))
+    found = leaps.log_density(places)
+    # A draw at the very edge of a cell may be rounded into its neighbour.
+    assert np.mean(found == stated) > 0.999
+    low, high = np.quantile(places, [0.2, 0.8], axis=0)
+    seen = float(((places > low) & (places < high)).all(axis=1).mean())
+    points = rng.uniform(low, high, (DRAWS, len(low)))
+    density = np.exp(leaps.log_density(points)) * np.prod(high - low)
+    error = np.hypot(np.sqrt(seen * (1 - seen) / DRAWS), density.std() / np.sqrt(DRAWS))
+    assert abs(density.mean() - seen) < 4.5 * error
+    assert error < 0.1 * seen
+
+
+def test_outside_the_grid_there_is_no_density(grid: GridPosterior) -> None:
+    place = Leaps(grid).draw(1, np.random.RandomState(3))[0]
+    for k in range(place.shape[1]):
+        away = place.copy()
+        away[0, k] += 1e4
+        assert Leaps(grid).log_density(away)[0] == -np.inf
+
+
+def test_wrong_leaps_make_no_wrong_posterior(likelihood: Likelihood, grid: GridPosterior) -> None:
+    """Draws that favour the east by five to one are put right by Metropolis & Hastings' rule."""
+    east = grid.cells.position[0] > grid.interval("east_mas")[0]
+    share = grid.contrast_probability * np.where(east, 5.0, 1.0)[:, None]
+    share /= share.sum()
+    wrong = replace(grid, contrast_probability=share, probability=share.sum(axis=1))
+    result = search(likelihood, FIELD)
+    posterior = sample(result, grid.prior, np.random.default_rng(4), grid=wrong)
+    assert posterior.converged
+    for k, name in enumerate(names(grid)):
+        column = posterior.samples[:, k]
+        values = np.sort(np.log(column) if name == "ln_contrast" else column)
+        ranks = (np.arange(len(values)) + 0.5) / len(values)
+        n = posterior.convergence()[posterior.names[k]]["n_effective"]
+        distance = np.abs(grid.marginal(name).cdf(values) - ranks).max()
+        assert distance < 0.02 + 2.7 / np.sqrt(n), name
