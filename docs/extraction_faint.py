@@ -10,9 +10,9 @@ first. The table goes to docs/extraction.md, between the lines that mark it.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from pages import put_table
 
 from amibayes import load_instrument
 from amibayes.cube import Cube
@@ -98,12 +98,7 @@ def table() -> list[str]:
 
 def main() -> int:
     """Put the table where it belongs."""
-    page = Path(__file__).with_name("extraction.md")
-    found = table()
-    head, _, rest = page.read_text(encoding="utf-8").partition("<!-- faint -->\n")
-    tail = rest.partition("<!-- end of faint -->\n")[2]
-    text = "\n".join(["<!-- faint -->", "", *found, "", "<!-- end of faint -->", ""])
-    page.write_text(head + text + tail, encoding="utf-8")
+    put_table("extraction.md", table(), "faint")
     return 0
 
 

@@ -15,9 +15,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
+from pages import put_table
 
 from amibayes import Scene, load_instrument
 from amibayes.calibration import calibrate
@@ -229,12 +229,7 @@ def row(label: str, photons: float, method: str, found: Pulls) -> str:
 
 def main() -> int:
     """Put the table where it belongs."""
-    page = Path(__file__).with_name("extraction.md")
-    found = table()
-    head, _, rest = page.read_text(encoding="utf-8").partition("<!-- pulls -->\n")
-    tail = rest.partition("<!-- end of pulls -->\n")[2]
-    text = "\n".join(["<!-- pulls -->", "", *found, "", "<!-- end of pulls -->", ""])
-    page.write_text(head + text + tail, encoding="utf-8")
+    put_table("extraction.md", table(), "pulls")
     return 0
 
 

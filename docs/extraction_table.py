@@ -13,9 +13,9 @@ import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from pages import put_table
 
 from amibayes import Instrument, load_instrument, psf
 from amibayes.calibration import calibrate
@@ -159,11 +159,7 @@ def table() -> list[str]:
 
 
 def main() -> int:
-    page = Path(__file__).with_name("extraction.md")
-    head, _, rest = page.read_text(encoding="utf-8").partition("<!-- table -->\n")
-    tail = rest.partition("<!-- end of table -->\n")[2]
-    text = "\n".join(["<!-- table -->", "", *table(), "", "<!-- end of table -->", ""])
-    page.write_text(head + text + tail, encoding="utf-8")
+    put_table("extraction.md", table())
     return 0
 
 

@@ -10,6 +10,8 @@ import shutil
 import sys
 from pathlib import Path
 
+from pages import put_table
+
 DOCS = Path(__file__).parent
 PICTURES = ("ranks", "coverage", "false_alarms", "completeness")
 
@@ -41,11 +43,7 @@ def main(folder: str) -> int:
     content = json.loads((Path(folder) / "validation.json").read_text(encoding="utf-8"))
     for name in PICTURES:
         shutil.copy(Path(folder) / f"{name}.png", DOCS / "static" / f"validation_{name}.png")
-    page = DOCS / "validation.md"
-    head, _, rest = page.read_text(encoding="utf-8").partition("<!-- table -->\n")
-    tail = rest.partition("<!-- end of table -->\n")[2]
-    text = "\n".join(["<!-- table -->", "", *lines_of(content), "", "<!-- end of table -->", ""])
-    page.write_text(head + text + tail, encoding="utf-8")
+    put_table("validation.md", lines_of(content))
     return 0
 
 

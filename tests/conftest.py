@@ -19,6 +19,10 @@ settings.load_profile("repeatable")
 ROOT = Path(__file__).resolve().parent.parent
 
 
+# Scripts of the documentation share a module.
+sys.path.append(str(ROOT / "docs"))
+
+
 def data_folder() -> Path:
     return Path(os.environ.get("AMIBAYES_DATA", ROOT.parent / "shared" / "data"))
 
