@@ -5,6 +5,7 @@ Pauls et al. 2005 for version 1, Duvert et al. 2017 for version 2.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 
 import numpy as np
@@ -125,9 +126,9 @@ def _formats(oifits: OIFits, table: OITable, rules: list[ColumnRule]) -> Finding
     wrong = []
     for rule in rules:
         form = plain(table.header.get(f"TFORM{forms[rule.name][5:]}", ""))
-        repeat, letter = int(form[:-1] or 1), form[-1:]
-        channels = _channels(oifits, table)
-        wanted = rule.repeat or channels
+        wanted = rule.repeat or _channels(oifits, table)
+        parts = re.fullmatch(r"(\d*)([A-Z])", form)  # others are arrays of any length, or damage
+        repeat, letter = (int(parts[1] or 1), parts[2]) if parts else (0, form)
         if letter != rule.letter or (letter != "A" and wanted is not None and repeat != wanted):
             wrong.append(f"{rule.name} {form} (for {wanted or 'W'}{rule.letter})")
     if wrong:
