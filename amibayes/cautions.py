@@ -8,7 +8,8 @@ from scipy.stats import chi2
 from amibayes.calibration import Calibration
 from amibayes.inference.grid_posterior import integrable
 from amibayes.inference.noise import ExtraNoise
-from amibayes.inference.posterior import Posterior, modes_to_sample
+from amibayes.inference.posterior import Posterior
+from amibayes.inference.region import modes_to_sample
 from amibayes.inference.results import SearchResult
 from amibayes.inference.significance import Significance
 from amibayes.inference.whiteness import channel_correlation
@@ -187,11 +188,9 @@ def search_cautions(
     if posterior is not None and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:
-            leaps = posterior.mode_method == "grid"
-            held = "takes in all modes" if leaps else "is that of the reported position alone"
             found.append(
-                f"the posterior {held}: among {len(posterior.mode_probability)} modes the reported "
-                f"position has a probability of {share:.2f} ({posterior.mode_method})"
+                f"the posterior is that of the reported position, whose probability among "
+                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
         exact = "; posterior.integrated in result.json does not rest on the chain"

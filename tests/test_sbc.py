@@ -17,6 +17,7 @@ from amibayes.inference.grid_posterior import grid_posterior
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.posterior import sample
 from amibayes.inference.priors import Prior
+from amibayes.inference.region import Region
 from amibayes.inference.search import search
 
 FIELD = (50.0, 400.0)
@@ -84,6 +85,11 @@ def test_chain_and_grid_are_one_posterior(contrast) -> None:
     grid = grid_posterior(likelihood, prior)
     posterior = sample(result, prior, np.random.default_rng(4), grid=grid)
     assert posterior.converged
+    inside = Region.of(result).holds(*grid.cells.position)
+    # In noise the chain is that of the field; that of a strong mode leaves the others out.
+    assert inside.all() == (contrast == 0.0 or len(result.modes) == 1)
+    assert (grid.probability[inside].sum() > 0.999) == (contrast != 0.003)
+    grid = grid.within(inside)
     for k, name in enumerate(NAMES):
         values = np.sort(np.log(posterior.samples[:, k]) if k == 2 else posterior.samples[:, k])
         share = (np.arange(len(values)) + 0.5) / len(values)

@@ -19,12 +19,20 @@ GROUP = "mcmc"
 
 
 def digest_of(
-    likelihood: Likelihood, prior: Prior, start: FloatArray, seed: int, *, leaps: bool
+    likelihood: Likelihood,
+    prior: Prior,
+    start: FloatArray,
+    seed: int,
+    region: FloatArray,
+    *,
+    leaps: bool,
 ) -> str:
-    """Say in short which data, model, prior, start and moves a chain belongs to."""
+    """Say in short which data, model, prior, start, region and moves a chain belongs to."""
     kind = type(likelihood).__name__
     text = repr((kind, likelihood.model, prior, seed, leaps, emcee.__version__)).encode()
-    return sha256(text + likelihood.observables.data.tobytes() + start.tobytes()).hexdigest()
+    return sha256(
+        text + likelihood.observables.data.tobytes() + start.tobytes() + region.tobytes()
+    ).hexdigest()
 
 
 def save_chain(sampler: emcee.EnsembleSampler, path: str | Path, digest: str) -> None:

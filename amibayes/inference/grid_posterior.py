@@ -22,6 +22,7 @@ from amibayes.inference.integrand import Integrand, Nuisance
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.marginal import Marginal
 from amibayes.inference.priors import Prior
+from amibayes.observables import BoolArray
 from amibayes.units import FloatArray
 
 FLOOR = 10.0
@@ -144,6 +145,18 @@ class GridPosterior:
         mass = np.diff(self.prior.contrast_cdf(self.contrast_edges), axis=1)
         share = self.contrast_probability * (high - low) / np.where(mass > 0, mass, np.inf)
         return float(Marginal(low.ravel(), high.ravel(), share.ravel()).quantile(level))
+
+    def within(self, kept: BoolArray) -> GridPosterior:
+        """The posterior given that the companion is in the cells ``kept`` (n_cells,)."""
+        share = self.contrast_probability[kept]
+        share = share / share.sum()
+        return replace(
+            self,
+            cells=self.cells[kept],
+            probability=share.sum(axis=1),
+            contrast_edges=self.contrast_edges[kept],
+            contrast_probability=share,
+        )
 
     def mass_near(self, positions: FloatArray, radius_mas: float) -> FloatArray:
         """Probability of being within a radius of each position (n, 2) and nearest to it, (n,)."""

@@ -23,7 +23,8 @@ from amibayes.inference.laplace import gaussian_of, log_masses, physical
 from amibayes.inference.leaps import Leaps
 from amibayes.inference.likelihood import Likelihood
 from amibayes.inference.priors import Prior
-from amibayes.inference.results import Mode, SearchResult
+from amibayes.inference.region import Region, modes_to_sample
+from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolution_mas
 from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import FloatArray, contrast_to_delta_mag, position_angle_deg, separation
@@ -39,9 +40,6 @@ GOOD_RHAT = 1.02
 
 START_WIDTH = 0.05
 """Longest scatter of the walkers' start, in units of the field."""
-
-STRONG = 30.0
-"""Δχ² above which a mode is an island: no chain leaves it."""
 
 Progress = Callable[[int, int], None]
 
@@ -207,7 +205,8 @@ def sample(
     Parameters
     ----------
     result : SearchResult
-        Its modes are where the walkers start, in proportion to their Laplace weights.
+        Its modes are where the walkers start, in proportion to their Laplace weights; a
+        strong one keeps them in its `Region`.
     prior : Prior
     rng : numpy.random.Generator
     path : path, optional
@@ -215,24 +214,23 @@ def sample(
     resume : bool
         Go on from ``path`` if it holds the chain of the same data, prior and seed.
     grid : GridPosterior, optional
-        Of the same likelihood and prior: gives the modes' probabilities, and `Leaps` from
-        any of them to any other.
+        Of the same likelihood and prior: gives the modes' probabilities, and `Leaps`.
     max_steps : int
         Steps after which a chain that has not converged is given up (and said to be so).
     progress : callable, optional
         Called with (steps done, steps expected).
     """
-    likelihood = result.likelihood
-    start = _start(result, prior, rng)
+    likelihood, region = result.likelihood, Region.of(result)
+    start = _start(result, prior, region, rng)
     seed = int(rng.integers(2**32))
-    digest = digest_of(likelihood, prior, start, seed, leaps=grid is not None)
+    digest = digest_of(likelihood, prior, start, seed, region.places, leaps=grid is not None)
     backend = load_chain(path, digest) if path and resume else None
     sampler = emcee.EnsembleSampler(
         len(start),
         start.shape[1],
-        _log_posterior(likelihood, prior),
+        _log_posterior(likelihood, prior, region),
         vectorize=True,
-        moves=_moves(grid),
+        moves=_moves(grid, region),
         backend=backend,
     )
     state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
@@ -245,17 +243,23 @@ def sample(
     return _posterior(sampler, result, prior, grid, done)
 
 
-def _moves(grid: GridPosterior | None) -> list[tuple[emcee.moves.Move, float]]:
+def _moves(grid: GridPosterior | None, region: Region) -> list[tuple[emcee.moves.Move, float]]:
     """Moves and how often each is made."""
     along = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
     if grid is None:
         return along
-    return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(Leaps(grid)), 0.5)]
+    inside = region.holds(*grid.cells.position)
+    if not grid.probability[inside].any():  # too improbable for cells of its own
+        return along
+    leaps = Leaps(grid.within(inside))
+    return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(leaps), 0.5)]
 
 
-def _log_posterior(likelihood: Likelihood, prior: Prior) -> Callable[[FloatArray], FloatArray]:
+def _log_posterior(
+    likelihood: Likelihood, prior: Prior, region: Region
+) -> Callable[[FloatArray], FloatArray]:
     def log_posterior(x: FloatArray) -> FloatArray:
-        density = prior.log_density(x)
+        density = np.where(region.holds(*x[:, :2].T), prior.log_density(x), -np.inf)
         inside = np.isfinite(density)
         if inside.any():
             density[inside] += likelihood.log_prob(physical(x[inside], likelihood.model))
@@ -287,17 +291,9 @@ def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
     return grid.mass_near(places, 0.5 * resolution_mas(result.likelihood))
 
 
-def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
-    """Choose the modes that one chain explores without `Leaps`.
-
-    It never passes between modes that are both strong: then it is that of the reported one.
-    Weak ones are joined by the sea of noise around them.
-    """
-    strong = result.modes[0].delta_chi2 > STRONG
-    return result.modes[:1] if strong else result.modes
-
-
-def _start(result: SearchResult, prior: Prior, rng: np.random.Generator) -> FloatArray:
+def _start(
+    result: SearchResult, prior: Prior, region: Region, rng: np.random.Generator
+) -> FloatArray:
     """Walkers (n, n_dim) around the modes, each by its own covariance, inside the prior."""
     chosen, likelihood = modes_to_sample(result), result.likelihood
     # A weak mode's errors reach past the prior's edges; a walker needs only a fair start.
@@ -309,7 +305,7 @@ def _start(result: SearchResult, prior: Prior, rng: np.random.Generator) -> Floa
     centre = np.array([c for c, _ in fits])[which]
     scatter = np.array([s for _, s in fits])[which]
     trial = centre + np.einsum("nij,nj->ni", scatter, rng.standard_normal((n_trials, n_dim)))
-    inside = trial[np.isfinite(prior.log_density(trial))]
+    inside = trial[np.isfinite(prior.log_density(trial)) & region.holds(*trial[:, :2].T)]
     if len(inside) < N_WALKERS:
         raise DataError("the best fit lies outside the prior", source=likelihood.observables.source)
     return np.asarray(inside[:N_WALKERS])

@@ -361,15 +361,17 @@ def _doubts(
         )
     if aliases:
         opposite = [m for m in aliases if np.hypot(*np.add(m.theta[:2], modes[0].theta[:2])) < 1e-2]
-        far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite)
+        far = [f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite]
         if opposite:
             doubts.append("without closure phases a position cannot be told from its opposite")
         if far:
+            name = "alias" if len(far) == 1 else "aliases"
             doubts.append(
-                f"these baselines cannot tell the position from its alias(es) at {far} mas: "
-                "the innermost is reported"
+                f"these baselines cannot tell the position from its {name} at {', '.join(far)} "
+                "mas: the innermost is reported"
             )
     rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
     if rivals:
-        doubts.append(f"{len(rivals)} other position(s) fit within Δχ² 9: it is not unique")
+        others = "position fits" if len(rivals) == 1 else "positions fit"
+        doubts.append(f"{len(rivals)} other {others} within Δχ² 9: it is not unique")
     return tuple(doubts)
