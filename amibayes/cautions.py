@@ -9,6 +9,7 @@ from amibayes.calibration import Calibration
 from amibayes.inference.grid_posterior import integrable
 from amibayes.inference.noise import ExtraNoise
 from amibayes.inference.posterior import Posterior
+from amibayes.inference.priors import Prior
 from amibayes.inference.region import modes_to_sample
 from amibayes.inference.results import SearchResult
 from amibayes.inference.significance import Significance
@@ -90,12 +91,13 @@ def _of_covariance(result: SearchResult) -> list[str]:
     ]
 
 
-def _of_errors(result: SearchResult) -> list[str]:
+def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
     """Say where the errors are so large that CANDID's nσ has lost its meaning."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
+    which = "the errors, with the noise that was added," if noise.any else "the stated errors"
     return [
-        f"the errors are far too large: chi2 is {result.chi2_binary:.2g} for {result.ndof} degrees "
+        f"{which} are far too large: chi2 is {result.chi2_binary:.2g} for {result.ndof} degrees "
         "of freedom with the companion; CANDID's n_sigma, a ratio of two such chi2, means nothing"
     ]
 
@@ -125,7 +127,20 @@ def _noise_caution(noise: ExtraNoise) -> str:
 
 
 def _amount(vis2: float, closure_phase_rad: float) -> str:
-    return f"{vis2:.2g} in V2 and {np.degrees(closure_phase_rad):.2g} deg in closure phase"
+    parts = [f"{vis2:.2g} in V2"] * (vis2 > 0.0)
+    parts += [f"{np.degrees(closure_phase_rad):.2g} deg in closure phase"] * (closure_phase_rad > 0)
+    return " and ".join(parts)
+
+
+def _of_prior(result: SearchResult, prior: Prior) -> list[str]:
+    """Say where the prior leaves the best fit out."""
+    c = result.companion.contrast
+    if prior.contrast_min <= c <= prior.contrast_max:
+        return []
+    return [
+        f"the best fit's contrast of {c:.3g} lies outside the prior, {prior.contrast_min:.3g} to "
+        f"{prior.contrast_max:.3g}: posterior and evidence are of other companions"
+    ]
 
 
 def _joint_cautions(result: SearchResult) -> list[str]:
@@ -156,7 +171,7 @@ def _correlated(result: SearchResult) -> list[str]:
     return [
         f"residuals of neighbouring channels are correlated by {correlation:.2f}, which the "
         "covariance does not have: the false-alarm probabilities, of a second companion above "
-        "all, and the errors are smaller than they ought to be"
+        "all, and the errors of the fit are smaller than they ought to be"
     ]
 
 
@@ -169,7 +184,7 @@ def search_cautions(
 ) -> tuple[str, ...]:
     """Say what makes the numbers of a search less than they seem."""
     found = [*result.warnings, *observables.notes, *_joint_cautions(result)]
-    found += [*_of_covariance(result), *_of_errors(result), *_of_bright(result)]
+    found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
     if noise.any:
         found.append(_noise_caution(noise))
     elif result.chi2_binary / result.ndof > 2.0:
@@ -185,7 +200,9 @@ def search_cautions(
         )
     found += _outliers(result)
     found += _correlated(result)
-    if posterior is not None and len(posterior.mode_probability) > 1:
+    excluded = [] if posterior is None else _of_prior(result, posterior.prior)
+    found += excluded
+    if posterior is not None and not excluded and len(posterior.mode_probability) > 1:
         share = posterior.mode_probability[0]
         if share < 0.99 and len(modes_to_sample(result)) == 1:
             found.append(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 from amibayes.calibration import Calibration, Method
 from amibayes.extraction.reading import ImageOptions
@@ -106,6 +107,10 @@ class SearchOptions:
     prior: tuple[PriorSetting, ...] = ()
     seed: int = 1
     images: ImageOptions | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """All of them in JSON's types, as ``result.json`` keeps them."""
+        return dict(json.loads(json.dumps(asdict(self), default=str)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,12 +43,15 @@ class Response:
     single : bool
         Whether every baseline has one sample, so that V² is the square of a response. With
         several, whose powers are summed, it is so to first order in the contrast.
+    method : str
+        Name of the extraction's method; empty where it is not known.
     """
 
     coefficients: SmallComplexArray
     to_node: FloatArray
     pointing: FloatArray
     single: bool = True
+    method: str = ""
 
     def __post_init__(self) -> None:
         read_only(self, "to_node", "pointing")

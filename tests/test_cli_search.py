@@ -43,7 +43,7 @@ def run(*words: object) -> int:
 
 
 KEYS = {
-    "amibayes", "seed", "inputs", "data", "fit", "significance", "modes", "posterior",
+    "amibayes", "seed", "options", "inputs", "data", "fit", "significance", "modes", "posterior",
     "calibration", "limits", "noise", "robust", "evidence", "warnings", "timing_s",
 }  # fmt: skip
 
@@ -212,7 +212,10 @@ def test_resume_and_overwrite_leave_no_foreign_results(target, tmp_path, capsys)
     assert run(target, "--separation", "50:400", "--null-draws", 1000, "--out", out) == 0
     capsys.readouterr()
     assert run(other, *FAST, "--out", out, "--resume") == 2
-    assert "result of other data" in error_of(capsys)
+    assert "result of other data or options" in error_of(capsys)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert run(target, *FAST, "--out", out, "--resume") == 2, "other options"
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert run(other, *FAST, "--out", out, "--overwrite", "--quiet") == 0
     left = sorted(p.name for p in out.iterdir())
     pictures = ["correlation.png", "coverage.png", "fit.png", "map.png", "maps.fits", "nsigma.png"]

@@ -407,6 +407,20 @@ def test_per_integration_series_average_to_the_mean(niriss: Instrument) -> None:
     np.testing.assert_allclose(closure.mean(axis=0), found.average.closure_phase, atol=1e-12)
     each = integrations(found)
     assert (each.n_vis2, each.n_closure_phases) == (6 * 21, 6 * 35)
+    # Their scatter is their own: a t likelihood of all of them would count it six times.
+    assert (each.covariance_kind, each.freedom) == ("given", None)
+
+
+def test_methods_are_not_mixed(niriss: Instrument, tmp_path: Path) -> None:
+    """A calibrator measured in another way has other errors of the optics to divide out."""
+    images = with_photons(binary_images(niriss, jittered(6, 16), (0.0, 0.0), 0.0), 17)
+    target = extract(cube_of(images, niriss), "fringes")
+    write_oifits(tmp_path / "square.oifits", extract(cube_of(images[::-1], niriss), "square"))
+    with pytest.raises(DataError, match="extracted by square, the target by fringes"):
+        calibrate(target, [read_oifits(tmp_path / "square.oifits")])
+    other = extract(cube_of(images[:4], niriss), "fringes")
+    with pytest.raises(UsageError, match="'foo' is no method of calibration"):
+        calibrate(target, [other], method="foo")  # type: ignore[arg-type]
 
 
 def test_faults_are_named(niriss: Instrument, tmp_path: Path) -> None:

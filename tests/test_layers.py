@@ -35,6 +35,7 @@ LAYERS = [
     "freedom",
     "observables",
     "assumed",
+    "moves",
     "synthetic",
     "oifits",
     "extraction",

@@ -129,7 +129,7 @@ def test_the_answer_stands_in_words(page: Reader, content) -> None:
     place = f"A companion at {fit['separation_mas']:.1f} ± {fit['errors']['separation_mas']:.1f}"
     assert place in said
     assert "Not one of 2\u202f000 data sets simulated without a companion has anything as" in said
-    assert "the chance of this by noise is below 0.0018" in said
+    assert "the chance of this by noise is estimated as 0.0005, and below 0.0018, with 95" in said
     for entry in content["inputs"]:
         assert entry["sha256"] in said
         assert entry["path"] in said

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from amibayes.calibration.transfer import (
     transfer_of,
 )
 from amibayes.calibration.weighted import Response, clipped, weighted_response
-from amibayes.errors import DataError
+from amibayes.errors import DataError, UsageError
 from amibayes.observables import Observables, join
 from amibayes.quantities import takes_quantities
 from amibayes.units import FloatArray
@@ -125,30 +125,30 @@ def calibrate(
     Parameters
     ----------
     targets : Observables, or a sequence of them
-        Several targets keep the covariance that the calibrators they share give them.
+        Several keep the covariance that the calibrators they share give them.
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted"}, optional
         Inverse-variance means, with the scatter where it is larger than the errors; or random
         effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline.
     clip : float, optional
         Leave out values that stand off the other calibrators' by more standard deviations.
-    diameters_mas : sequence of float or (float, float), optional
-        Uniform-disc diameter of each calibrator, or diameter and error.
+    diameters_mas : sequence of float or (diameter, error), optional
+        Of each calibrator, as a uniform disc.
     window_days : float, optional
         Use only calibrators observed within this time of each epoch of the target.
     charge_levels : sequence of float, optional
         Of the target, then of each calibrator: the response may depend on them linearly.
-    rng : numpy.random.Generator, optional
-        A fixed seed by default.
+    rng : numpy.random.Generator, with a fixed seed by default
 
     Raises
     ------
-    DataError
-        Where calibrators are none, too few, the target itself, or have nothing in common.
+    UsageError, DataError
+        For an unknown method; where calibrators are none, too few, the target itself, extracted
+        by another method, or have nothing in common.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
     _refuse_same(parts, calibrators := list(calibrators))
-    target = join(parts)
+    _refuse_other_extraction(target := join(parts), calibrators)
     keys = keys_of(target, window_days)
     seen = _transfers(calibrators, keys, diameters_mas)
     serving = _serving(target, calibrators, seen)
@@ -171,6 +171,10 @@ def calibrate(
 
 def _method(method: Method | None, target: Observables, serving: list[Transfer]) -> Method:
     """The method asked for, or what the calibrators of one baseline are enough for."""
+    if method is not None and method not in (known := get_args(Method)):
+        raise UsageError(
+            f"{method!r} is no method of calibration", remedy=f"one of {', '.join(known)}"
+        )
     together = int(np.sum([t.seen for t in serving], axis=0).max())
     if method == "hierarchical" and together < 2:
         raise DataError(
@@ -198,6 +202,29 @@ def _refuse_same(parts: list[Observables], calibrators: list[Observables]) -> No
                     remedy="give every observation once",
                 )
         before.append((calibrator, "another calibrator"))
+
+
+def _refuse_other_extraction(target: Observables, calibrators: list[Observables]) -> None:
+    """Refuse calibrators whose images were measured in another way: their errors differ too."""
+    own = _extracted(target)
+    for calibrator in calibrators:
+        other = _extracted(calibrator)
+        if own and other and own != other:
+            raise DataError(
+                f"was extracted by {_listed(other)}, the target by {_listed(own)}",
+                source=calibrator.source,
+                remedy="extract both by one method",
+            )
+
+
+def _extracted(observables: Observables) -> set[str]:
+    """Methods that images of some observables were measured by, where they are known."""
+    responses = (setup.response for setup in observables.setups)
+    return {r.method for r in responses if r is not None and r.method}
+
+
+def _listed(names: set[str]) -> str:
+    return ", ".join(sorted(names))
 
 
 def _transfers(

@@ -21,6 +21,7 @@ from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import ClosureSet, Transfer, closure_sets
 from amibayes.calibration.weighted import Response
 from amibayes.errors import RunError
+from amibayes.moves import along_others
 from amibayes.observables import BoolArray, IntArray
 from amibayes.units import FloatArray
 
@@ -269,8 +270,9 @@ def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:
         return population.log_prob(tau)
 
     # Differential evolution forgets three times faster here than stretching does.
-    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(N_WALKERS, len(present), log_prob, vectorize=True, moves=moves)
+    sampler = emcee.EnsembleSampler(
+        N_WALKERS, len(present), log_prob, vectorize=True, moves=along_others()
+    )
     # emcee wants the state of numpy's older generator; it is seeded from ours.
     older = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))
     start = np.abs(rng.standard_normal((N_WALKERS, len(present)))) / PRIOR_WIDTH

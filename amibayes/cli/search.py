@@ -98,7 +98,7 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     names = _names(options, calibrated=bool(arguments.cal), several=several)
     folder = output_folder(arguments.out, names, overwrite=overwrite)
     if arguments.resume and not arguments.overwrite:
-        _refuse_other_data(folder / RESULT, [*arguments.targets, *arguments.cal])
+        _refuse_others(folder / RESULT, [*arguments.targets, *arguments.cal], options)
     report = _search(arguments, options, folder)
     for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
@@ -114,8 +114,8 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
     return [*names, CALIBRATED] if calibrated else names
 
 
-def _refuse_other_data(path: Path, inputs: list[str]) -> None:
-    """Refuse to go on in a folder whose result is that of other files."""
+def _refuse_others(path: Path, inputs: list[str], options: SearchOptions) -> None:
+    """Refuse to go on in a folder whose result is that of other files or options."""
     import json
 
     from amibayes.files import sha256
@@ -123,12 +123,15 @@ def _refuse_other_data(path: Path, inputs: list[str]) -> None:
     if not path.is_file():
         return
     try:
-        before = {entry["sha256"] for entry in json.loads(path.read_text())["inputs"]}
+        content = json.loads(path.read_text())
+        before = {entry["sha256"] for entry in content["inputs"]}, content["options"]
     except (ValueError, KeyError, TypeError):
-        before = set()
-    if before != {sha256(p) for p in inputs if Path(p).is_file()}:
+        before = set(), {}
+    if before != ({sha256(p) for p in inputs if Path(p).is_file()}, options.to_json()):
         raise UsageError(
-            "is the result of other data", source=path, remedy="give --overwrite or another --out"
+            "is the result of other data or options",
+            source=path,
+            remedy="give --overwrite or another --out",
         )
 
 

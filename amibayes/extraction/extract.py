@@ -160,7 +160,7 @@ def _measured(
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
     star = star_image(bench.view)
     centre = frames.shift_px[frames.used].mean(axis=0)
-    response = off_axis_response(star, bench.sampling, template.orientation, centre)
+    response = off_axis_response(star, bench.sampling, template.orientation, centre, options.method)
     return _Part(
         template,
         bench,

@@ -51,11 +51,14 @@ def integrations(extraction: Extraction) -> Observables:
                 vis2=_at(mean.vis2, vis2[k], mjd, n),
                 closure_phase=_at(mean.closure_phase, closure[k], mjd, n),
                 covariance=whole,
+                covariance_kind="given",
+                freedom=None,
                 scatter=None,
             )
         )
-    # All of them rest on the same scatter: there is no more of it in many than in one.
-    return replace(join(parts), freedom=mean.freedom, scatter=None)
+    # The scatter is that of these very data: what it does not tell of the covariance they do
+    # not tell again, and a t likelihood of all of them would be too narrow.
+    return replace(join(parts), covariance_kind="given", freedom=None, scatter=None)
 
 
 def _at(table: Measurements, value: FloatArray, mjd: float, n: int) -> Measurements:

@@ -40,7 +40,11 @@ def star_image(view: View) -> FineImage:
 
 
 def off_axis_response(
-    star: FineImage, sampling: Sampling, orientation: Orientation, centre_px: FloatArray
+    star: FineImage,
+    sampling: Sampling,
+    orientation: Orientation,
+    centre_px: FloatArray,
+    method: str = "",
 ) -> Response:
     """Measure the response of flux and of every baseline.
 
@@ -54,6 +58,8 @@ def off_axis_response(
     centre_px : (2,) array
         Where the phases of the fringes say that the light is on the average, from the view's
         centre.
+    method : str
+        Its name, which the response keeps.
 
     Returns
     -------
@@ -80,7 +86,7 @@ def off_axis_response(
     between[a, b], between[b, a] = spline[1:], spline[1:].conj()
     pointing = orientation.to_sky(pixel * centre_px)
     single = sampling.n_samples == view.instrument.mask.n_baselines
-    return Response(between, orientation.matrix.T / (step * cell), pointing, single)
+    return Response(between, orientation.matrix.T / (step * cell), pointing, single, method)
 
 
 def _interpolating(values: ComplexArray) -> ComplexArray:

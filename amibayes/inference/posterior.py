@@ -26,6 +26,7 @@ from amibayes.inference.priors import Prior
 from amibayes.inference.region import Region, modes_to_sample
 from amibayes.inference.results import SearchResult
 from amibayes.inference.search import resolution_mas
+from amibayes.moves import along_others
 from amibayes.notebook import UNITS, html_table, pretty, quantity_table
 from amibayes.units import FloatArray, contrast_to_delta_mag, position_angle_deg, separation
 
@@ -245,7 +246,7 @@ def sample(
 
 def _moves(grid: GridPosterior | None, region: Region) -> list[tuple[emcee.moves.Move, float]]:
     """Moves and how often each is made."""
-    along = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    along = along_others()
     if grid is None:
         return along
     inside = region.holds(*grid.cells.position)
@@ -289,6 +290,10 @@ def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
     """Posterior probability within λ/2B of each mode; what is missing to 1 is elsewhere."""
     places = np.array([m.theta[:2] for m in result.modes])
     return grid.mass_near(places, 0.5 * resolution_mas(result.likelihood))
+
+
+def _elsewhere(result: SearchResult, grid: GridPosterior) -> float:
+    return max(1.0 - float(mode_masses(result, grid).sum()), 0.0)
 
 
 def _start(
@@ -369,7 +374,7 @@ def _posterior(
         prior=prior,
         mode_probability=mode_probabilities(result, prior, grid),
         mode_method="laplace" if grid is None else "grid",
-        elsewhere=float("nan") if grid is None else 1.0 - float(mode_masses(result, grid).sum()),
+        elsewhere=float("nan") if grid is None else _elsewhere(result, grid),
         times=times,
         rhats=_split_rhat(sampler),
     )

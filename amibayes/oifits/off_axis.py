@@ -49,6 +49,7 @@ def response_tables(layout: Layout, setups: tuple[Setup, ...]) -> list[Any]:
         for key, value in zip(LATTICE, numbers, strict=True):
             table.header[f"HIERARCH {OWN_KEY} {key}"] = float(value)
         table.header[f"HIERARCH {OWN_KEY} SINGLE"] = setup.response.single
+        table.header[f"HIERARCH {OWN_KEY} METHOD"] = setup.response.method
         _explain(table, setup.response.n_nodes)
         tables.append(table)
     return tables
@@ -81,6 +82,7 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
     if not np.isfinite(half).all() or not np.iscomplexobj(half):
         return setup
     single = bool(found[0].header.get(f"{OWN_KEY} SINGLE", True))
+    method = str(found[0].header.get(f"{OWN_KEY} METHOD", ""))
     place = {int(k): i for i, k in enumerate(setup.station_index)}
     n = len(setup.stations)
     response = np.zeros((n, n, n_nodes, n_nodes), dtype=np.complex64)
@@ -90,7 +92,7 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
             i, j = place[int(a)], place[int(b)]
             response[j, i] = row.conj()
             response[i, j] = row
-    return replace(setup, response=Response(response, *lattice, single))
+    return replace(setup, response=Response(response, *lattice, single, method))
 
 
 def _lattice(header: Any) -> tuple[FloatArray, FloatArray] | None:

@@ -102,8 +102,9 @@ def significance(content: Json, figures: tuple[Figure, ...]) -> Section:
         Fact(
             "Δχ²",
             fixed(s["delta_chi2"], 1),
-            "χ² of the best fit without a companion minus that with one. What a value is worth "
-            "depends on how many positions were tried.",
+            "Twice the gain in ln likelihood over the best fit without a companion: the difference "
+            "of the two χ² where the errors are known, less where they were estimated from few "
+            "integrations. What a value is worth depends on how many positions were tried.",
         ),
         Fact(
             "CANDID nσ",
@@ -152,14 +153,11 @@ def _by_law(probability: float) -> str:
 
 
 def _local(content: Json) -> Fact:
-    fit = content["fit"]
-    error = fit["errors"]["contrast"]
-    value = NONE if not error else f"{fixed(fit['contrast'] / error, 1)} σ"
+    gain = max(content["significance"]["delta_chi2"], 0.0)
     return Fact(
         "Local significance",
-        value,
-        "Contrast over its error at this one position, as if no other had been tried; the field "
-        "makes it worth less.",
+        f"{fixed(gain**0.5, 1)} σ",
+        "Root of Δχ², as if no other position had been tried; the field makes it worth less.",
     )
 
 

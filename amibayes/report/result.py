@@ -45,6 +45,7 @@ def result_json(report: SearchReport) -> Json:
     return {
         "amibayes": __version__,
         "seed": report.options.seed,
+        "options": report.options.to_json(),
         "inputs": inputs_json(report.targets, report.calibrators),
         "data": data_json(report.result),
         "fit": _fit(result),

@@ -72,10 +72,13 @@ def _chance(content: Json) -> str:
     if significance["detected"] is None:
         asked = f"too few to tell anything below {alpha}"
     if low == 0.0:
+        # Where the bound does not meet what is asked, the estimate does.
+        decided = significance["detected"] and high >= significance["alpha"]
+        estimated = f"estimated as {chance(probability)}, and " if decided else ""
         return (
             f"Not one of {count(draws, 'data set')} simulated without a companion has anything as "
             f"good anywhere in the field ({field(content)}): the chance of this by noise is "
-            f"below {chance(high)}, with 95\u00a0% confidence; {asked}."
+            f"{estimated}below {chance(high)}, with 95\u00a0% confidence; {asked}."
         )
     return (
         "The chance that noise alone gives something as good anywhere in the field "
