@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from amibayes.files import short_names
+from amibayes.plots.calibration import columns_of
 from amibayes.plots.style import GREY, marker_of, new_figure, styled
 from amibayes.report import limits_json, number
 from amibayes.vetting import Vetted, Vetting, doubts
@@ -80,17 +81,24 @@ def _cell(probability: float | None) -> str:
     return f"{'-':>10}" if probability is None else f"{probability:>10.2g}"
 
 
+HEIGHT_OF_NAMES = 0.2
+"""Inches that a line of a legend takes."""
+
+
 @styled()
 def vetting_picture(vetting: Vetting) -> Figure:
     """Draw the probabilities of the three tests and what each calibrator rules out."""
     limited = [(name, v) for name, v in _named(vetting) if v.limit is not None]
     n = len(vetting.calibrators)
     heights = [1.2 + 0.4 * n, 4.0] if limited else [1.2 + 0.4 * n]
-    figure = new_figure(sum(heights))
+    figure = new_figure(sum(heights) + HEIGHT_OF_NAMES * (1 + len(limited)))
     axes = np.atleast_1d(figure.subplots(len(heights), 1, height_ratios=heights))
     _draw_tests(axes[0], vetting)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     if limited:
         _draw_limits(axes[1], limited)
+        drawn, texts = axes[1].get_legend_handles_labels()
+        figure.legend(drawn, texts, loc="outside lower center", ncols=columns_of(texts))
     return figure
 
 
@@ -116,7 +124,6 @@ def _draw_tests(ax: Any, vetting: Vetting) -> None:
         [name if v.kept else f"{name} (dropped)" for name, v in _named(vetting)],
     )
     ax.set_xlabel(f"probability of chance (dashed: dropped below {vetting.alpha:g})")
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, frameon=False)
 
 
 LEAST_SHOWN = 1e-8
@@ -140,4 +147,3 @@ def _draw_limits(ax: Any, limited: list[tuple[str, Vetted]]) -> None:
     assert limit is not None
     ax.set_xlabel("Separation (mas)")
     ax.set_ylabel(f"Magnitude difference ruled out ({limit.completeness:.0%})")
-    ax.legend()

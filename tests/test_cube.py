@@ -212,6 +212,40 @@ def write_calints(path: Path, **arrays: Any) -> Path:
     return path
 
 
+def with_times(path: Path, number: list[int], **segment: int) -> Path:
+    """Three images with the times of the integrations of these numbers."""
+    write_calints(path, SCI=IMAGES)
+    columns = [
+        fits.Column("integration_number", "J", array=np.array(number)),
+        fits.Column("int_mid_MJD_UTC", "D", array=60000.0 + np.array(number)),
+    ]
+    with fits.open(path, mode="append") as hdus:
+        hdus.append(fits.BinTableHDU.from_columns(columns, name="INT_TIMES"))
+    for key, value in segment.items():
+        fits.setval(path, key, value=value)
+    return path
+
+
+def test_times_of_a_segment_are_found_in_the_table_of_the_exposure(tmp_path: Path) -> None:
+    path = with_times(tmp_path / "a.fits", list(range(1, 83)), INTSTART=40, INTEND=42)
+    assert read_cube(path).mjd.tolist() == [60040.0, 60041.0, 60042.0]
+    with open_cube(path) as file:
+        assert file.read(1, 2).mjd.tolist() == [60041.0]
+    own = with_times(tmp_path / "b.fits", [40, 41, 42], INTSTART=1, INTEND=3)
+    assert read_cube(own).mjd.tolist() == [60040.0, 60041.0, 60042.0]
+
+
+@pytest.mark.parametrize(
+    "segment",
+    [{}, {"INTSTART": 40}, {"INTSTART": 40, "INTEND": 43}, {"INTSTART": 82, "INTEND": 84}],
+)
+def test_times_that_cannot_be_told_are_refused(segment: dict[str, int], tmp_path: Path) -> None:
+    path = with_times(tmp_path / "a.fits", list(range(1, 83)), **segment)
+    with pytest.raises(DataError, match="INT_TIMES has 82 rows for 3 images") as raised:
+        read_cube(path)
+    assert "INTSTART" in raised.value.remedy
+
+
 IMAGES = np.random.default_rng(3).normal(size=(3, 8, 8))
 
 

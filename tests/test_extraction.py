@@ -539,6 +539,43 @@ def test_command_writes_what_it_says(
     assert CLI_METHODS == METHODS
 
 
+def test_star_is_told_from_the_middle_of_the_image_as_given(
+    niriss: Instrument, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A frame so large that only a part of it is used, with the star 12 and -9 pixels off."""
+    part = with_photons(binary_images(niriss, jittered(3, 33), (0.0, 0.0), 0.0), 34)
+    frame = np.random.default_rng(35).normal(0.0, 3.0, (3, 120, 130))
+    frame[:, 11:91, 37:117] += part
+    path = tmp_path / "täräget one.fits"
+    write_cube(path, cube_of(frame, niriss))
+    assert main(["extract", str(path), "--out", str(tmp_path / "out")]) == 0
+    entry = json.loads((tmp_path / "out" / "extract.json").read_text())["extractions"][0]
+    assert max(extract_all(path)[0].benches[0].view.shape) < 120
+    expected = np.array([12.0, -9.0]) + jittered(3, 33).mean(axis=0)
+    assert entry["centre_px"][0] == pytest.approx(list(expected), abs=0.1)
+    x, y = entry["centre_px"][0]
+    assert f"x {x:+.3f}, y {y:+.3f} pixels from the middle" in capsys.readouterr().out
+    header = fits.getheader(tmp_path / "out" / "täräget one.oifits")
+    assert header["AMIBAYES SOURCE1"] == "t\\xe4r\\xe4get one.fits"
+
+
+def test_window_is_for_the_methods_that_have_one(niriss: Instrument) -> None:
+    cube = cube_of(binary_images(niriss, jittered(1, 36), (0.0, 0.0), 0.0), niriss)
+    with pytest.raises(UsageError, match="fringes has no window"):
+        extract(cube, options=ExtractOptions(window_px=20.0))
+    plain, narrow = (extract(cube, "fft", options=ExtractOptions(window_px=w)) for w in (0.0, 9.0))
+    assert not np.array_equal(plain.data, narrow.data)
+
+
+def test_files_that_name_no_star_are_said_to_be_taken_as_one(niriss: Instrument) -> None:
+    cube = cube_of(binary_images(niriss, jittered(2, 37), (0.0, 0.0), 0.0), niriss)
+    said = "2 files that name no star are taken as exposures of one"
+    assert said in extract([cube, cube]).notes
+    assert said not in extract(cube).notes
+    named = replace(cube, header={"TARGPROP": "A"})
+    assert said not in extract([named, named]).notes
+
+
 @pytest.mark.parametrize(("name", "coarse"), [("F277W", True), ("F380M", False)])
 def test_reader_is_told_of_pixels_too_large_for_the_fringes(name: str, coarse: bool) -> None:
     """Two pixels of 65.6 mas are 0.131 arcsec; λ/B of the longest baseline 0.109 and 0.149."""

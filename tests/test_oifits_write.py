@@ -220,6 +220,23 @@ def test_existing_files_and_bad_folders(rng: np.random.Generator, tmp_path: Path
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.fits"]
 
 
+def test_names_in_other_alphabets_are_escaped(rng: np.random.Generator, tmp_path: Path) -> None:
+    """FITS has printable ASCII alone; ä is U+00E4, ★ is U+2605."""
+    data = random_observables(rng)
+    names = {"target": "ä Orionis", "insname": "MÄSK_K", "arrname": "Ä★"}
+    setups = tuple(replace(setup, **names) for setup in data.setups)
+    header = {"HIERARCH AMIBAYES SOURCE1": "täräget\tone.fits", "OBSERVER": "a\\b"}
+    write_oifits(tmp_path / "ä.fits", replace(data, setups=setups), header=header)
+    back = read_oifits(tmp_path / "ä.fits")
+    assert back.setups[0].target == "\\xe4 Orionis"
+    assert back.setups[0].insname == "M\\xc4SK_K"
+    assert back.setups[0].arrname == "\\xc4\\u2605"
+    np.testing.assert_array_equal(back.data, data.data)
+    written = fits.getheader(tmp_path / "ä.fits")
+    assert written["AMIBAYES SOURCE1"] == "t\\xe4r\\xe4get\\tone.fits"
+    assert written["OBSERVER"] == "a\\b"
+
+
 def test_interrupted_writing_leaves_nothing(
     rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

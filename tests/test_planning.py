@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -188,6 +189,14 @@ def test_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFix
     shown = capsys.readouterr().out.splitlines()
     assert len(shown) <= 20
     assert any("groups          16" in line and "paper 14" in line for line in shown)
+
+
+def test_saturation_is_stated_with_a_charge_above_the_well() -> None:
+    """In F277W a star of 6 mag fills less than a pixel in one group, and more in two."""
+    with pytest.raises(UsageError, match="a slope needs 2 groups") as raised:
+        make_plan(load_instrument("niriss", "F277W"), magnitude=6.0, photons=1e8)
+    collected, well = map(int, re.findall(r"(\d+) (?:electrons|fill)", str(raised.value)))
+    assert well < collected < 2 * well
 
 
 @pytest.mark.parametrize(

@@ -175,6 +175,6 @@ def test_exposures_that_make_no_sense(numbers: dict[str, float], message: str) -
 
 def test_scene_that_saturates_is_one_line() -> None:
     star = Star(still(5, 4, 16), Detector(), rate_e_s=1e8)
-    with pytest.raises(UsageError, match=r"the scene saturates: \d+ electrons") as raised:
+    with pytest.raises(UsageError, match=r"the scene saturates: a slope needs 2 groups") as raised:
         star.take()
     assert "\n" not in str(raised.value)

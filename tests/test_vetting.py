@@ -100,6 +100,19 @@ def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
     assert len(vetting_picture(replace(vetting, calibrators=one_without_limit(vetting))).axes) == 1
 
 
+def test_legends_of_the_picture_cover_nothing_and_stay_on_the_page(rng) -> None:
+    data = [calibrator(rng, name=f"some/long_name_of_calibrator_{k}.fits") for k in range(3)]
+    vetting = vet(data, separation_mas=FIELD, null_draws=500)
+    figure = vetting_picture(vetting)
+    figure.draw_without_rendering()
+    assert len(figure.legends) == 2
+    for legend in figure.legends:
+        box = legend.get_window_extent()
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+        assert not any(box.overlaps(axes.get_tightbbox()) for axes in figure.axes)
+
+
 def one_without_limit(vetting: Vetting) -> tuple[Vetted, ...]:
     return tuple(replace(vetted, limit=None) for vetted in vetting.calibrators)
 

@@ -41,7 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep-all", action="store_true", help="leave no integration out that can be measured"
     )
     group.add_argument(
-        "--window", type=float, metavar="PIXELS", help="half-power radius of the Fourier window"
+        "--window",
+        type=common.finite_float,
+        metavar="PIXELS",
+        help="radius at which the window of the Fourier methods (all but fringes) has fallen to a "
+        "half; 0 for none (default: 0.45 of the image's side)",
     )
     group.add_argument(
         "--covariance",
@@ -77,6 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         covariance=arguments.covariance,
         geometry=arguments.geometry,
     )
+    options.refuse_unused()
     stems = _stems(arguments.cubes)
     names = [SUMMARY, *(n for stem in stems for n in _names(stem, arguments))]
     folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)

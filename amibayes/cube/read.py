@@ -139,7 +139,7 @@ def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile:
     keys.check_mask(header, source)
     template = _template(header, science, given, source)
     n = science.shape[0] if len(science.shape) == 3 else 1
-    return CubeFile(template, n, chosen, _mid_times(hdus, n, source))
+    return CubeFile(template, n, chosen, _mid_times(hdus, n, header, source))
 
 
 @contextmanager
@@ -248,14 +248,31 @@ def _usual_pixel_scale(instrument: str, filter: str, source: str) -> float:
     raise DataError("does not say its pixel scale", source=source, remedy="give --pixel-scale")
 
 
-def _mid_times(hdus: Any, n: int, source: str) -> FloatArray | None:
+def _mid_times(hdus: Any, n: int, header: dict[str, Any], source: str) -> FloatArray | None:
     table = next((hdu for hdu in hdus if hdu.name == "INT_TIMES"), None)
     if table is None or table.is_image or "int_mid_MJD_UTC" not in table.columns.names:
         return None
     times = np.asarray(table.data["int_mid_MJD_UTC"], dtype=float)
-    if len(times) != n:
-        raise DataError(f"INT_TIMES has {len(times)} rows for {n} images", source=source)
-    return times
+    if len(times) == n:
+        return times
+    rows = _rows_of_segment(table, header, source)
+    if np.count_nonzero(rows) != n:
+        raise DataError(
+            f"INT_TIMES has {len(times)} rows for {n} images",
+            source=source,
+            remedy="say with INTSTART and INTEND which integration_number are those of the "
+            "images, or take the table away",
+        )
+    return times[rows]
+
+
+def _rows_of_segment(table: Any, header: dict[str, Any], source: str) -> NDArray[np.bool_]:
+    """Rows of this file, where the table is that of an exposure cut into several files."""
+    first, last = (keys.number(header, key, source) for key in ("INTSTART", "INTEND"))
+    if first is None or last is None or "integration_number" not in table.columns.names:
+        return np.zeros(len(table.data), dtype=bool)
+    number = np.asarray(table.data["integration_number"])
+    return np.asarray((first <= number) & (number <= last))
 
 
 def _section(hdu: Any, part: slice) -> NDArray[Any]:

@@ -120,6 +120,7 @@ def extract_all(
     if not given:
         raise DataError("no cube to extract", remedy="give at least one file")
     chosen = options or ExtractOptions()
+    chosen.refuse_unused()
     parts = [_measured(cube, index, chosen, header) for index, cube in enumerate(given)]
     groups: dict[tuple[Any, ...], list[_Part]] = {}
     for part in parts:
@@ -178,7 +179,8 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
-    observables = _tabled(parts[0], frames, mean, shrunk, basis)
+    notes = _unnamed(parts) + _notes(view, frames, shrunk)
+    observables = _tabled(parts[0], frames, mean, shrunk, basis, notes)
     benches = tuple(p.bench for p in parts)
     sources = tuple(p.template.source for p in parts)
     return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
@@ -203,7 +205,12 @@ def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Aver
 
 
 def _tabled(
-    part: _Part, frames: Frames, mean: Average, shrunk: Shrunk, basis: FloatArray
+    part: _Part,
+    frames: Frames,
+    mean: Average,
+    shrunk: Shrunk,
+    basis: FloatArray,
+    notes: tuple[str, ...],
 ) -> Observables:
     n = int(frames.used.sum())
     scatter = None if shrunk.carried is None else csr_array(shrunk.scatter / n)
@@ -219,7 +226,7 @@ def _tabled(
         response=part.response,
         mjd=_mjd(frames, part.template),
         integration_s=n * (part.template.integration_time_s or 0.0),
-        notes=_notes(part.bench.view, frames, shrunk),
+        notes=notes,
     )
 
 
@@ -233,6 +240,13 @@ def _mjd(frames: Frames, template: Cube) -> float:
         if isinstance(value, int | float):
             return float(value)
     return 0.0
+
+
+def _unnamed(parts: list[_Part]) -> tuple[str, ...]:
+    """Say that nothing but the command line tells the files to be of one star."""
+    if len(parts) == 1 or target_of(parts[0].template):
+        return ()
+    return (f"{len(parts)} files that name no star are taken as exposures of one",)
 
 
 def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
@@ -31,7 +32,7 @@ class ExtractOptions:
         Pixels that stand off their own in other integrations by more are left out.
     window_px : float, optional
         Radius at which the window of the Fourier methods has fallen to a half; 0 for no
-        window. By default 0.45 of the image's side.
+        window. By default 0.45 of the image's side. ``fringes`` takes none.
     covariance : {"shrunk", "scatter", "physical"}
         Scatter and photon noise weighed against each other, or one of them alone.
     temperature_k : float, optional
@@ -66,11 +67,27 @@ class ExtractOptions:
         for name in ("clip", "outlier"):
             if not getattr(self, name) > 0.0:
                 raise UsageError(f"{name} is {getattr(self, name):g}; it must be above 0")
-        if self.window_px is not None and not self.window_px >= 0.0:
-            raise UsageError(f"window is {self.window_px:g} pixels; it must be at least 0")
+        if self.window_px is not None and not 0.0 <= self.window_px < math.inf:
+            raise UsageError(
+                f"window is {self.window_px:g} pixels; it must be at least 0, and finite"
+            )
         if self.temperature_k is not None and not self.temperature_k >= COLDEST_K:
             raise UsageError(
                 f"temperature is {self.temperature_k:g} K; it must be at least {COLDEST_K:g}"
+            )
+
+    def refuse_unused(self) -> None:
+        """Refuse a window that the method would leave aside.
+
+        Raises
+        ------
+        UsageError
+            Where the method is ``fringes``.
+        """
+        if self.window_px is not None and self.method == "fringes":
+            raise UsageError(
+                "the method fringes has no window",
+                remedy=f"leave the window out, or choose from {', '.join(METHODS[1:])}",
             )
 
     def as_mapping(self) -> Mapping[str, Any]:

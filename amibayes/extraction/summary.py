@@ -9,6 +9,7 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.extraction.extract import Extraction
+from amibayes.extraction.frames import Bench
 from amibayes.extraction.geometry import Geometry
 from amibayes.units import DEGREE
 
@@ -34,7 +35,7 @@ def described(extraction: Extraction) -> dict[str, Any]:
             {"path": path, "integration": number, "reason": reason}
             for path, number, reason in extraction.rejected
         ],
-        "centre_px": [list(b.view.centre_px) for b in extraction.benches],
+        "centre_px": [_from_middle(b) for b in extraction.benches],
         "geometry": [_geometry(b.geometry) for b in extraction.benches],
         "jitter_px": float(np.sqrt(frames.shift_px[used].var(axis=0).mean())),
         "flux": float(frames.flux[used].mean()),
@@ -52,6 +53,14 @@ def described(extraction: Extraction) -> dict[str, Any]:
         "block": shrunk.block,
         "notes": list(extraction.observables.notes),
     }
+
+
+def _from_middle(bench: Bench) -> list[float]:
+    """Place (x, y) of the star from the middle of the image as given, before any cropping."""
+    view = bench.view
+    ny, nx = bench.reference.image.shape
+    sides = zip((view.columns, view.rows), (nx, ny), view.centre_px, strict=True)
+    return [0.5 * (part.start + part.stop - size) + at for part, size, at in sides]
 
 
 def _geometry(found: Geometry) -> dict[str, float | None]:

@@ -42,14 +42,19 @@ class Layout:
             ["arrname", "stations", "station_index", "station_xyz_m", "station_diameter_m"],
         )
         channel, channels = _shared(setups, ["insname", "wavelength_m", "band_m"])
-        arrnames = _distinct([s.arrname or UNKNOWN for s in arrays])
-        insnames = _distinct([s.insname or UNKNOWN for s in channels])
+        arrnames = _distinct([printable(s.arrname) or UNKNOWN for s in arrays])
+        insnames = _distinct([printable(s.insname) or UNKNOWN for s in channels])
         return cls(setups, target, array, channel, targets, arrays, channels, arrnames, insnames)
 
     def station_index(self, setup: int) -> IntArray:
         """STA_INDEX of a setup's stations: its own, or from 1 on where they begin below 1."""
         index = self.setups[setup].station_index
         return index if index.min(initial=1) >= 1 else np.arange(1, len(index) + 1)
+
+
+def printable(text: str) -> str:
+    """The text in the characters that FITS has, others as Python's escapes."""
+    return "".join(c if " " <= c <= "~" else c.encode("unicode_escape").decode() for c in text)
 
 
 def _shared(setups: tuple[Setup, ...], names: list[str]) -> tuple[list[int], list[Setup]]:

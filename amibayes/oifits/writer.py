@@ -24,7 +24,7 @@ from amibayes.files import atomic_path
 from amibayes.observables import BoolArray, IntArray, Observables
 from amibayes.oifits.correlations import pair_covariance
 from amibayes.oifits.dates import first_date
-from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of
+from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of, printable
 from amibayes.oifits.off_axis import response_tables
 from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.scatter import scatter_table
@@ -111,7 +111,7 @@ def _table(name: str, columns: Mapping[str, Any], extra: Mapping[str, Any], n_ch
 
 def _own(table: Any, keyword: str, value: HeaderValue) -> None:
     """Set one of our own hierarchical keywords."""
-    table.header[f"HIERARCH {OWN_KEY} {keyword}"] = value
+    table.header[f"HIERARCH {OWN_KEY} {keyword}"] = _card_value(value)
 
 
 def _primary(
@@ -133,8 +133,12 @@ def _primary(
         "PROCSOFT": f"amibayes {__version__}",
     }
     for name, value in (standard | dict(header)).items():
-        hdu.header[name] = value
+        hdu.header[name] = _card_value(value)
     return hdu
+
+
+def _card_value(value: HeaderValue) -> HeaderValue:
+    return printable(value) if isinstance(value, str) else value
 
 
 def _one(names: list[str]) -> str:
@@ -155,7 +159,7 @@ def _target_table(layout: Layout) -> Any:
     columns: dict[str, Any] = {rule.name: zero for rule in rules if not rule.optional}
     columns |= {
         "TARGET_ID": np.arange(1, len(targets) + 1),
-        "TARGET": [s.target or UNKNOWN for s in targets],
+        "TARGET": [printable(s.target) or UNKNOWN for s in targets],
         "RAEP0": np.array([s.right_ascension_deg for s in targets]),
         "DECEP0": np.array([s.declination_deg for s in targets]),
         "EQUINOX": np.full(len(targets), 2000.0),

@@ -68,11 +68,11 @@ def calibrator_plot(
         ax.set_ylabel(label)
         ax.set_xlabel(axis)
     handles, texts = axes[0].get_legend_handles_labels()
-    figure.legend(handles, texts, loc="outside lower center", ncols=_columns(texts))
+    figure.legend(handles, texts, loc="outside lower center", ncols=columns_of(texts))
     return figure
 
 
-def _columns(texts: Sequence[str]) -> int:
+def columns_of(texts: Sequence[str]) -> int:
     """As many columns as the names leave room for."""
     longest = max(map(len, texts), default=1)
     return max(1, min(3, len(texts), ROOM_FOR_NAMES // (longest + EDGE_OF_NAME)))

@@ -325,8 +325,8 @@ def _groups(peaks: Peaks, rate: float, rules: PlanOptions) -> dict[str, int]:
 def _refuse_saturated(per_frame: float, full_well_e: float) -> None:
     if 2.0 * per_frame > full_well_e:
         raise UsageError(
-            f"the star saturates: {per_frame:.0f} electrons in the brightest pixel "
-            f"per group, and {full_well_e:.0f} fill it",
+            f"the star saturates: a slope needs 2 groups, which collect {2.0 * per_frame:.0f} "
+            f"electrons in the brightest pixel, and {full_well_e:.0f} fill it",
             remedy="a fainter star or a narrower filter",
         )
 

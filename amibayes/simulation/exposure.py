@@ -199,8 +199,8 @@ def make_recorder(
     peak = float(expected.max()) * detector.frame_time_s
     if 2.0 * peak > detector.full_well_e:
         raise UsageError(
-            f"the scene saturates: {peak:.0f} electrons in the brightest pixel per group, "
-            f"and {detector.full_well_e:.0f} fill it",
+            f"the scene saturates: a slope needs 2 groups, which collect {2.0 * peak:.0f} "
+            f"electrons in the brightest pixel, and {detector.full_well_e:.0f} fill it",
             remedy="a fainter star or a narrower filter",
         )
     fit = SlopeFit(expected, detector, maps, exposure.n_groups)
