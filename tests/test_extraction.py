@@ -377,6 +377,9 @@ def test_oifits_keeps_everything(niriss: Instrument, tmp_path: Path) -> None:
     assert before.setups[0].response is not None
     for field in fields(Response):
         kept, written = (getattr(x.setups[0].response, field.name) for x in (after, before))
+        if field.name == "method":
+            assert (kept, written) == ("fringes", "fringes")
+            continue
         np.testing.assert_allclose(kept, written, rtol=1e-12)
     assert after.n_integrations == 10
     assert after.vis2.integration_s[0] == 20.0

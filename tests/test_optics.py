@@ -329,7 +329,8 @@ def test_fringe_image_of_a_point_is_its_image(turn: float) -> None:
     quick = fringe_image(instrument, channels, point, 30, 3, rotation_rad=turn)
     turned = instrument.with_mask(instrument.mask.rotated(turn))
     exact = 2.0 * psf(turned, channels, 30, oversample=3, integrate=False)
-    np.testing.assert_allclose(quick, exact, atol=1e-13 * exact.max())
+    # In single precision, of sums of 43 terms.
+    np.testing.assert_allclose(quick, exact, atol=5e-7 * exact.max())
 
 
 @pytest.mark.parametrize(
