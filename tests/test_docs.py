@@ -11,6 +11,7 @@ import runpy
 import shlex
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -135,7 +136,10 @@ def test_every_key_of_the_result_is_explained() -> None:
     report = search_companion([data / "target.oifits"], sorted(data.glob("cal*.oifits")), options)
     page = (DOCS / "reference" / "result_json.md").read_text(encoding="utf-8")
     words = set(re.findall(r"\w+", page.split("## An example")[0]))
-    missing = keys_of(result_json(report)) - words
+    content = result_json(report)
+    assert set(content.pop("options")) == {field.name for field in fields(SearchOptions)}
+    missing = keys_of(content) | {"options"}
+    missing -= words
     assert not missing
 
 
