@@ -7,6 +7,7 @@ goes on from there and ends with the same samples.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,7 +172,9 @@ class Posterior:
             Where ArviZ is not installed.
         """
         try:
-            import arviz
+            with warnings.catch_warnings():  # once a day it tells of plans of its own
+                warnings.simplefilter("ignore", FutureWarning)
+                import arviz
         except ImportError as error:
             raise UsageError(
                 "InferenceData needs ArviZ", remedy="pip install 'amibayes[arviz]'"
