@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from conftest import script
 
 import amibayes
 from amibayes.cli import main as amibayes_command
@@ -168,7 +169,7 @@ def test_the_readme_prints_what_the_command_does(tmp_path: Path, monkeypatch, ca
 @pytest.mark.slow
 def test_the_tutorial_finds_its_companion(tmp_path: Path) -> None:
     subprocess.run(
-        [sys.executable, "-W", "error", str(DOCS / "tutorial.py"), str(tmp_path)],
+        [sys.executable, *script("generate").STRICT, str(DOCS / "tutorial.py"), str(tmp_path)],
         check=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"},
     )
