@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+import time
+import warnings
 from pathlib import Path
 from types import ModuleType
 
@@ -18,6 +20,26 @@ settings.load_profile("repeatable")
 
 ROOT = Path(__file__).resolve().parent.parent
 
+
+def _greet_arviz() -> None:
+    """Let ArviZ, which corner imports, say what it says once a day, before any test does.
+
+    It writes a file as it does so, which workers that start together take from each other.
+    """
+    for _ in range(5):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                importlib.import_module("arviz")
+        except OSError:
+            time.sleep(0.1)
+            continue
+        except ImportError:
+            pass
+        return
+
+
+_greet_arviz()
 
 # Scripts of the documentation share a module.
 sys.path.append(str(ROOT / "docs"))
