@@ -139,8 +139,7 @@ def test_every_key_of_the_result_is_explained() -> None:
     words = set(re.findall(r"\w+", page.split("## An example")[0]))
     content = result_json(report)
     assert set(content.pop("options")) == {field.name for field in fields(SearchOptions)}
-    missing = keys_of(content) | {"options"}
-    missing -= words
+    missing = (keys_of(content) | {"options"}) - words
     assert not missing
 
 

@@ -41,24 +41,21 @@ def integrations(extraction: Extraction) -> Observables:
     n = len(used)
     blocks = [replace(b, matrix=b.matrix * n) for b in covariance.blocks]
     whole = BlockCovariance(covariance.size, blocks)
+    # The scatter is that of these very data: what it does not tell of the covariance they do
+    # not tell again, and a t likelihood of all of them would be too narrow.
+    one = replace(mean, covariance=whole, covariance_kind="given", freedom=None, scatter=None)
     time = extraction.frames.mjd[used]
     parts = []
     for k in range(n):
         mjd = time[k] if np.isfinite(time[k]) else mean.vis2.mjd[0]
         parts.append(
             replace(
-                mean,
+                one,
                 vis2=_at(mean.vis2, vis2[k], mjd, n),
                 closure_phase=_at(mean.closure_phase, closure[k], mjd, n),
-                covariance=whole,
-                covariance_kind="given",
-                freedom=None,
-                scatter=None,
             )
         )
-    # The scatter is that of these very data: what it does not tell of the covariance they do
-    # not tell again, and a t likelihood of all of them would be too narrow.
-    return replace(join(parts), covariance_kind="given", freedom=None, scatter=None)
+    return join(parts)
 
 
 def _at(table: Measurements, value: FloatArray, mjd: float, n: int) -> Measurements:

@@ -7,7 +7,6 @@ goes on from there and ends with the same samples.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -172,9 +171,7 @@ class Posterior:
             Where ArviZ is not installed.
         """
         try:
-            with warnings.catch_warnings():  # once a day it tells of plans of its own
-                warnings.simplefilter("ignore", FutureWarning)
-                import arviz
+            import arviz
         except ImportError as error:
             raise UsageError(
                 "InferenceData needs ArviZ", remedy="pip install 'amibayes[arviz]'"
