@@ -13,31 +13,31 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration, calibrate
+    from amibayes.companion_search.joint_bank import bank_of
+    from amibayes.companion_search.residuals_by_file import file_residuals
+    from amibayes.companion_search.result import Companion, SearchResult
+    from amibayes.companion_search.search import search
+    from amibayes.companion_search.second_companion import TwoCompanions, search_second
+    from amibayes.companion_search.template_bank import TemplateBank
     from amibayes.cube import Cube, open_cube, read_cube, write_cube
+    from amibayes.data.observables import Observables, join
+    from amibayes.data.point_source import point_source
+    from amibayes.detection.false_alarm import Significance, significance
     from amibayes.errors import AmibayesError, DataError, RunError, UsageError
     from amibayes.extraction import extract
-    from amibayes.inference.analytic_limits import AnalyticLimit, analytic_limit
-    from amibayes.inference.bank import TemplateBank
-    from amibayes.inference.by_file import file_residuals
-    from amibayes.inference.evidence import Evidence, weigh_models
-    from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
-    from amibayes.inference.injection import Criterion, MeasuredStar, make_criterion, measure_star
-    from amibayes.inference.joint import joint_likelihood
-    from amibayes.inference.joint_bank import bank_of
-    from amibayes.inference.likelihood import Likelihood
-    from amibayes.inference.limits import DetectionLimit, detection_limit
-    from amibayes.inference.model import BinaryModel
-    from amibayes.inference.multiplicity import TwoCompanions, search_second
-    from amibayes.inference.posterior import Posterior, sample
-    from amibayes.inference.priors import Prior
-    from amibayes.inference.recovery import Recovery, recover
-    from amibayes.inference.results import Companion, SearchResult
-    from amibayes.inference.search import search
-    from amibayes.inference.significance import Significance, significance
     from amibayes.instrument import Instrument, instrument_names, load_instrument
-    from amibayes.job import SearchOptions, SearchReport
-    from amibayes.limits_job import LimitsOptions, LimitsReport, measure_limits
-    from amibayes.observables import Observables, join
+    from amibayes.likelihood.joint import joint_likelihood
+    from amibayes.likelihood.likelihood import Likelihood
+    from amibayes.limits.analytic import AnalyticLimit, analytic_limit
+    from amibayes.limits.completeness import DetectionLimit, detection_limit
+    from amibayes.limits.image_injection import (
+        Criterion,
+        MeasuredStar,
+        make_criterion,
+        measure_star,
+    )
+    from amibayes.limits.injection import Recovery, recover
+    from amibayes.models.components import BinaryModel
     from amibayes.oifits import (
         OIFits,
         OITable,
@@ -47,89 +47,95 @@ if TYPE_CHECKING:
         write_oifits,
     )
     from amibayes.optics import FringeBasis, PupilMap, Wavefront, fringe_basis, psf, scene_image
-    from amibayes.orientation import Orientation
     from amibayes.parallel import open_executor
-    from amibayes.pipeline import search_companion
-    from amibayes.planning import expect, make_plan
-    from amibayes.scene import Scene
-    from amibayes.scene_file import load_scene
+    from amibayes.pipeline.limits import LimitsOptions, LimitsReport, measure_limits
+    from amibayes.pipeline.options import SearchOptions
+    from amibayes.pipeline.planning import expect, make_plan
+    from amibayes.pipeline.report_types import SearchReport
+    from amibayes.pipeline.search import search_companion
+    from amibayes.posterior.ensemble import Posterior, sample
+    from amibayes.posterior.evidence import Evidence, compare_models
+    from amibayes.posterior.grid import GridPosterior, grid_posterior
+    from amibayes.posterior.priors import Prior
+    from amibayes.scene.file import load_scene
+    from amibayes.scene.orientation import Orientation
+    from amibayes.scene.sources import Scene
     from amibayes.simulation import Detector, Exposure, Observation, simulate
-    from amibayes.synthetic import point_source
 
 _HOME = {
     "AmibayesError": "amibayes.errors",
-    "AnalyticLimit": "amibayes.inference.analytic_limits",
-    "BinaryModel": "amibayes.inference.model",
+    "AnalyticLimit": "amibayes.limits.analytic",
+    "BinaryModel": "amibayes.models.components",
     "Calibration": "amibayes.calibration",
-    "Companion": "amibayes.inference.results",
+    "Companion": "amibayes.companion_search.result",
     "Cube": "amibayes.cube",
-    "Criterion": "amibayes.inference.injection",
+    "Criterion": "amibayes.limits.image_injection",
     "DataError": "amibayes.errors",
-    "DetectionLimit": "amibayes.inference.limits",
+    "DetectionLimit": "amibayes.limits.completeness",
     "Detector": "amibayes.simulation",
-    "Evidence": "amibayes.inference.evidence",
+    "Evidence": "amibayes.posterior.evidence",
     "Exposure": "amibayes.simulation",
     "FringeBasis": "amibayes.optics",
-    "GridPosterior": "amibayes.inference.grid_posterior",
+    "GridPosterior": "amibayes.posterior.grid",
     "Instrument": "amibayes.instrument",
-    "Likelihood": "amibayes.inference.likelihood",
-    "LimitsOptions": "amibayes.limits_job",
-    "LimitsReport": "amibayes.limits_job",
-    "MeasuredStar": "amibayes.inference.injection",
+    "Likelihood": "amibayes.likelihood.likelihood",
+    "LimitsOptions": "amibayes.pipeline.limits",
+    "LimitsReport": "amibayes.pipeline.limits",
+    "MeasuredStar": "amibayes.limits.image_injection",
     "OIFits": "amibayes.oifits",
     "OITable": "amibayes.oifits",
-    "Observables": "amibayes.observables",
+    "Observables": "amibayes.data.observables",
     "Observation": "amibayes.simulation",
-    "Orientation": "amibayes.orientation",
-    "Posterior": "amibayes.inference.posterior",
-    "Prior": "amibayes.inference.priors",
+    "Orientation": "amibayes.scene.orientation",
+    "Posterior": "amibayes.posterior.ensemble",
+    "Prior": "amibayes.posterior.priors",
     "PupilMap": "amibayes.optics",
-    "Recovery": "amibayes.inference.recovery",
+    "Recovery": "amibayes.limits.injection",
     "RunError": "amibayes.errors",
-    "Scene": "amibayes.scene",
-    "SearchOptions": "amibayes.job",
-    "SearchReport": "amibayes.job",
-    "SearchResult": "amibayes.inference.results",
-    "Significance": "amibayes.inference.significance",
-    "TemplateBank": "amibayes.inference.bank",
-    "TwoCompanions": "amibayes.inference.multiplicity",
+    "Scene": "amibayes.scene.sources",
+    "SearchOptions": "amibayes.pipeline.options",
+    "SearchReport": "amibayes.pipeline.options",
+    "SearchResult": "amibayes.companion_search.result",
+    "Significance": "amibayes.detection.false_alarm",
+    "TemplateBank": "amibayes.companion_search.template_bank",
+    "TwoCompanions": "amibayes.companion_search.second_companion",
     "UsageError": "amibayes.errors",
     "Wavefront": "amibayes.optics",
-    "analytic_limit": "amibayes.inference.analytic_limits",
-    "bank_of": "amibayes.inference.joint_bank",
+    "analytic_limit": "amibayes.limits.analytic",
+    "bank_of": "amibayes.companion_search.joint_bank",
     "calibrate": "amibayes.calibration",
-    "detection_limit": "amibayes.inference.limits",
-    "expect": "amibayes.planning",
+    "detection_limit": "amibayes.limits.completeness",
+    "expect": "amibayes.pipeline.planning",
     "extract": "amibayes.extraction",
-    "file_residuals": "amibayes.inference.by_file",
+    "file_residuals": "amibayes.likelihood.residuals",
     "fringe_basis": "amibayes.optics",
-    "grid_posterior": "amibayes.inference.grid_posterior",
+    "grid_posterior": "amibayes.posterior.grid",
     "instrument_names": "amibayes.instrument",
-    "join": "amibayes.observables",
-    "joint_likelihood": "amibayes.inference.joint",
+    "join": "amibayes.data.observables",
+    "joint_likelihood": "amibayes.likelihood.joint",
     "load_instrument": "amibayes.instrument",
-    "load_scene": "amibayes.scene_file",
-    "make_criterion": "amibayes.inference.injection",
-    "make_plan": "amibayes.planning",
-    "measure_star": "amibayes.inference.injection",
-    "measure_limits": "amibayes.limits_job",
+    "load_scene": "amibayes.scene.file",
+    "make_criterion": "amibayes.limits.image_injection",
+    "make_plan": "amibayes.pipeline.planning",
+    "measure_star": "amibayes.limits.image_injection",
+    "measure_limits": "amibayes.pipeline.limits",
     "observables_of": "amibayes.oifits",
     "open_cube": "amibayes.cube",
     "open_executor": "amibayes.parallel",
     "open_oifits": "amibayes.oifits",
-    "point_source": "amibayes.synthetic",
+    "point_source": "amibayes.data.point_source",
     "psf": "amibayes.optics",
     "read_cube": "amibayes.cube",
     "read_oifits": "amibayes.oifits",
-    "recover": "amibayes.inference.recovery",
-    "sample": "amibayes.inference.posterior",
+    "recover": "amibayes.limits.injection",
+    "sample": "amibayes.posterior.ensemble",
     "scene_image": "amibayes.optics",
-    "search": "amibayes.inference.search",
-    "search_companion": "amibayes.pipeline",
-    "search_second": "amibayes.inference.multiplicity",
-    "significance": "amibayes.inference.significance",
+    "search": "amibayes.companion_search.search",
+    "search_companion": "amibayes.pipeline.search",
+    "search_second": "amibayes.companion_search.second_companion",
+    "significance": "amibayes.detection.false_alarm",
     "simulate": "amibayes.simulation",
-    "weigh_models": "amibayes.inference.evidence",
+    "weigh_models": "amibayes.posterior.evidence",
     "write_cube": "amibayes.cube",
     "write_oifits": "amibayes.oifits",
 }

@@ -25,11 +25,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes import Likelihood, TemplateBank, load_instrument, open_executor, point_source
-from amibayes.inference.bank import make_grid
-from amibayes.inference.recovery import TRIALS_AT_ONCE, nearer_aliases, recover
-from amibayes.inference.refine import Box, refine
-from amibayes.inference.search import resolution_mas, search
-from amibayes.observables import BoolArray, Observables
+from amibayes.companion_search.optimise import refine
+from amibayes.companion_search.search import resolution_mas, search
+from amibayes.companion_search.template_bank import make_grid
+from amibayes.data.observables import BoolArray, Observables
+from amibayes.limits.injection import TRIALS_AT_ONCE, nearer_aliases, recover
+from amibayes.models.parameters import Box
 from amibayes.parallel import Executor
 from amibayes.units import FloatArray, offset
 

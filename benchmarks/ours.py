@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from amibayes import BinaryModel, Likelihood, read_oifits, sample, search
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.detection.false_alarm import null_maxima
 from amibayes.extraction import ExtractOptions, extract_all
-from amibayes.inference.bank import TemplateBank
-from amibayes.inference.priors import default_prior
-from amibayes.inference.significance import null_maxima
+from amibayes.posterior.priors import default_prior
 from benchmarks.search import gemm_seconds
 
 DRAWS = 10_000

@@ -22,12 +22,13 @@ from pathlib import Path
 import numpy as np
 
 from amibayes import Likelihood, join, point_source, read_oifits, write_oifits
-from amibayes.inference.bank import TemplateBank, make_grid
-from amibayes.inference.model import BinaryModel
-from amibayes.inference.refine import fit_single, single_likelihood
-from amibayes.inference.search import search
-from amibayes.inference.significance import null_maxima
-from amibayes.observables import Observables
+from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.search import search
+from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.data.observables import Observables
+from amibayes.detection.false_alarm import null_maxima
+from amibayes.likelihood.likelihood import single_likelihood
+from amibayes.models.components import BinaryModel
 
 FIELD = (0.7, 50.0)
 POSITIONS = 40_000

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.files import sha256
 from amibayes.parallel import open_executor
-from amibayes.simulation.observe import Shutter, write_exposure
+from amibayes.simulation.observe import PreparedExposure, write_exposure
 from amibayes.simulation.program import read_program
+from amibayes.support.atomic_files import sha256
 
 SCENE = """
 [star]
@@ -40,7 +40,7 @@ def megabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def draws_alone_s(shutter: Shutter, n: int) -> tuple[float, float]:
+def draws_alone_s(shutter: PreparedExposure, n: int) -> tuple[float, float]:
     """Seconds of one core for the Poisson and normal numbers of n integrations."""
     detector = shutter.observation.detector
     light = shutter.recorder.light(shutter.pointings.jitter_px[:32]) * detector.frame_time_s

@@ -17,8 +17,8 @@ from pages import put_table
 from amibayes import load_instrument
 from amibayes.cube import Cube
 from amibayes.extraction import ExtractOptions, extract_all
+from amibayes.extraction.fourier.sampling import OneEach
 from amibayes.extraction.low_flux import expected_covariance
-from amibayes.extraction.sampling import OneEach
 from amibayes.optics import psf
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray

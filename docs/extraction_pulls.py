@@ -24,14 +24,14 @@ from amibayes.calibration import calibrate
 from amibayes.cube import Cube
 from amibayes.extraction import Extraction, ExtractOptions, extract_all
 from amibayes.extraction.averaging import average
-from amibayes.extraction.fine_image import FineImage
+from amibayes.extraction.fourier.fine_image import FineImage
+from amibayes.extraction.fourier.sampling import split
 from amibayes.extraction.image_plane import shift_of
 from amibayes.extraction.response import pointing_response, star_image
-from amibayes.extraction.sampling import split
 from amibayes.parallel import SerialExecutor
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
-from amibayes.simulation.observe import Observation, Shutter, blank_cube, open_shutter
+from amibayes.simulation.observe import Observation, PreparedExposure, blank_cube, open_shutter
 from amibayes.units import MAS, FloatArray
 
 N_INTEGRATIONS, N_GROUPS, N_PAIRS = 20, 14, 32
@@ -82,7 +82,7 @@ def pair(
     return [taken(open_shutter(observation, child, drawn)) for child in exposures]
 
 
-def taken(shutter: Shutter) -> Cube:
+def taken(shutter: PreparedExposure) -> Cube:
     """The exposure in memory."""
     chunks = list(shutter.take(SerialExecutor()))
     images, error, dq = (

@@ -22,7 +22,7 @@ from amibayes.calibration import calibrate
 from amibayes.cube import Cube
 from amibayes.extraction import METHODS, Extraction, ExtractOptions, extract_all
 from amibayes.instrument import Channels
-from amibayes.spectrum import Blackbody
+from amibayes.scene.spectrum import Blackbody
 from amibayes.units import FloatArray
 
 PHOTONS = 1e7

@@ -14,9 +14,9 @@ import numpy as np
 from scipy import stats
 
 import amibayes as ab
-from amibayes.closure import closure_matrix
-from amibayes.inference.bank import make_grid
-from amibayes.inference.search import search
+from amibayes.companion_search.search import search
+from amibayes.companion_search.template_bank import make_grid
+from amibayes.data.closure import closure_matrix
 from amibayes.plots.maps import detection_map
 from amibayes.plots.style import (
     BLACK,

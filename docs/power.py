@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from amibayes import BinaryModel, Likelihood, Observables, TemplateBank, load_instrument
-from amibayes.inference.bank import make_grid
-from amibayes.inference.detection import candid_n_sigma
-from amibayes.inference.significance import clopper_pearson, null_maxima
+from amibayes.companion_search.template_bank import make_grid
+from amibayes.data.point_source import point_source
+from amibayes.detection.false_alarm import clopper_pearson, null_maxima
+from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
-from amibayes.synthetic import point_source
 from amibayes.units import FloatArray, offset
 
 FIELD_MAS = (50.0, 400.0)

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from amibayes import BinaryModel, Likelihood, Observables, read_oifits, search
-from amibayes.observables import Measurements
+from amibayes.data.observables import Measurements
 
 FREE = BinaryModel(diameter_mas="free")
 UNSMEARED = BinaryModel(diameter_mas="free", smearing=False)

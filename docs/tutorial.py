@@ -17,13 +17,13 @@ import numpy as np
 
 import amibayes as ab
 from amibayes.cli import main as amibayes_command
-from amibayes.inference.priors import default_prior
 from amibayes.plots.contrast_curve import Curve, limits_plot
 from amibayes.plots.corner_plot import corner_plot
 from amibayes.plots.fit import fit_plot
 from amibayes.plots.maps import detection_map
 from amibayes.plots.null_plot import null_plot
 from amibayes.plots.style import save
+from amibayes.posterior.priors import default_prior
 
 # [/imports]
 

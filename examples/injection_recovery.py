@@ -26,7 +26,7 @@ from amibayes import (
     simulate,
 )
 from amibayes.cube import Cube
-from amibayes.observables import Observables
+from amibayes.data.observables import Observables
 from amibayes.units import FloatArray, offset
 
 SEPARATION_MAS = 150.0

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import Block, BlockCovariance, DiagonalCovariance, stack_covariances
-from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.model import BinaryModel
+from amibayes.data.closure import closure_matrix, kernel_basis
+from amibayes.data.covariance import Block, BlockCovariance, DiagonalCovariance, stack_covariances
+from amibayes.data.observables import Observables
+from amibayes.data.point_source import point_source
 from amibayes.instrument import load_instrument
-from amibayes.observables import Observables
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.components import BinaryModel
 from amibayes.oifits import write_oifits
-from amibayes.synthetic import point_source
 from amibayes.units import DEGREE, FloatArray, delta_mag_to_contrast, offset
 
 SEED = 20201211

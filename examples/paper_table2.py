@@ -43,10 +43,10 @@ from amibayes import (
     significance,
     simulate,
 )
-from amibayes.assumed import covariance_of_errors
-from amibayes.inference.detection import candid_n_sigma
-from amibayes.observables import Observables
-from amibayes.planning import PAPER, contrast_curve, expected_observables
+from amibayes.data.assumed_covariance import covariance_of_errors
+from amibayes.data.observables import Observables
+from amibayes.likelihood.chi2 import candid_n_sigma
+from amibayes.pipeline.planning import PAPER, contrast_curve, expected_observables
 from amibayes.plots.style import MARKERS, SERIES, new_figure, save, styled
 from amibayes.simulation import PRESETS
 from amibayes.simulation.budget import Plan, star_channels

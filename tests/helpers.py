@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amibayes.inference.likelihood import Likelihood
-from amibayes.inference.model import BinaryModel
-from amibayes.observables import Observables
-from amibayes.synthetic import point_source
+from amibayes.data.observables import Observables
+from amibayes.data.point_source import point_source
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.components import BinaryModel
 
 NIRISS_HOLES = np.array(
     [

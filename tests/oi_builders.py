@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.assumed import covariance_of_errors
-from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import (
+from amibayes.data.assumed_covariance import covariance_of_errors
+from amibayes.data.closure import closure_matrix, kernel_basis
+from amibayes.data.covariance import (
     Block,
     BlockCovariance,
     Covariance,
     DiagonalCovariance,
     stack_covariances,
 )
-from amibayes.observables import Measurements, Observables, Setup
+from amibayes.data.observables import Measurements, Observables, Setup
 
 
 def table(name: str, columns: dict[str, tuple[str, Any, str]], **keywords: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from amibayes.instrument import Channels, Instrument, load_instrument
 from amibayes.optics import scene_image
 from amibayes.parallel import Executor, SerialExecutor
-from amibayes.scene import Scene
+from amibayes.scene.sources import Scene
 from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
 from amibayes.simulation.exposure import (
     Exposure,

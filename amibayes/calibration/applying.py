@@ -10,9 +10,9 @@ from scipy.sparse import coo_array, csr_array, diags_array, triu
 from amibayes.calibration.freedom import calibrated_freedom
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import sparse_covariance, wrapped
-from amibayes.calibration.weighted import Response
+from amibayes.calibration.weighted import TransferFunction
+from amibayes.data.observables import BoolArray, CovarianceKind, Observables
 from amibayes.errors import DataError
-from amibayes.observables import BoolArray, CovarianceKind, Observables
 from amibayes.oifits.correlations import Pairs, given_covariance
 from amibayes.units import FloatArray
 
@@ -23,7 +23,7 @@ FAINTEST = 3.0
 def apply_response(
     target: Observables,
     keys: Keys,
-    response: Response,
+    response: TransferFunction,
     calibrators: list[Observables],
     notes: tuple[str, ...],
 ) -> Observables:
@@ -34,7 +34,7 @@ def apply_response(
     target : Observables
     keys : Keys
         Which value of the response goes with which datum.
-    response : Response
+    response : TransferFunction
     calibrators : list of Observables
         All that were given: the kind of the covariance is that of the least certain.
     notes : tuple of str
@@ -76,7 +76,7 @@ def apply_response(
 
 
 def _values(
-    used: Observables, key: np.ndarray, sign: np.ndarray, response: Response
+    used: Observables, key: np.ndarray, sign: np.ndarray, response: TransferFunction
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Calibrated data and their derivatives by the target's datum and by the response."""
     n, data, m = used.n_vis2, used.data, response.value[key]

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.sparse import block_diag, coo_array, csr_array, triu
 
 from amibayes.calibration.transfer import sparse_covariance, wrapped
-from amibayes.closure import canonical, canonical_uv
-from amibayes.errors import UsageError
-from amibayes.observables import (
+from amibayes.data.closure import canonical, canonical_uv
+from amibayes.data.observables import (
     DAY_S,
     SIMULTANEOUS_S,
     IntArray,
@@ -25,6 +24,7 @@ from amibayes.observables import (
     Setup,
     closure_sets,
 )
+from amibayes.errors import UsageError
 from amibayes.oifits.correlations import Pairs, given_covariance
 from amibayes.units import FloatArray
 

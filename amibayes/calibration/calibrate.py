@@ -18,10 +18,10 @@ from amibayes.calibration.transfer import (
     on_one_branch,
     transfer_of,
 )
-from amibayes.calibration.weighted import Response, clipped, weighted_response
+from amibayes.calibration.weighted import TransferFunction, clipped, weighted_response
+from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
-from amibayes.observables import Observables, join
-from amibayes.quantities import takes_quantities
+from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray
 
 Method = Literal["hierarchical", "weighted"]
@@ -249,7 +249,7 @@ def _response(
     keys: Keys,
     rng: np.random.Generator,
     covariate: FloatArray | None,
-) -> Response:
+) -> TransferFunction:
     if method == "weighted":
         return weighted_response(kept, keys)
     return hierarchical_response(kept, keys, rng, covariate)
@@ -314,7 +314,7 @@ def _covariate(
     return np.asarray(covariate / np.abs(covariate).max())
 
 
-def _tau(response: Response) -> tuple[float | None, float | None]:
+def _tau(response: TransferFunction) -> tuple[float | None, float | None]:
     if response.tau is None:
         return None, None
     median = [float(np.median(draws)) for draws in response.tau.T]

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from amibayes.data.observables import BoolArray, Measurements, Observables
 from amibayes.errors import DataError, UsageError
-from amibayes.observables import BoolArray, Measurements, Observables
 from amibayes.units import DEGREE, FloatArray
 
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>|=)\s*(.+?)\s*$")

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.calibration.transfer import Transfer
-from amibayes.covariance import Covariance
-from amibayes.freedom import Freedom, squared_share, welch_satterthwaite
-from amibayes.observables import Observables
+from amibayes.data.covariance import Covariance
+from amibayes.data.degrees_of_freedom import Freedom, squared_share, welch_satterthwaite
+from amibayes.data.observables import Observables
 
 
 def response_freedom(

@@ -19,10 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import ClosureSet, Transfer, closure_sets
-from amibayes.calibration.weighted import Response
+from amibayes.calibration.weighted import TransferFunction
+from amibayes.data.observables import BoolArray, IntArray
 from amibayes.errors import RunError
-from amibayes.moves import along_others
-from amibayes.observables import BoolArray, IntArray
+from amibayes.support.ensemble_moves import along_others
 from amibayes.units import FloatArray
 
 PRIOR_WIDTH = 5.0
@@ -294,7 +294,7 @@ def hierarchical_response(
     keys: Keys,
     rng: np.random.Generator,
     covariate: FloatArray | None = None,
-) -> Response:
+) -> TransferFunction:
     """Response of the instrument for the target: moments of its posterior predictive density.
 
     Parameters
@@ -306,7 +306,7 @@ def hierarchical_response(
     population = population_of(transfers, keys, known, covariate)
     tau = sample_tau(population, rng)
     value, covariance = predictive(population, tau, len(keys))
-    return Response(value, covariance, known, tau)
+    return TransferFunction(value, covariance, known, tau)
 
 
 def predictive(

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.closure import canonical
-from amibayes.observables import BoolArray, IntArray, Measurements, Observables, Setup
+from amibayes.data.closure import canonical
+from amibayes.data.observables import BoolArray, IntArray, Measurements, Observables, Setup
 from amibayes.units import FloatArray
 
 SAME_CHANNEL = 0.1

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.sparse import block_array, coo_array, csr_array, diags_array
 
 from amibayes.calibration.matching import Keys, Match, match
-from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import sparse_covariance
-from amibayes.disc import uniform_disc
-from amibayes.observables import BoolArray, IntArray, Observables
+from amibayes.data.closure import closure_matrix, kernel_basis
+from amibayes.data.covariance import sparse_covariance
+from amibayes.data.observables import BoolArray, IntArray, Observables
+from amibayes.scene.disc import uniform_disc
 from amibayes.units import FloatArray
 
 Diameter = tuple[float, float]
@@ -30,7 +30,7 @@ class Transfer:
     covariance : (n_keys, n_keys) sparse array
     seen : (n_keys,) bool array
     scatter : (n_keys, n_keys) sparse array, optional
-        The covariance by measured scatter alone; see `amibayes.observables.Observables`.
+        The covariance by measured scatter alone; see `amibayes.data.observables.Observables`.
     """
 
     value: FloatArray

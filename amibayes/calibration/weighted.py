@@ -11,13 +11,13 @@ from scipy.stats import chi2
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import Transfer, kernel_projector
-from amibayes.freedom import Freedom
-from amibayes.observables import BoolArray
+from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.data.observables import BoolArray
 from amibayes.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class TransferFunction:
     """The response of the instrument when the target was observed.
 
     Parameters
@@ -101,7 +101,7 @@ def _excess(value: FloatArray, variance: FloatArray, seen: BoolArray, n_vis2: in
     return out
 
 
-def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> Response:
+def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> TransferFunction:
     """Inverse-variance mean of calibrators, key by key, and its full covariance.
 
     The error of a mean is that of its weights, or that of the scatter between calibrators
@@ -118,7 +118,7 @@ def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> Response:
     inflate = kernel_projector(keys, known) @ diags_array(np.maximum(birge, 1.0))
     scatters = [t.covariance if t.scatter is None else t.scatter for t in transfers]
     measured = any(t.scatter is not None for t in transfers)
-    return Response(
+    return TransferFunction(
         kernel_projector(keys, known) @ mean,
         _combined(inflate, weight, [t.covariance for t in transfers]),
         known,

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from amibayes.oifits.audit import Audit, Finding
 
 RESULT = "audit.json"
-MOST_LINES = 20
+MAX_LINES = 20
 
 EXAMPLES = """examples:
   amibayes audit target.oifits
@@ -40,8 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.files)
     from amibayes import __version__
-    from amibayes.files import output_folder, write_json
     from amibayes.oifits.audit import audit
+    from amibayes.support.atomic_files import output_folder, write_json
 
     audits = [audit(path) for path in arguments.files]
     copies = _copies(arguments, audits)
@@ -110,9 +110,9 @@ def _summary(
             said += f", {len(mended)} mended in {folder / copies[a.oifits.path]}"
         lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {said}")
         lines += [_line(group) for group in _alike(a.findings)]
-    if len(lines) > MOST_LINES - 1:
-        left = len(lines) - (MOST_LINES - 2)
-        lines = [*lines[: MOST_LINES - 2], f"and {left} lines more"]
+    if len(lines) > MAX_LINES - 1:
+        left = len(lines) - (MAX_LINES - 2)
+        lines = [*lines[: MAX_LINES - 2], f"and {left} lines more"]
     return [*lines, f"explained in {folder / RESULT}"]
 
 

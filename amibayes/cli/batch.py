@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from amibayes.cli import common
 from amibayes.errors import AmibayesError, DataError, UsageError
-from amibayes.files import folders_held
+from amibayes.support.atomic_files import output_locks
 
 if TYPE_CHECKING:
-    from amibayes.survey import Outcome, SurveyTarget
+    from amibayes.pipeline.batch import SurveyTarget
+    from amibayes.report.survey import Outcome
 
 NOT_OF_A_ROW = {
     "--batch", "--cal", "--debug", "--help", "--json", "--out", "--overwrite", "--quiet",
@@ -87,8 +88,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
     int
         0 where all targets were done, 4 where some failed.
     """
-    from amibayes.survey import read_targets, summary_lines
-    from amibayes.survey.summary import write_picture
+    from amibayes.pipeline.batch import read_targets
+    from amibayes.report.survey import summary_lines, write_picture
 
     if arguments.targets:
         raise UsageError(
@@ -110,7 +111,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
 def _written(
     arguments: argparse.Namespace, outcomes: list[Outcome], folder: Path
 ) -> dict[str, Any]:
-    from amibayes.survey import summary_json, write_summary
+    from amibayes.report.survey import summary_json, write_summary
 
     content = summary_json(arguments.command, arguments.seed, outcomes)
     write_summary(content, folder)
@@ -118,8 +119,8 @@ def _written(
 
 
 def _folder(arguments: argparse.Namespace, jobs: list[Job]) -> Path:
-    from amibayes.files import output_folder
-    from amibayes.survey.summary import JSON_NAME, PICTURE_NAME, TABLE_NAME
+    from amibayes.report.survey import JSON_NAME, PICTURE_NAME, TABLE_NAME
+    from amibayes.support.atomic_files import output_folder
 
     names = [JSON_NAME, TABLE_NAME, PICTURE_NAME]
     names += [f"{job.name}/{_result_name(arguments.command)}" for job in jobs]
@@ -211,8 +212,7 @@ def _finished_or_pending(
     arguments: argparse.Namespace, jobs: list[Job], folder: Path
 ) -> list[Outcome]:
     """Outcomes before anything is done: with ``--resume``, the jobs that are finished."""
-    from amibayes.survey import Outcome
-    from amibayes.survey.summary import JSON_NAME
+    from amibayes.report.survey import JSON_NAME, Outcome
 
     keys = _keys_of_done(folder / JSON_NAME) if arguments.resume else {}
     outcomes = []
@@ -260,7 +260,7 @@ def _carry_out(
 
 
 def _outcome(arguments: argparse.Namespace, job: Job, key: str, error: str) -> Outcome:
-    from amibayes.survey import Outcome
+    from amibayes.report.survey import Outcome
 
     if error:
         print(f"amibayes: {job.name}: {error}", file=sys.stderr)
@@ -275,7 +275,7 @@ def _one(command: str, job: Job) -> str:
         return job.error
     common.configure_logging(job.arguments)
     try:
-        with folders_held():
+        with output_locks():
             importlib.import_module(f"amibayes.cli.{command}").perform(job.arguments)
     except AmibayesError as error:
         return str(error)

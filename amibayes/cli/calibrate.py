@@ -11,7 +11,7 @@ from amibayes.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration
-    from amibayes.observables import Observables
+    from amibayes.data.observables import Observables
 
 RESULT = "calibrated.oifits"
 
@@ -102,8 +102,8 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from amibayes.calibration import calibrate
-    from amibayes.files import output_folder
     from amibayes.oifits import write_oifits
+    from amibayes.support.atomic_files import output_folder
 
     calibrators = [_prepared(path, arguments, target=None) for path in arguments.cal]
     targets = [_prepared(path, arguments, target=arguments.target) for path in arguments.targets]
@@ -207,7 +207,7 @@ def _from_table(path: str, calibrators: list[Observables]) -> list[tuple[float, 
 
 def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> dict[str, object]:
     from amibayes import __version__
-    from amibayes.files import sha256
+    from amibayes.support.atomic_files import sha256
 
     used = found.observables
     return {

@@ -15,9 +15,9 @@ from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
-    from amibayes.inference.priors import PriorSetting
     from amibayes.parallel import Executor, StageBars
     from amibayes.parallel import Progress as Told
+    from amibayes.posterior.priors import PriorSetting
 
 
 METHODS = ("fringes", "matched", "fft", "gauss", "square", "unique")
@@ -310,7 +310,7 @@ def companion_counts(text: str) -> tuple[int, ...]:
 
 def prior_setting(text: str) -> PriorSetting:
     """Parse ``NAME=[FORM:]LOW:HIGH`` or ``NAME=FORM``."""
-    from amibayes.inference.priors import parse_setting
+    from amibayes.posterior.priors import parse_setting
 
     try:
         return parse_setting(text)
@@ -323,7 +323,7 @@ def finish(
 ) -> None:
     """Print the JSON or the summary, as was asked for."""
     if arguments.json:
-        from amibayes.files import to_json
+        from amibayes.support.atomic_files import to_json
 
         sys.stdout.write(to_json(content))
     elif not arguments.quiet:

@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run each step as a user would, then compare with the truth."""
     common.configure_logging(arguments)
-    from amibayes.files import output_folder, write_json, write_text
     from amibayes.simulation.program import example
+    from amibayes.support.atomic_files import output_folder, write_json, write_text
 
     folder = output_folder(arguments.out, [SCENE, RESULT], overwrite=arguments.overwrite)
     write_text(folder / SCENE, example())
@@ -86,8 +86,8 @@ def _step(arguments: argparse.Namespace, words: list[str]) -> dict[str, Any]:
 
 def truth(scene: Path) -> dict[str, float]:
     """Where the companion of a scene is, and how faint."""
-    from amibayes.scene import Point
-    from amibayes.scene_file import load_scene
+    from amibayes.scene.file import load_scene
+    from amibayes.scene.sources import Point
     from amibayes.units import MAS, contrast_to_delta_mag, position_angle_deg, separation
 
     companion = load_scene(scene).components[1]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from amibayes.cli import common
 
 if TYPE_CHECKING:
-    from amibayes.checkup import Checkup
+    from amibayes.support.environment import Checkup
 
 EXAMPLES = """examples:
   amibayes doctor
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Look, time, and say what was found."""
     common.configure_logging(arguments)
-    from amibayes.checkup import checkup
+    from amibayes.support.environment import checkup
 
     found = checkup()
     common.finish(arguments, found.as_json(), lambda: _summary(found))

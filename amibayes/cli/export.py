@@ -38,9 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.files)
     from amibayes import __version__
-    from amibayes.files import output_folder, write_text
     from amibayes.oifits import read_oifits
     from amibayes.oifits.export import export, write_export
+    from amibayes.support.atomic_files import output_folder, write_text
 
     parts = [
         read_oifits(path, insname=arguments.insname, target=arguments.target)

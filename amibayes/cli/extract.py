@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from amibayes.extraction import extract_all
-    from amibayes.files import output_folder, write_json
+    from amibayes.support.atomic_files import output_folder, write_json
 
     images = common.image_options_of(arguments)
     options = replace(

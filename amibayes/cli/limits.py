@@ -10,7 +10,7 @@ from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
-    from amibayes.limits_job import LimitsOptions, LimitsReport
+    from amibayes.pipeline.limits import LimitsOptions, LimitsReport
 
 RESULT, TABLE, MAP, JOURNAL = "limits.json", "limits.ecsv", "completeness.png", "limits.journal"
 
@@ -105,7 +105,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     """Measure the limits of one target and write their files, without a word."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
-    from amibayes.files import output_folder
+    from amibayes.support.atomic_files import output_folder
 
     options = _options(arguments)
     names = _names(options)
@@ -124,7 +124,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
 
 def _names(options: LimitsOptions) -> list[str]:
     """List the files of a run."""
-    from amibayes.pictures import limits_picture_names
+    from amibayes.plots.pictures import limits_picture_names
 
     return [RESULT, TABLE, *limits_picture_names(options.method)]
 
@@ -176,8 +176,8 @@ def _measure(
     arguments: argparse.Namespace, options: LimitsOptions, folder: Path, request: str
 ) -> Any:
     """Do the work, keeping what is finished; the journal ends when all files are written."""
-    from amibayes.limits_job import measure_limits
     from amibayes.parallel import Journals
+    from amibayes.pipeline.limits import measure_limits
     from amibayes.report import limits_report_json
 
     journals = Journals(folder / JOURNAL, request, resume=arguments.resume)
@@ -201,9 +201,9 @@ def _measure(
 
 
 def _write(report: LimitsReport, content: object, folder: Path) -> None:
-    from amibayes.files import write_json
-    from amibayes.pictures import save_limits_pictures
+    from amibayes.plots.pictures import save_limits_pictures
     from amibayes.report import write_limits_table
+    from amibayes.support.atomic_files import write_json
 
     save_limits_pictures(report, folder)
     write_limits_table(folder / TABLE, report)
@@ -212,8 +212,8 @@ def _write(report: LimitsReport, content: object, folder: Path) -> None:
 
 
 def _options(arguments: argparse.Namespace) -> LimitsOptions:
-    from amibayes.job import SearchOptions
-    from amibayes.limits_job import LimitsOptions
+    from amibayes.pipeline.limits import LimitsOptions
+    from amibayes.pipeline.options import SearchOptions
 
     search = SearchOptions(
         **data_options.search_settings(arguments),
@@ -230,7 +230,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
 
 
 def _null_draws(arguments: argparse.Namespace) -> int:
-    from amibayes.limits_job import NULL_DRAWS
+    from amibayes.pipeline.limits import NULL_DRAWS
 
     if arguments.null_draws is not None:
         return int(arguments.null_draws)
@@ -244,7 +244,7 @@ def _masses(arguments: argparse.Namespace) -> Any:
                 "needs a table", source="--primary-magnitude", remedy="give --mass-table FILE"
             )
         return None
-    from amibayes.mass_table import read_mass_table
+    from amibayes.limits.mass_table import read_mass_table
 
     return read_mass_table(arguments.mass_table, arguments.primary_magnitude)
 

@@ -125,12 +125,12 @@ def run_command(words: list[str]) -> int:
     words : list of str
         The command and its arguments.
     """
-    from amibayes.files import folders_held
+    from amibayes.support.atomic_files import output_locks
 
     command = next((word for word in words if word in COMMANDS), None)
     arguments = build_parser(command).parse_args(words, argparse.Namespace(words=words))
     run = importlib.import_module(f"amibayes.cli.{arguments.command}").run
-    with folders_held():
+    with output_locks():
         return int(run(arguments))
 
 

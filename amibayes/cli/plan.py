@@ -15,7 +15,7 @@ from amibayes.cli.common import (
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
-    from amibayes.planning import ContrastCurve, Expectation, Plan
+    from amibayes.pipeline.planning import ContrastCurve, Expectation, Plan
 
 EPILOG = """examples:
   amibayes plan --filter F430M --photons 1e8 --mag 6
@@ -65,9 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Plan, write ``plan.json``, print a summary."""
     configure_logging(arguments)
-    from amibayes.files import output_folder, write_json
     from amibayes.instrument import load_instrument
-    from amibayes.planning import PlanOptions, expect, make_plan
+    from amibayes.pipeline.planning import PlanOptions, expect, make_plan
+    from amibayes.support.atomic_files import output_folder, write_json
     from amibayes.units import MAS
 
     instrument = load_instrument(arguments.instrument, arguments.filter)

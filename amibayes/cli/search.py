@@ -10,7 +10,8 @@ from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
-    from amibayes.job import SearchOptions, SearchReport
+    from amibayes.pipeline.options import SearchOptions
+    from amibayes.pipeline.report_types import SearchReport
 
 RESULT, REPORT = "result.json", "report.html"
 CHAIN, CALIBRATED = "posterior.h5", "calibrated.oifits"
@@ -90,7 +91,7 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     """Run the main job for one target and write its files, without a word."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
-    from amibayes.files import output_folder
+    from amibayes.support.atomic_files import output_folder
 
     options = _options(arguments)
     overwrite = arguments.overwrite or arguments.resume
@@ -107,7 +108,7 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
 
 def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[str]:
     """List the files of a run."""
-    from amibayes.pictures import picture_names
+    from amibayes.plots.pictures import picture_names
 
     names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated, several=several)]
     names += [CHAIN] if options.posterior else []
@@ -118,7 +119,7 @@ def _refuse_others(path: Path, inputs: list[str], options: SearchOptions) -> Non
     """Refuse to go on in a folder whose result is that of other files or options."""
     import json
 
-    from amibayes.files import sha256
+    from amibayes.support.atomic_files import sha256
 
     if not path.is_file():
         return
@@ -136,7 +137,7 @@ def _refuse_others(path: Path, inputs: list[str], options: SearchOptions) -> Non
 
 
 def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path) -> SearchReport:
-    from amibayes.pipeline import search_companion
+    from amibayes.pipeline.search import search_companion
 
     with (
         common.executor_of(arguments) as executor,
@@ -155,7 +156,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
 
 
 def _options(arguments: argparse.Namespace) -> SearchOptions:
-    from amibayes.job import SearchOptions
+    from amibayes.pipeline.options import SearchOptions
 
     return SearchOptions(
         **data_options.search_settings(arguments),
@@ -171,10 +172,10 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
 
 def _write(arguments: argparse.Namespace, report: SearchReport, folder: Path) -> dict[str, object]:
     """Write everything but the chain; the result last, so that it stands for a whole run."""
-    from amibayes.files import write_json
     from amibayes.oifits import write_oifits
-    from amibayes.pictures import save_pictures
+    from amibayes.plots.pictures import save_pictures
     from amibayes.report import captioned, result_json, search_page, write_page
+    from amibayes.support.atomic_files import write_json
 
     if report.calibration is not None:
         write_oifits(folder / CALIBRATED, report.observables, overwrite=True)

@@ -21,8 +21,8 @@ from amibayes.errors import UsageError
 
 if TYPE_CHECKING:
     from amibayes.parallel import Executor, Journals, Progress
-    from amibayes.simulation.observe import Shutter
-    from amibayes.simulation.program import Program, Shot
+    from amibayes.simulation.observe import PreparedExposure
+    from amibayes.simulation.program import ExposureSpec, Program
 
 JOURNAL = "simulate.journal"
 
@@ -74,10 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, Any]]:
     """Take and write the exposures; say what each one is."""
-    from amibayes.files import output_folder
     from amibayes.parallel import Journals, digest
     from amibayes.simulation.observe import ramp_path
-    from amibayes.simulation.program import blaming
+    from amibayes.simulation.program import naming_source
+    from amibayes.support.atomic_files import output_folder
 
     names = [shot.file_name for shot in program.shots]
     names += [ramp_path(Path(n)).name for n in names if program.keeps_ramps]
@@ -86,7 +86,7 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
     key = digest(program, arguments.seed)
     journals = Journals(folder / JOURNAL, key, resume=arguments.resume)
     done = []
-    with executor_of(arguments) as executor, blaming(arguments.scene):
+    with executor_of(arguments) as executor, naming_source(arguments.scene):
         for shot, shutter in program.shutters(arguments.seed):
             path = folder / shot.file_name
             with progress_of(arguments, shot.name, unit="integration") as told:
@@ -98,7 +98,7 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
 
 def take(
     path: Path,
-    shutter: Shutter,
+    shutter: PreparedExposure,
     executor: Executor,
     history: tuple[str, ...],
     told: Progress,
@@ -116,7 +116,7 @@ def take(
     pieces.remove()
 
 
-def described(shot: Shot, shutter: Shutter, path: Path) -> dict[str, Any]:
+def described(shot: ExposureSpec, shutter: PreparedExposure, path: Path) -> dict[str, Any]:
     """Say what an exposure is, in plain numbers."""
     import numpy as np
 

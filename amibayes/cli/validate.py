@@ -33,17 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Simulate, analyse, check, and write what came out."""
     common.configure_logging(arguments)
-    from amibayes.files import output_folder, write_json
     from amibayes.plots.style import save
     from amibayes.report.page import read_figure, write_page
-    from amibayes.validation import FULL, QUICK, validate
-    from amibayes.validation_report import (
+    from amibayes.report.validation import (
         PICTURES,
         validation_json,
         validation_page,
         validation_pictures,
         validation_table,
     )
+    from amibayes.support.atomic_files import output_folder, write_json
+    from amibayes.validation import FULL, QUICK, validate
 
     pngs = [f"{name}.png" for name, *_ in PICTURES.values()]
     folder = output_folder(

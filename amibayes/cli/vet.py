@@ -59,10 +59,10 @@ def run(arguments: argparse.Namespace) -> int:
             source="--charge-levels",
         )
     from amibayes.extraction.reading import read_observations
-    from amibayes.files import output_folder, write_json
+    from amibayes.pipeline.vetting import vet
     from amibayes.plots.style import save
-    from amibayes.vetting import vet
-    from amibayes.vetting_report import vetting_json, vetting_picture, vetting_table
+    from amibayes.report.vetting import vetting_json, vetting_picture, vetting_table
+    from amibayes.support.atomic_files import output_folder, write_json
 
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
     data = [

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.errors import DataError
-from amibayes.orientation import Orientation
+from amibayes.scene.orientation import Orientation
 from amibayes.units import FloatArray
 
 DO_NOT_USE = 1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from amibayes.errors import DataError
-from amibayes.orientation import Orientation
+from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
 Header = Mapping[str, Any]

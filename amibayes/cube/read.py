@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
 from amibayes.cube.container import Cube
-from amibayes.damage import reporting_damage
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
-from amibayes.orientation import Orientation
+from amibayes.scene.orientation import Orientation
+from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import DEGREE, FloatArray
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from amibayes.files import atomic_path
+from amibayes.support.atomic_files import atomic_path
 
 BLOCK = 2880
 """FITS files come in blocks of so many bytes."""

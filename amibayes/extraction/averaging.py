@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.extraction.cleaning import TO_SIGMA, BoolArray
+from amibayes.extraction.fourier.sampling import IntArray
 from amibayes.extraction.frames import Frames, look_elsewhere
-from amibayes.extraction.sampling import IntArray
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 

@@ -12,8 +12,9 @@ from amibayes.extraction.cleaning import (
     median_and_scatter,
     reference_of,
 )
-from amibayes.extraction.fourier import fourier_sampling
-from amibayes.extraction.frames import Bench
+from amibayes.extraction.fourier.sampling import split
+from amibayes.extraction.fourier.transform import fourier_sampling
+from amibayes.extraction.frames import ExtractionOperator
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
     FringeFit,
@@ -30,13 +31,12 @@ from amibayes.extraction.noise import (
     scatter_about_pointing,
 )
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import split
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View, look_at
 from amibayes.optics import FringeBasis
 from amibayes.units import FloatArray, SingleArray
 
-MOST_LEFT = 0.25
+MAX_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
 SMOOTH_SHARE, SMOOTH_FLOOR = 0.98, 0.003
@@ -46,7 +46,7 @@ JITTER_SLACK = 0.01
 """Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
 
-def make_bench(file: Source, options: ExtractOptions) -> Bench:
+def make_bench(file: Source, options: ExtractOptions) -> ExtractionOperator:
     """Look at a cube once, and prepare all that its integrations go through."""
     template = file.template
     reference = reference_of(file)
@@ -67,7 +67,9 @@ def make_bench(file: Source, options: ExtractOptions) -> Bench:
         else fourier_sampling(view, basis, options)
     )
     variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
-    return Bench(view, geometry, reference, fit, scatter, sampling, variance, third, options)
+    return ExtractionOperator(
+        view, geometry, reference, fit, scatter, sampling, variance, third, options
+    )
 
 
 def _fit_of_median(view: View, even: FringeFit, reference: Reference) -> FringeFit:
@@ -155,7 +157,7 @@ def _refuse_another(
     expected = float(noise.variance[good].sum()) / len(reference.sample)
     left = float((residual[good] ** 2).sum()) - expected
     share = np.sqrt(max(left, 0.0) / max(float((image[good] ** 2).sum()), 1e-300))
-    if share > MOST_LEFT:
+    if share > MAX_LEFT:
         raise DataError(
             f"the fringes of this mask and filter leave {100.0 * share:.0f} % of the image",
             source=reference.source,

@@ -11,8 +11,8 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from amibayes.cube import Cube
 from amibayes.errors import DataError
+from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.noise import NoiseModel, noise_model
-from amibayes.extraction.sampling import PixelArray
 from amibayes.extraction.source import Source
 from amibayes.units import FloatArray, read_only
 
@@ -21,7 +21,7 @@ BoolArray = NDArray[np.bool_]
 SAMPLE, RUN = 32, 4
 """Integrations that the reference is the median of: short runs, evenly over the cube."""
 
-MOST_BAD = 0.2
+MAX_BAD = 0.2
 """An integration with a larger fraction of bad pixels is not used."""
 
 ALWAYS_BAD = 0.5
@@ -95,7 +95,7 @@ def reference_of(file: Source) -> Reference:
     cube = _sample(file)
     bad = cube.bad
     share = np.count_nonzero(bad, axis=(1, 2)) / bad[0].size
-    keep = share <= max(MOST_BAD, 1.5 * float(np.median(share)))
+    keep = share <= max(MAX_BAD, 1.5 * float(np.median(share)))
     images = np.where(bad, np.nan, cube.images)[keep]
     flux = np.nansum(images, axis=(1, 2)) if len(images) else np.zeros(0)
     lit = flux > 0.2 * max(float(np.median(flux[flux > 0.0])) if np.any(flux > 0.0) else 0.0, 0.0)

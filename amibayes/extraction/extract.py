@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from amibayes.covariance import Block
 from amibayes.cube import Cube
+from amibayes.data.covariance import Block
+from amibayes.data.observables import Observables, join
+from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average, average, standing_off
 from amibayes.extraction.bench import make_bench
-from amibayes.extraction.frames import Bench, Frames, concatenated, measure, select
+from amibayes.extraction.frames import ExtractionOperator, Frames, concatenated, measure, select
 from amibayes.extraction.low_flux import expected_covariance
 from amibayes.extraction.options import ExtractOptions, Method
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
@@ -23,15 +25,13 @@ from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
-from amibayes.observables import Observables, join
 from amibayes.optics.psf import ComplexArray
-from amibayes.response import Response
 from amibayes.units import FloatArray
 
 NYQUIST = 0.5
 """Cycles per pixel beyond which fringes look like others."""
 
-LARGEST_SHIFT_PX = 1.5
+MAX_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
 
 
@@ -50,7 +50,7 @@ class Extraction:
         Of one integration.
     physical : (m, m) array
         Covariance of one integration that photon and read noise make.
-    benches : tuple of Bench
+    benches : tuple of ExtractionOperator
         One per file: view, reference image, operators.
     options : ExtractOptions
     sources : tuple of str
@@ -61,7 +61,7 @@ class Extraction:
     average: Average
     covariance: Shrunk
     physical: FloatArray
-    benches: tuple[Bench, ...]
+    benches: tuple[ExtractionOperator, ...]
     options: ExtractOptions
     sources: tuple[str, ...]
 
@@ -141,10 +141,10 @@ class _Part:
     """One file."""
 
     template: Cube
-    bench: Bench
+    bench: ExtractionOperator
     frames: Frames
     physical: FloatArray
-    response: Response
+    response: OffAxisResponse
     pointed: ComplexArray
 
 
@@ -156,7 +156,7 @@ def _measured(
         frames, samples, flux = measure(bench, file, index)
     template = file.template
     if not options.keep_all:
-        frames = replace(frames, reason=select(frames, options.clip, LARGEST_SHIFT_PX))
+        frames = replace(frames, reason=select(frames, options.clip, MAX_SHIFT_PX))
     if not frames.used.any():
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
     star = star_image(bench.view)

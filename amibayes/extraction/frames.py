@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from amibayes.cube import Cube
-from amibayes.extraction.cleaning import MOST_BAD, TO_SIGMA, BoolArray, Reference
+from amibayes.extraction.cleaning import MAX_BAD, TO_SIGMA, BoolArray, Reference
+from amibayes.extraction.fourier.sampling import IntArray, OneEach, PixelArray, Sampling
 from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.sampling import IntArray, OneEach, PixelArray, Sampling
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
@@ -77,7 +77,7 @@ class Frames:
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class ExtractionOperator:
     """Everything that an integration goes through.
 
     Parameters
@@ -214,7 +214,9 @@ class Bench:
         return np.asarray(self._usual - coefficients @ self.fit.model.single)
 
 
-def measure(bench: Bench, file: Source, index: int) -> tuple[Frames, ComplexArray, float]:
+def measure(
+    bench: ExtractionOperator, file: Source, index: int
+) -> tuple[Frames, ComplexArray, float]:
     """Measure every integration of a file, which is number ``index`` of its set.
 
     Returns
@@ -257,12 +259,14 @@ def _chunk_size(file: Source) -> int:
     return min(CHUNK, file.n_integrations, max(int(CHUNK_PIXELS // (n_y * n_x)), 1))
 
 
-def _measure_chunk(bench: Bench, cube: Cube, room: SingleArray) -> tuple[Frames, ComplexArray]:
+def _measure_chunk(
+    bench: ExtractionOperator, cube: Cube, room: SingleArray
+) -> tuple[Frames, ComplexArray]:
     pixels, numbers, misfit, n_bad = _cleaned(bench, cube, room)
     flux, samples = bench.sampled(numbers, pixels)
     own, extra = bench.bias
     n = cube.n_integrations
-    hopeless = n_bad > MOST_BAD * pixels.shape[1]
+    hopeless = n_bad > MAX_BAD * pixels.shape[1]
     reason = np.where(hopeless, "too many bad pixels", np.where(flux > 0.0, "", "no light"))
     return (
         Frames(
@@ -283,7 +287,7 @@ def _measure_chunk(bench: Bench, cube: Cube, room: SingleArray) -> tuple[Frames,
 
 
 def _cleaned(
-    bench: Bench, cube: Cube, room: SingleArray
+    bench: ExtractionOperator, cube: Cube, room: SingleArray
 ) -> tuple[PixelArray, FloatArray, FloatArray, IntArray]:
     """Give pixels that are flagged, or stand off, the values that a fit predicts.
 
@@ -322,7 +326,7 @@ def _filled(fit: FringeFit, pixels: PixelArray, missing: BoolArray) -> PixelArra
     """Pixels with the missing ones filled, unless there are too many."""
     gone = missing | ~fit.used
     if gone.any():
-        hopeless = np.count_nonzero(missing & fit.used, axis=1) > MOST_BAD * missing.shape[1]
+        hopeless = np.count_nonzero(missing & fit.used, axis=1) > MAX_BAD * missing.shape[1]
         pixels = fit.fill(pixels, gone & ~hopeless[:, None])
     return pixels
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.extraction.fine_image import fine_image
+from amibayes.extraction.fourier.fine_image import fine_image
 from amibayes.extraction.image_plane import FringeFit, FringeModel, weighted_fit
 from amibayes.extraction.view import View
 from amibayes.optics import FringeBasis
@@ -34,7 +34,7 @@ LARGEST = 0.02
 CONSTRAINED = 3e-3
 """A fit with larger errors says less than the header does."""
 
-MOST_STEPS = 4
+MAX_STEPS = 4
 
 BELIEVED, SIGNIFICANT = 2.5e-4, 4.0
 """Differences from the stated geometry below this, or so many standard deviations, are left."""
@@ -128,7 +128,7 @@ def solve_geometry(
         return None
     limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
     believed = np.zeros(2)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]
         step = (covariance @ (slopes * fit.weight) @ residual)[:2]
         # Scales multiply: what the slopes are linear in is their logarithm.

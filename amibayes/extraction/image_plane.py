@@ -14,13 +14,13 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
-from amibayes.extraction.sampling import BoolArray, IntArray, OneEach, PixelArray, split
+from amibayes.extraction.fourier.sampling import BoolArray, IntArray, OneEach, PixelArray, split
 from amibayes.extraction.view import CONVERGED_PX, View
 from amibayes.optics import FringeBasis
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray, SingleArray
 
-MOST_STEPS = 12
+MAX_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ def centre_on(
     even = np.ones(view.shape)
     if basis is None:
         view = view.moved(_shift_of_transform(view, pixels))
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         basis = basis or view.basis()
         fit = fringe_fit(FringeModel.of(basis), even, good)
         flux, samples = split(fit.solve(pixels.reshape(1, -1)))

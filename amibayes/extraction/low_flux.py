@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.extraction.sampling import OneEach, Sampling, signs
-from amibayes.extraction.splodges import Splodges
+from amibayes.extraction.fourier.sampling import OneEach, Sampling, signs
+from amibayes.extraction.fourier.splodges import Splodges
 from amibayes.optics.psf import ComplexArray
 from amibayes.units import FloatArray
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
 
-from amibayes.extraction.sampling import BoolArray, PixelArray
+from amibayes.extraction.fourier.sampling import BoolArray, PixelArray
 from amibayes.units import FloatArray, read_only
 
 _ROUNDS = 4

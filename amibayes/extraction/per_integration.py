@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from amibayes.covariance import BlockCovariance
+from amibayes.data.covariance import BlockCovariance
+from amibayes.data.observables import Measurements, Observables, join
 from amibayes.errors import DataError
 from amibayes.extraction.extract import Extraction
-from amibayes.observables import Measurements, Observables, join
 from amibayes.units import FloatArray
 
 

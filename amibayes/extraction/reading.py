@@ -9,11 +9,11 @@ from typing import Any
 
 from astropy.io import fits
 
-from amibayes.damage import UNREADABLE
+from amibayes.data.observables import Observables, join
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
-from amibayes.observables import Observables, join
 from amibayes.oifits import read_oifits
+from amibayes.support.fits_errors import UNREADABLE
 
 
 @dataclass(frozen=True)

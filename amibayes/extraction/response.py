@@ -11,12 +11,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import spline_filter1d
 
-from amibayes.extraction.fine_image import FARTHEST, FineImage, fine_image
-from amibayes.extraction.sampling import Sampling
+from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
+from amibayes.extraction.fourier.sampling import Sampling
 from amibayes.extraction.view import View
 from amibayes.optics.psf import ComplexArray
-from amibayes.orientation import Orientation
-from amibayes.response import Response
+from amibayes.scene.orientation import Orientation
 from amibayes.units import FloatArray
 
 NODES_PER_FRINGE = 2.8
@@ -45,7 +45,7 @@ def off_axis_response(
     orientation: Orientation,
     centre_px: FloatArray,
     method: str = "",
-) -> Response:
+) -> OffAxisResponse:
     """Measure the response of flux and of every baseline.
 
     Parameters
@@ -86,7 +86,7 @@ def off_axis_response(
     between[a, b], between[b, a] = spline[1:], spline[1:].conj()
     pointing = orientation.to_sky(pixel * centre_px)
     single = sampling.n_samples == view.instrument.mask.n_baselines
-    return Response(between, orientation.matrix.T / (step * cell), pointing, single, method)
+    return OffAxisResponse(between, orientation.matrix.T / (step * cell), pointing, single, method)
 
 
 def _interpolating(values: ComplexArray) -> ComplexArray:

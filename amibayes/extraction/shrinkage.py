@@ -15,12 +15,12 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.special import digamma, gammaln
 
+from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.errors import DataError
-from amibayes.extraction.sampling import BoolArray
-from amibayes.freedom import Freedom
+from amibayes.extraction.fourier.sampling import BoolArray
 from amibayes.units import FloatArray, read_only
 
-MOST_FREEDOM = 1e4
+MAX_FREEDOM = 1e4
 """The prior never counts for more integrations than this."""
 
 SIGNIFICANT = 4.0
@@ -139,7 +139,7 @@ def _most_likely(white: FloatArray, groups: BoolArray) -> tuple[float, tuple[flo
     p, n = white.shape
     scatter = white @ white.T
     start = np.log(np.maximum(_scales(scatter / (n - 1), groups), 1e-3))
-    bounds = [(-2.0, np.log(MOST_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
+    bounds = [(-2.0, np.log(MAX_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
     tries = [
         minimize(
             _loss,

@@ -27,7 +27,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class InMemoryCube:
     """A cube in memory."""
 
     cube: Cube
@@ -58,7 +58,7 @@ class Held:
 def opened(cube: Cube | str | Path, **header: Any) -> Iterator[Source]:
     """Open a path, with `open_cube`'s options in place of its header, or a cube."""
     if isinstance(cube, Cube):
-        yield Held(cube)
+        yield InMemoryCube(cube)
         return
     with open_cube(cube, **header) as file:
         yield file

@@ -9,7 +9,7 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.extraction.extract import Extraction
-from amibayes.extraction.frames import Bench
+from amibayes.extraction.frames import ExtractionOperator
 from amibayes.extraction.geometry import Geometry
 from amibayes.units import DEGREE
 
@@ -55,7 +55,7 @@ def described(extraction: Extraction) -> dict[str, Any]:
     }
 
 
-def _from_middle(bench: Bench) -> list[float]:
+def _from_middle(bench: ExtractionOperator) -> list[float]:
     """Place (x, y) of the star from the middle of the image as given, before any cropping."""
     view = bench.view
     ny, nx = bench.reference.image.shape

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import Block, BlockCovariance
 from amibayes.cube import Cube
+from amibayes.data.closure import closure_matrix, kernel_basis
+from amibayes.data.covariance import Block, BlockCovariance
+from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.data.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
+from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.extraction.averaging import Average
 from amibayes.extraction.view import View
-from amibayes.freedom import Freedom
-from amibayes.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
-from amibayes.response import Response
 from amibayes.units import FloatArray
 
 
@@ -37,7 +37,7 @@ def observables_of(
     kind: CovarianceKind,
     freedom: Freedom | None,
     scatter: csr_array | None,
-    response: Response,
+    response: OffAxisResponse,
     mjd: float,
     integration_s: float,
     notes: tuple[str, ...],
@@ -70,7 +70,7 @@ def target_of(template: Cube) -> str:
     ).strip()
 
 
-def _setup(view: View, template: Cube, holes: FloatArray, response: Response) -> Setup:
+def _setup(view: View, template: Cube, holes: FloatArray, response: OffAxisResponse) -> Setup:
     mask, header = view.instrument.mask, template.header
     n = mask.n_holes
     right, down = (header.get(key) for key in ("TARG_RA", "TARG_DEC"))

@@ -13,7 +13,7 @@ from amibayes.errors import DataError, UsageError
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import Channels, Instrument, load_instrument
 from amibayes.optics import FringeBasis, fringe_field, fringe_image
-from amibayes.spectrum import Blackbody
+from amibayes.scene.spectrum import Blackbody
 from amibayes.units import FloatArray
 
 LARGEST = 1.25

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh_tridiagonal
 
 from amibayes.errors import DataError
-from amibayes.spectrum import Flat, Spectrum
+from amibayes.scene.spectrum import Flat, Spectrum
 from amibayes.units import FloatArray, read_only
 
 _FINE = 2001

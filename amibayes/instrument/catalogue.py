@@ -14,8 +14,8 @@ from astropy import constants
 from amibayes.errors import DataError, UsageError
 from amibayes.instrument.bandpass import Bandpass
 from amibayes.instrument.mask import SHAPES, Mask
-from amibayes.settings import Section, read_toml
-from amibayes.spectrum import Spectrum
+from amibayes.scene.spectrum import Spectrum
+from amibayes.support.toml import Section, read_toml
 from amibayes.units import DEGREE, MAS, FloatArray
 
 _JANSKY = 1e-26

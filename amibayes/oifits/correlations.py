@@ -9,22 +9,22 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from amibayes.assumed import kernel_blocks
-from amibayes.closure import closure_matrix, kernel_basis
-from amibayes.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
-from amibayes.errors import DataError
-from amibayes.observables import (
+from amibayes.data.assumed_covariance import kernel_blocks
+from amibayes.data.closure import closure_matrix, kernel_basis
+from amibayes.data.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
+from amibayes.data.observables import (
     BoolArray,
     IntArray,
     Measurements,
     closure_sets,
     exposure_labels,
 )
+from amibayes.errors import DataError
 from amibayes.oifits.setups import integers, numbers, placed, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, FloatArray
 
-LARGEST_MISFIT = 0.5
+MAX_MISFIT = 0.5
 """Median departure of ln(variance ratio) past which a covariance is not that of the errors."""
 
 OPPOSITE = -0.05
@@ -199,7 +199,7 @@ def _order_and_unit(
     ]
     misfit = [_misfit(diagonal * scale, variance[grid]) for _, grid, scale in trials]
     best = int(np.argmin(misfit))
-    if not misfit[best] < LARGEST_MISFIT:
+    if not misfit[best] < MAX_MISFIT:
         raise DataError(
             f"the diagonal of {table.label} does not fit the errors of the data",
             source=oifits.path,

@@ -17,13 +17,13 @@ from typing import Any, Literal
 import numpy as np
 from astropy.io import fits
 
-from amibayes.closure import canonical
-from amibayes.covariance import DiagonalCovariance
+from amibayes.data.closure import canonical
+from amibayes.data.covariance import DiagonalCovariance
+from amibayes.data.observables import BoolArray, Measurements, Observables, Setup, join
 from amibayes.errors import DataError, UsageError
-from amibayes.files import atomic_path
-from amibayes.observables import BoolArray, Measurements, Observables, Setup, join
 from amibayes.oifits.setups import same
 from amibayes.oifits.writer import to_hdus
+from amibayes.support.atomic_files import atomic_path
 from amibayes.units import MAS, FloatArray
 
 Program = Literal["irbis", "squeeze", "mira"]
@@ -31,7 +31,7 @@ Program = Literal["irbis", "squeeze", "mira"]
 PIXELS_PER_RESOLUTION = 4.0
 """Pixels per λ/B_max."""
 
-FEWEST_PIXELS = 32
+MIN_PIXELS = 32
 NO_AMPLITUDE_ERROR = 1e3
 """Error of a triple amplitude that V² cannot give: it then counts for nothing."""
 
@@ -199,7 +199,7 @@ def _image(whole: Observables, program: Program) -> tuple[float, float, int]:
     pixel = 1.0 / (PIXELS_PER_RESOLUTION * frequency.max() * MAS)
     digits = 10.0 ** (1 - np.floor(np.log10(pixel)))
     pixel = np.floor(pixel * digits) / digits
-    wanted = max(FEWEST_PIXELS, 2.0 / (frequency.min() * MAS) / pixel)
+    wanted = max(MIN_PIXELS, 2.0 / (frequency.min() * MAS) / pixel)
     # A Fourier transform likes powers of two, and IRBis asks for them.
     n = int(2 ** np.ceil(np.log2(wanted))) if program == "irbis" else int(2 * np.ceil(wanted / 2))
     return float(pixel), float(pixel * n), n

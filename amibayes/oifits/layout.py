@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.observables import IntArray, Measurements, Observables, Setup
+from amibayes.data.observables import IntArray, Measurements, Observables, Setup
 from amibayes.oifits.rows import T3, VIS2, Kind
 
 UNKNOWN = "UNKNOWN"

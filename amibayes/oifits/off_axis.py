@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.observables import Setup
+from amibayes.data.observables import Setup
+from amibayes.data.off_axis_response import TAPS, OffAxisResponse
 from amibayes.oifits.layout import Layout
 from amibayes.oifits.tables import OWN_KEY, OIFits
-from amibayes.response import TAPS, Response
 from amibayes.units import FloatArray
 
 RESPONSE = "AMIBAYES_RESPONSE"
@@ -92,7 +92,7 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
             i, j = place[int(a)], place[int(b)]
             response[j, i] = row.conj()
             response[i, j] = row
-    return replace(setup, response=Response(response, *lattice, single, method))
+    return replace(setup, response=OffAxisResponse(response, *lattice, single, method))
 
 
 def _lattice(header: Any) -> tuple[FloatArray, FloatArray] | None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from amibayes.data.observables import IntArray, Measurements, Observables, Setup
 from amibayes.errors import DataError
-from amibayes.observables import IntArray, Measurements, Observables, Setup
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.rows import Rows, channel_count, read_rows
 from amibayes.oifits.scatter import SCATTER

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from amibayes.data.observables import BoolArray, IntArray, Measurements
 from amibayes.errors import DataError
-from amibayes.observables import BoolArray, IntArray, Measurements
 from amibayes.oifits.dates import mjd_of_date
 from amibayes.oifits.scales import ANGLE, LENGTH, TIME, scale_of
 from amibayes.oifits.setups import integers, numbers, rest_of
@@ -53,7 +53,7 @@ T3 = Kind(
 )
 KINDS = {kind.table: kind for kind in (VIS2, T3)}
 
-SMALLEST_ERROR = 1e-12
+MIN_ERROR = 1e-12
 """An error below this is none: it would outweigh everything else."""
 
 
@@ -203,12 +203,12 @@ def _cells(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> _Cell
     return _Cells(value, variance, u, v, (*notes, *u_notes, *v_notes))
 
 
-def absurd(kind: Kind, value: FloatArray, variance: FloatArray) -> BoolArray:
+def unusable(kind: Kind, value: FloatArray, variance: FloatArray) -> BoolArray:
     """Where a value or its error cannot be meant: not finite, not positive, or a fill value."""
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
         usable = np.isfinite(value) & (np.abs(value) < kind.largest_value)
-        usable &= (sigma >= SMALLEST_ERROR) & (sigma <= kind.largest_error)
+        usable &= (sigma >= MIN_ERROR) & (sigma <= kind.largest_error)
     return np.asarray(~usable)
 
 
@@ -286,7 +286,7 @@ def _with_unusable(
     station_position: IntArray,
 ) -> tuple[BoolArray, BoolArray]:
     """(flags with those of cells that cannot be used, which of them are new)."""
-    wrong = absurd(kind, cells.value, cells.variance) | ~(wavelength > 0)
+    wrong = unusable(kind, cells.value, cells.variance) | ~(wavelength > 0)
     wrong |= ~np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)[:, None]
     wrong |= _repeats_a_station(station_position)[:, None]
     return flag | wrong, wrong & ~flag

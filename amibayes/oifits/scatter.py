@@ -11,7 +11,7 @@ import numpy as np
 from astropy.io import fits
 from scipy.sparse import coo_array, csr_array, triu
 
-from amibayes.observables import IntArray
+from amibayes.data.observables import IntArray
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.data.observables import IntArray, Setup
 from amibayes.errors import DataError
-from amibayes.observables import IntArray, Setup
 from amibayes.oifits.scales import ANGLE, LENGTH, scale_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, plain
 from amibayes.units import DEGREE, FloatArray

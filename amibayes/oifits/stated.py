@@ -9,10 +9,10 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csr_array
 
-from amibayes.covariance import Covariance, DiagonalCovariance
+from amibayes.data.covariance import Covariance, DiagonalCovariance
+from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.data.observables import BoolArray, CovarianceKind, IntArray, Measurements
 from amibayes.errors import DataError
-from amibayes.freedom import Freedom
-from amibayes.observables import BoolArray, CovarianceKind, IntArray, Measurements
 from amibayes.oifits.correlations import (
     REMEDY,
     Pairs,
@@ -69,7 +69,7 @@ class Content:
 
 
 @dataclass(frozen=True, eq=False)
-class Stated:
+class FileCovariance:
     """A covariance, its kind, what an estimated one rests on, and notes."""
 
     covariance: Covariance
@@ -82,7 +82,7 @@ class Stated:
 
 def stated_covariance(
     oifits: OIFits, content: Content, closure_covariance: ClosureCovariance
-) -> Stated:
+) -> FileCovariance:
     """Covariance of what is not flagged, and what the file says of it."""
     flag = np.concatenate([c.measurements.flag for c in content.both])
     variance = np.concatenate([c.variance for c in content.both])
@@ -98,7 +98,9 @@ def stated_covariance(
     images, variance, notes = _image_pairs(oifits, content, variance)
     if closure_covariance == "diagonal":
         set_aside = ("correlations of the file set aside",) if tables or notes else ()
-        return Stated(DiagonalCovariance(variance[~flag]), "diagonal", None, None, set_aside)
+        return FileCovariance(
+            DiagonalCovariance(variance[~flag]), "diagonal", None, None, set_aside
+        )
     pairs = _unflagged(joined([images, *_table_pairs(oifits, content, tables, variance)]), flag)
     pairs, doubt = trusted_pairs(pairs, variance[~flag], closure)
     notes += (doubt,) if doubt else ()
@@ -118,7 +120,7 @@ def stated_covariance(
     freedom = _freedom(tables)
     index = np.concatenate([c.correlation_index for c in content.both])[~flag]
     scatter = None if freedom is None else scatter_of(oifits, tables, index, variance[~flag])
-    return Stated(covariance, said or kind, _integrations(tables), freedom, notes, scatter)
+    return FileCovariance(covariance, said or kind, _integrations(tables), freedom, notes, scatter)
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:

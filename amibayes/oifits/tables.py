@@ -15,8 +15,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from amibayes.damage import reporting_damage
 from amibayes.errors import DataError
+from amibayes.support.fits_errors import reporting_damage
 
 USED = ("OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS2", "OI_T3", "OI_CORR", "V2COV", "CPCOV")
 """Extensions that `observables_of` reads."""

@@ -18,10 +18,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from amibayes import __version__
-from amibayes.covariance import DiagonalCovariance, as_blocks
+from amibayes.data.covariance import DiagonalCovariance, as_blocks
+from amibayes.data.observables import BoolArray, IntArray, Observables
 from amibayes.errors import UsageError
-from amibayes.files import atomic_path
-from amibayes.observables import BoolArray, IntArray, Observables
 from amibayes.oifits.correlations import pair_covariance
 from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of, printable
@@ -30,6 +29,7 @@ from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.scatter import scatter_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
+from amibayes.support.atomic_files import atomic_path
 from amibayes.units import DEGREE, FloatArray
 
 CORRNAME = "AMIBAYES"

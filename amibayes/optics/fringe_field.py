@@ -19,7 +19,7 @@ from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.fringes import FringeBasis
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.psf import ComplexArray
-from amibayes.optics.sampling import HALF_WIDTH, LARGEST_FREQUENCY, interpolator, pixel_weights
+from amibayes.optics.sampling import HALF_WIDTH, MAX_FREQUENCY, interpolator, pixel_weights
 from amibayes.units import FloatArray, SingleArray, read_only
 
 REACH_STEP_PX = 8
@@ -197,7 +197,7 @@ class _Recipe:
 def _remembered(recipe: _Recipe) -> FringeField:
     pixel, channels, mask = recipe.instrument.pixel_scale_rad, recipe.channels, recipe.mask
     mean = float(1.0 / (channels.weight @ (1.0 / channels.wavelength_m)))
-    spacing = LARGEST_FREQUENCY / (_band_limit(mask, channels, mean) * pixel)
+    spacing = MAX_FREQUENCY / (_band_limit(mask, channels, mean) * pixel)
     uv = np.vstack([np.zeros((1, 2)), mask.uv_m])
     reach = math.ceil(0.5 * recipe.n_pixels / spacing) + HALF_WIDTH
     margin = HALF_WIDTH + math.ceil(0.5 / spacing)
@@ -220,9 +220,9 @@ def _remembered(recipe: _Recipe) -> FringeField:
 def _averaging(frequency_px: FloatArray, spacing_px: float, margin: int, size: int) -> ComplexArray:
     """Matrices (n_waves, size − 2·margin, size): a pixel's mean of wave and hill, less the wave."""
     nodes, weight = pixel_weights()
-    sample, taps = interpolator(nodes / spacing_px + margin)
+    sample, bspline_weights = interpolator(nodes / spacing_px + margin)
     kernel = np.zeros((len(nodes), 2 * margin + 1))
-    np.put_along_axis(kernel, sample, taps, axis=1)
+    np.put_along_axis(kernel, sample, bspline_weights, axis=1)
     once = (np.exp(2j * np.pi * np.outer(frequency_px, nodes)) * weight) @ kernel
     row = np.arange(size - 2 * margin)[:, None]
     matrix = np.zeros((len(once), len(row), size), dtype=complex)

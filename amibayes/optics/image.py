@@ -20,8 +20,8 @@ from amibayes.errors import DataError
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.psf import ComplexArray, Wavefront, axis_nodes, intensity, psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator, pixel_transform
-from amibayes.orientation import Orientation
-from amibayes.scene import Scene
+from amibayes.scene.orientation import Orientation
+from amibayes.scene.sources import Scene
 from amibayes.units import MAS, FloatArray, read_only
 
 OVERSAMPLE = 11

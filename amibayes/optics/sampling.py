@@ -24,7 +24,7 @@ IntArray = NDArray[np.intp]
 HALF_WIDTH = 8
 """Samples on either side that an interpolated value is made of."""
 
-LARGEST_FREQUENCY = 0.15
+MAX_FREQUENCY = 0.15
 """Cycles per sample that the interpolation is made for."""
 
 _KAISER_BETA = 17.7
@@ -39,7 +39,7 @@ _NODES = 8
 
 def fine_sampling(band_limit_per_px: float) -> int:
     """Cells per pixel and axis that a band limit (cycles per pixel) needs."""
-    return max(1, math.ceil(band_limit_per_px / LARGEST_FREQUENCY))
+    return max(1, math.ceil(band_limit_per_px / MAX_FREQUENCY))
 
 
 def fine_size(n_pixels: int, oversample: int, reach_px: float) -> int:

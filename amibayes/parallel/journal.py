@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes import __version__
-from amibayes.files import atomic_path, cannot_write, sha256
+from amibayes.support.atomic_files import atomic_path, cannot_write, sha256
 
 Columns = dict[str, NDArray[Any]]
 """What a journalled piece returns: named arrays."""

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, ScalarFormatter
 
-from amibayes.files import short_names
-from amibayes.inference.by_file import FileResiduals
+from amibayes.companion_search.residuals_by_file import FileResiduals
 from amibayes.plots.style import BLUE, GREY, VERMILLION, new_figure, styled
+from amibayes.support.atomic_files import short_names
 
 
 @styled()

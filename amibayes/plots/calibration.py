@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from amibayes.observables import Measurements, Observables
+from amibayes.data.observables import Measurements, Observables
 from amibayes.plots.fit import longest_baseline_m
 from amibayes.plots.style import BLACK, GREY, LIGHT_GREY, marker_of, new_figure, styled
 from amibayes.units import FloatArray
@@ -19,7 +19,7 @@ from amibayes.units import FloatArray
 ROOM_FOR_NAMES, EDGE_OF_NAME = 90, 9
 """Letters that stand beside each other under a picture; those that a marker takes the room of."""
 
-MOST_KEYS = 100
+MAX_KEYS = 100
 """Numbers of one kind and data set beyond which markers get smaller."""
 
 
@@ -132,8 +132,8 @@ def _draw_kind(
             fmt=marker,
             color=colour if keep else GREY,
             fillstyle="full" if keep else "none",
-            markersize=3.5 if len(one.key) <= MOST_KEYS else 2,
-            elinewidth=0.9 if len(one.key) <= MOST_KEYS else 0.3,
+            markersize=3.5 if len(one.key) <= MAX_KEYS else 2,
+            elinewidth=0.9 if len(one.key) <= MAX_KEYS else 0.3,
             zorder=3 if keep else 2,
             label=name if keep else f"{name} (dropped)",
         )

@@ -12,7 +12,7 @@ from amibayes.plots.corner_plot import label_of
 from amibayes.plots.style import BLACK, BLUE, LIGHT_GREY, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray
 
-MOST_WALKERS, MOST_STEPS = 64, 2000
+MAX_WALKERS, MAX_STEPS = 64, 2000
 
 
 @styled()
@@ -40,7 +40,7 @@ def trace_plot(
         With at most 64 walkers and 2000 steps of each drawn, and the title says so.
     """
     steps, walkers, _ = chain.shape
-    every, apart = -(-steps // MOST_STEPS), -(-walkers // MOST_WALKERS)
+    every, apart = -(-steps // MAX_STEPS), -(-walkers // MAX_WALKERS)
     rows = [chain[:, :, i] for i in range(chain.shape[2])]
     names = [label_of(name) for name in labels]
     if log_prob is not None:

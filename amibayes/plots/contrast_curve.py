@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
-from amibayes.inference.results import Companion
-from amibayes.mass_table import MassTable
-from amibayes.observables import BoolArray
+from amibayes.companion_search.result import Companion
+from amibayes.data.observables import BoolArray
+from amibayes.limits.mass_table import MassTable
 from amibayes.plots.style import (
     BLACK,
     DASHES,

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from amibayes.inference.bands import band_name
+from amibayes.models.bands import band_name
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from amibayes.observables import Measurements, Observables
+from amibayes.data.observables import Measurements, Observables
 from amibayes.plots.style import BLACK, BLUE, GREY, SEQUENTIAL, new_figure, styled
 from amibayes.units import FloatArray
 

@@ -26,7 +26,7 @@ from amibayes.plots.style import (
 )
 from amibayes.units import FloatArray
 
-MOST_LINES = 35
+MAX_LINES = 35
 """Closure phases drawn against time."""
 
 
@@ -171,7 +171,7 @@ def time_plot(extraction: Extraction) -> Figure:
     figure = new_figure(7.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     rest = np.degrees(closure - extraction.average.closure_phase)
-    upper.plot(number, rest[:, :MOST_LINES], ".", color=BLUE, markersize=3)
+    upper.plot(number, rest[:, :MAX_LINES], ".", color=BLUE, markersize=3)
     upper.plot(number, rest.std(axis=1), "s-", color=VERMILLION, markersize=4, label="rms")
     upper.set_ylabel("Closure phase − mean (°)")
     upper.legend(loc="upper right")

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from amibayes.inference.refine import single_likelihood
-from amibayes.inference.results import SearchResult
-from amibayes.observables import Measurements
+from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Measurements
+from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.plots.style import (
     BLACK,
     BLUE,
@@ -24,7 +24,7 @@ from amibayes.plots.style import (
 )
 from amibayes.units import FloatArray
 
-MOST_BARS = 1500
+MAX_BARS = 1500
 """Points of one kind drawn with error bars and models; beyond, one in so many is."""
 
 LINEAR_TO = 12.0
@@ -122,7 +122,7 @@ def longest_baseline_m(m: Measurements) -> FloatArray:
 
 
 def _shown(n: int) -> slice:
-    return slice(0, None, -(-n // MOST_BARS))
+    return slice(0, None, -(-n // MAX_BARS))
 
 
 def _draw_data(ax: Axes, kind: _Kind, shown: slice) -> None:
@@ -152,7 +152,7 @@ def _draw_residuals(ax: Axes, kind: _Kind) -> None:
     few = len(kind.observed) <= 200
     ax.axhspan(-1.0, 1.0, color=LIGHT_GREY, alpha=0.5, lw=0, zorder=0)
     ax.axhline(0.0, color=GREY, lw=0.8, zorder=0)
-    size = 5.0 if few else 2.5 if len(kind.observed) <= MOST_BARS else 1.0
+    size = 5.0 if few else 2.5 if len(kind.observed) <= MAX_BARS else 1.0
     x = kind.frequency_mega
     ax.plot(x, kind.residual(kind.single), "s", color=VERMILLION, fillstyle="none", markersize=size)
     ax.plot(x, kind.residual(kind.binary), "D", color=BLUE, markersize=0.8 * size)

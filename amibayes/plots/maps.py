@@ -13,12 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
-from amibayes.files import atomic_path
-from amibayes.inference.bank import Grid
-from amibayes.inference.detection import candid_n_sigma
-from amibayes.inference.results import SearchResult
-from amibayes.inference.search import resolution_mas
-from amibayes.inference.significance import Significance
+from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.search import resolution_mas
+from amibayes.companion_search.template_bank import Grid
+from amibayes.detection.false_alarm import Significance
+from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import (
     BLACK,
     DIVERGING,
@@ -28,6 +27,7 @@ from amibayes.plots.style import (
     new_figure,
     styled,
 )
+from amibayes.support.atomic_files import atomic_path
 from amibayes.units import FloatArray
 
 Quantity = Literal["sqrt_delta_chi2", "delta_chi2"]
@@ -38,7 +38,7 @@ MAP_TITLES = {
     "delta_chi2": "Δχ² of the best companion at each position",
 }
 
-LEAST_SHOWN = 1e-12
+MIN_SHOWN = 1e-12
 """Probabilities below this have one colour."""
 
 HALO = [withStroke(linewidth=3.5, foreground="white")]
@@ -130,7 +130,7 @@ def false_alarm_map(result: SearchResult, weight: Significance) -> Figure:
     figure = new_figure(11.6)
     axes = figure.subplots(2, 1)
     for ax, (name, p) in zip(axes, probability_maps(weight).items(), strict=True):
-        value = np.log10(np.maximum(p, LEAST_SHOWN))
+        value = np.log10(np.maximum(p, MIN_SHOWN))
         low = min(float(value.min()), -2.0)
         label = f"{name.capitalize()} false-alarm probability (power of ten)"
         _paint(figure, ax, result.grid, value, label, cmap=f"{SEQUENTIAL}_r", vmin=low, vmax=0.0)

@@ -7,12 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from amibayes.covariance import BlockCovariance
-from amibayes.observables import IntArray, Observables
+from amibayes.data.covariance import BlockCovariance
+from amibayes.data.observables import IntArray, Observables
 from amibayes.plots.style import BLACK, BLUE, DIVERGING, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray
 
-MOST_DATA = 160
+MAX_DATA = 160
 """Data of a matrix drawn whole; of larger sets the first groups of each kind are drawn."""
 
 
@@ -49,11 +49,11 @@ def correlation_plot(observables: Observables) -> Figure:
 def _chosen(data: Observables) -> tuple[IntArray, IntArray]:
     """Places of the V² and of the closure phases that are drawn."""
     order = np.arange(len(data.data))
-    if len(order) > MOST_DATA and isinstance(data.covariance, BlockCovariance):
+    if len(order) > MAX_DATA and isinstance(data.covariance, BlockCovariance):
         order = np.concatenate([block.index for block in data.covariance.blocks])
     vis2, closure = order[order < data.n_vis2], order[order >= data.n_vis2]
-    half = max(MOST_DATA // 2, MOST_DATA - len(closure))
-    return vis2[:half], closure[: MOST_DATA - min(half, len(vis2))]
+    half = max(MAX_DATA // 2, MAX_DATA - len(closure))
+    return vis2[:half], closure[: MAX_DATA - min(half, len(vis2))]
 
 
 def _draw_matrix(figure: Figure, ax: Axes, correlation: FloatArray, n_vis2: int) -> None:

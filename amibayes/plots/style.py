@@ -15,7 +15,7 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from amibayes.files import atomic_path
+from amibayes.support.atomic_files import atomic_path
 
 WIDTH_IN = 6.4
 """Type of 10 to 11 points on this width can still be read on a telephone."""

@@ -22,7 +22,7 @@ from amibayes.plots.style import (
 )
 from amibayes.units import FloatArray
 
-MOST_NAMED = 12
+MAX_NAMED = 12
 """With more targets than this single curves cannot be told apart: they are drawn grey."""
 
 WIDE = 15.0
@@ -63,7 +63,7 @@ def survey_plot(curves: Mapping[str, LimitCurve], found: Mapping[str, Found]) ->
     matplotlib.figure.Figure
     """
     names = list(dict.fromkeys([*curves, *found]))
-    told = len(names) <= MOST_NAMED
+    told = len(names) <= MAX_NAMED
     figure = new_figure(5.2 + (0.16 * ((len(names) + 2) // 3) if told else 0.0))
     ax = figure.subplots()
     for k, name in enumerate(names):

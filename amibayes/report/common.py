@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from amibayes.files import sha256
-from amibayes.inference.noise_marginal import NoisePosterior
-from amibayes.inference.results import SearchResult
+from amibayes.companion_search.result import SearchResult
+from amibayes.likelihood.averaged_noise import NoisePosterior
+from amibayes.support.atomic_files import sha256
 
 Json = dict[str, Any]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from amibayes.inference.bands import band_name
-from amibayes.inference.tails import LEAST_PROBABILITY
+from amibayes.detection.tails import MIN_PROBABILITY
+from amibayes.models.bands import band_name
 from amibayes.report.joint_sections import joint_tables
 from amibayes.report.page import Column, Fact, Figure, Section, Table
 from amibayes.report.statement import false_alarm, field
@@ -24,7 +24,7 @@ UNITS = {
     "background": ("Over-resolved flux (star = 1)", ""),
 }
 
-MOST_MODES = 8
+MAX_MODES = 8
 """Rows of the table of positions."""
 
 OPEN_DEG = 270.0
@@ -75,13 +75,13 @@ def _modes(content: Json) -> tuple[Table, ...]:
             fixed(m["delta_chi2"], 1),
             chance(m["probability"]) if "probability" in m else NONE,
         )
-        for m in modes[:MOST_MODES]
+        for m in modes[:MAX_MODES]
     )
     caption = "Positions that fit nearly as well, best first; the probability is among these"
     if content["significance"]["detected"] is False:
         caption = "Best positions of the field; the probability is among these, had it a companion"
-    if len(modes) > MOST_MODES:
-        caption += f" ({len(modes) - MOST_MODES} more in result.json)"
+    if len(modes) > MAX_MODES:
+        caption += f" ({len(modes) - MAX_MODES} more in result.json)"
     return (Table(caption, tuple(Column(c) for c in columns), rows),)
 
 
@@ -147,8 +147,8 @@ def _extrapolated(s: Json) -> tuple[Fact, ...]:
 
 
 def _by_law(probability: float) -> str:
-    if probability < LEAST_PROBABILITY:
-        return f"<\u00a0{chance(LEAST_PROBABILITY)}"
+    if probability < MIN_PROBABILITY:
+        return f"<\u00a0{chance(MIN_PROBABILITY)}"
     return chance(probability)
 
 

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.inference.bands import bands_of
-from amibayes.inference.by_file import FileResiduals, file_residuals, files_of
-from amibayes.inference.noise import FileNoise
-from amibayes.inference.results import SearchResult
-from amibayes.job import SearchReport
+from amibayes.companion_search.residuals_by_file import FileResiduals, file_residuals
+from amibayes.companion_search.result import SearchResult
+from amibayes.likelihood.extra_noise import FileNoise
+from amibayes.likelihood.residuals import files_of
+from amibayes.models.bands import bands_of
+from amibayes.pipeline.report_types import SearchReport
 from amibayes.report.common import NOISE_KEYS, Json, noise_interval, number
 from amibayes.units import contrast_to_delta_mag
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from amibayes.files import short_names
-from amibayes.inference.bands import band_name
+from amibayes.models.bands import band_name
 from amibayes.report.page import Column, Table
 from amibayes.report.words import NONE, fixed, measured, plain
+from amibayes.support.atomic_files import short_names
 
 Json = dict[str, Any]
 

@@ -8,12 +8,12 @@ import numpy as np
 from astropy.table import Table
 
 from amibayes import __version__
-from amibayes.files import atomic_path
-from amibayes.inference.analytic_limits import AnalyticLimit
-from amibayes.inference.limits import DetectionLimit
-from amibayes.inference.search import resolution_mas
-from amibayes.limits_job import NAMES, LimitsReport, MeasuredLimit
+from amibayes.companion_search.search import resolution_mas
+from amibayes.limits.analytic import AnalyticLimit
+from amibayes.limits.completeness import DetectionLimit
+from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
+from amibayes.support.atomic_files import atomic_path
 from amibayes.units import contrast_to_delta_mag
 
 MAG_PER_LOG = 2.5 / np.log(10.0)

@@ -12,7 +12,7 @@ Json = dict[str, Any]
 
 KINDS = {"extra_vis2": "V²", "extra_closure_phase_deg": "closure phase (°)"}
 
-MOST_OUTLIERS = 20
+MAX_OUTLIERS = 20
 """Rows of the table; the rest stands in result.json."""
 
 
@@ -85,7 +85,7 @@ def _outliers(found: Json | None) -> tuple[Table, ...]:
             plain(o["weight"], 2),
             Path(o["source"]).name,
         )
-        for o in found["outliers"][:MOST_OUTLIERS]
+        for o in found["outliers"][:MAX_OUTLIERS]
     )
     columns = (
         Column("Outlier", "text"),

@@ -20,12 +20,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from amibayes import __version__
 from amibayes.errors import DataError
-from amibayes.files import write_text
+from amibayes.support.atomic_files import write_text
 
 Kind = Literal["found", "none", "open"]
 """Of a statement: something is there, nothing is, or nothing is claimed."""
 
-MOST_ON_A_TELEPHONE = 4
+MAX_ON_A_TELEPHONE = 4
 """Columns of named rows that stand beside each other on a telephone."""
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
@@ -55,7 +55,7 @@ class Table:
     def stacks(self) -> bool:
         """Whether its rows are too wide for a telephone and stand there one below the other."""
         kinds = [column.kind for column in self.columns]
-        return "code" in kinds or (kinds[0] == "text" and len(kinds) > MOST_ON_A_TELEPHONE)
+        return "code" in kinds or (kinds[0] == "text" and len(kinds) > MAX_ON_A_TELEPHONE)
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,15 @@ from dataclasses import asdict
 import numpy as np
 
 from amibayes import __version__
-from amibayes.inference.evidence import HALO_BACKGROUND, Evidence
-from amibayes.inference.grid_posterior import GridPosterior
-from amibayes.inference.multiplicity import TwoCompanions
-from amibayes.inference.posterior import Posterior
-from amibayes.inference.priors import Prior
-from amibayes.inference.results import Companion, Mode, SearchResult
-from amibayes.inference.robust import DEGREES, normal_moments
-from amibayes.inference.significance import Significance
-from amibayes.job import SearchReport, calibrator_verdicts
+from amibayes.companion_search.result import Companion, Mode, SearchResult
+from amibayes.companion_search.second_companion import TwoCompanions
+from amibayes.detection.false_alarm import Significance
+from amibayes.likelihood.student import DEGREES, normal_moments
+from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
+from amibayes.posterior.ensemble import Posterior
+from amibayes.posterior.evidence import HALO_BACKGROUND, Evidence
+from amibayes.posterior.grid import GridPosterior
+from amibayes.posterior.priors import Prior
 from amibayes.report.common import (
     NOISE_KEYS,
     Json,

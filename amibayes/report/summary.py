@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.inference.evidence import Evidence
-from amibayes.inference.limits import DetectionLimit
-from amibayes.inference.posterior import Posterior
-from amibayes.inference.results import SearchResult
-from amibayes.inference.significance import Significance
-from amibayes.inference.tails import LEAST_PROBABILITY
-from amibayes.job import SearchReport
+from amibayes.companion_search.result import SearchResult
+from amibayes.detection.false_alarm import Significance
+from amibayes.detection.tails import MIN_PROBABILITY
+from amibayes.limits.completeness import DetectionLimit
+from amibayes.pipeline.report_types import SearchReport
+from amibayes.posterior.ensemble import Posterior
+from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.result import upper_limit
 
@@ -89,8 +89,8 @@ def _chance(weight: Significance) -> str:
 
 def _power(probability: float) -> str:
     """An extrapolation is worth a power of ten."""
-    if probability <= LEAST_PROBABILITY:
-        return f"< {LEAST_PROBABILITY:.0e}"
+    if probability <= MIN_PROBABILITY:
+        return f"< {MIN_PROBABILITY:.0e}"
     return f"{probability:.0e}"
 
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from amibayes.errors import UsageError
 from amibayes.instrument import Bandpass, Channels, Instrument
 from amibayes.optics import psf
+from amibayes.scene.spectrum import Blackbody, Spectrum, g2v
 from amibayes.simulation.detector import PRESETS, Detector
-from amibayes.simulation.exposure import MOST_INTEGRATIONS
-from amibayes.spectrum import Blackbody, Spectrum, g2v
+from amibayes.simulation.exposure import MAX_INTEGRATIONS
 
 TABLE_1_RATES_E_S = {"F380M": 1999651.0, "F430M": 1279391.0, "F480M": 1137034.0}
 """Count rates of a G2V star of 6 mag behind the NIRISS mask (Soulain et al. 2020, Table 1)."""
@@ -27,10 +27,10 @@ TABLE_1_MAGNITUDE = 6.0
 PAPER_TEMPERATURE_K = 5450.0
 """Temperature of the paper's G2V star."""
 
-MOST_GROUPS = 800
+MAX_GROUPS = 800
 """More groups than this are not allowed in a NISRAPID ramp."""
 
-FEWEST_PHOTONS = 100.0
+MIN_PHOTONS = 100.0
 """With fewer the error of a closure phase, √1.5·N_holes/√N, is near a radian."""
 
 LONGEST_S = 1e7
@@ -211,7 +211,7 @@ def make_plan(
     full_well = (detector or PRESETS["paper"]).full_well_e
     _refuse_saturated(peaks.centred * rate * rules.frame_time_s, full_well)
     wanted = groups["paper" if rules.preset == "paper" else "centred"]
-    n_groups = min(max(wanted, 2), MOST_GROUPS)
+    n_groups = min(max(wanted, 2), MAX_GROUPS)
     n = integrations(rate, n_groups, rules, photons=photons, time_s=time_s)
     plan = Plan(instrument, rules, rate, photons, n_groups, n, peaks, groups)
     return replace(plan, warnings=tuple(_warnings(plan, wanted, full_well)))
@@ -255,9 +255,9 @@ def integrations(
 
 
 def _refuse_dark(photons: float) -> None:
-    if photons < FEWEST_PHOTONS:
+    if photons < MIN_PHOTONS:
         raise UsageError(
-            f"{photons:g} photons carry no closure phase", remedy=f"at least {FEWEST_PHOTONS:g}"
+            f"{photons:g} photons carry no closure phase", remedy=f"at least {MIN_PHOTONS:g}"
         )
 
 
@@ -336,12 +336,12 @@ def _warnings(plan: Plan, wanted: int, full_well_e: float) -> list[str]:
     limit = plan.options.peak_limit_e
     if wanted < 2:
         found.append(f"a slope needs 2 groups, which exceed {limit:.0f} e-")
-    if wanted > MOST_GROUPS:
-        found.append(f"{wanted} groups would fit; a ramp has {MOST_GROUPS} at most")
-    if plan.n_integrations > MOST_INTEGRATIONS:
+    if wanted > MAX_GROUPS:
+        found.append(f"{wanted} groups would fit; a ramp has {MAX_GROUPS} at most")
+    if plan.n_integrations > MAX_INTEGRATIONS:
         found.append(
             f"{plan.n_integrations} integrations do not fit in one exposure, "
-            f"which takes {MOST_INTEGRATIONS}"
+            f"which takes {MAX_INTEGRATIONS}"
         )
     if plan.peak_e > full_well_e:
         found.append(f"the brightest pixel saturates: {plan.peak_e:.0f} of {full_well_e:.0f} e-")

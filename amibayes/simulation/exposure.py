@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from amibayes.errors import UsageError
 from amibayes.optics import ShiftedImage
 from amibayes.parallel import Executor, Journal, Progress, child_seeds, run_job, slices
-from amibayes.quantities import takes_quantities
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import read_ramps
 from amibayes.simulation.slopes import SlopeFit
+from amibayes.support.quantities import takes_quantities
 from amibayes.units import MAS, FloatArray
 
 PIECE = 32
 """Integrations of a piece; part of what a seed means, so it does not change."""
 
-MOST_INTEGRATIONS = 10000
+MAX_INTEGRATIONS = 10000
 """More than this does not fit in one JWST exposure."""
 
 
-MOST_SIMULATED = 1_000_000
+MAX_SIMULATED = 1_000_000
 """Integrations of the largest file that is simulated, a hundred full exposures."""
 
 
@@ -37,9 +37,9 @@ def refuse_too_many(n_integrations: int) -> None:
     ------
     UsageError
     """
-    if n_integrations > MOST_SIMULATED:
+    if n_integrations > MAX_SIMULATED:
         raise UsageError(
-            f"n_integrations is {n_integrations:.4g}; at most {MOST_SIMULATED} are simulated",
+            f"n_integrations is {n_integrations:.4g}; at most {MAX_SIMULATED} are simulated",
             remedy="fewer photons or a brighter star",
         )
 

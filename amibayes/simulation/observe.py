@@ -15,9 +15,9 @@ from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream,
 from amibayes.errors import DataError
 from amibayes.instrument import Instrument, instrument_names, load_instrument
 from amibayes.optics import Wavefront, scene_image
-from amibayes.orientation import Orientation
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, child_seeds, spawn
-from amibayes.scene import Scene
+from amibayes.scene.orientation import Orientation
+from amibayes.scene.sources import Scene
 from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
 from amibayes.simulation.exposure import (
     Chunk,
@@ -133,7 +133,7 @@ def _catalogued(instrument: Instrument) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Shutter:
+class PreparedExposure:
     """An exposure about to be taken."""
 
     observation: Observation
@@ -153,7 +153,7 @@ class Shutter:
 
 def open_shutter(
     observation: Observation, seed: np.random.SeedSequence, maps: DetectorMaps
-) -> Shutter:
+) -> PreparedExposure:
     """Point the telescope and form the image.
 
     Raises
@@ -179,7 +179,7 @@ def open_shutter(
     )
     rate = observation.rate_e_s
     recorder = make_recorder(image, rate, pointings, exposure, observation.detector, maps)
-    return Shutter(observation, pointings, recorder, noise)
+    return PreparedExposure(observation, pointings, recorder, noise)
 
 
 def simulate(
@@ -236,7 +236,7 @@ def simulate(
     )
 
 
-def blank_cube(shutter: Shutter) -> Cube:
+def blank_cube(shutter: PreparedExposure) -> Cube:
     """Everything of the cube but its images."""
     observation = shutter.observation
     n = observation.exposure.n_pixels
@@ -256,7 +256,7 @@ def blank_cube(shutter: Shutter) -> Cube:
 
 def write_exposure(
     path: Path,
-    shutter: Shutter,
+    shutter: PreparedExposure,
     executor: Executor,
     *,
     history: tuple[str, ...] = (),
@@ -273,7 +273,7 @@ def write_exposure(
     ----------
     path : Path
         ``…_calints.fits``.
-    shutter : Shutter
+    shutter : PreparedExposure
         From `open_shutter`.
     executor : Executor
         Where the work is done.
@@ -298,7 +298,7 @@ def write_exposure(
 
 @contextmanager
 def _files(
-    path: Path, shutter: Shutter, history: tuple[str, ...]
+    path: Path, shutter: PreparedExposure, history: tuple[str, ...]
 ) -> Iterator[tuple[CubeStream, FitsStream | None]]:
     observation = shutter.observation
     n = observation.exposure.n_integrations
@@ -320,7 +320,7 @@ def ramp_path(path: Path) -> Path:
     return path.with_name(path.name.replace("_calints", "_ramp"))
 
 
-def _ramp_hdus(shutter: Shutter) -> list[Any]:
+def _ramp_hdus(shutter: PreparedExposure) -> list[Any]:
     observation = shutter.observation
     exposure = observation.exposure
     header = exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s)

@@ -15,25 +15,25 @@ import numpy as np
 from amibayes.errors import DataError, UsageError
 from amibayes.instrument import Instrument, load_instrument
 from amibayes.optics import PupilMap, Wavefront
-from amibayes.orientation import Orientation
 from amibayes.parallel import child_seeds
-from amibayes.scene import Scene
-from amibayes.scene_file import read_image, scene_from
-from amibayes.settings import Section, read_toml
+from amibayes.scene.file import read_image, scene_from
+from amibayes.scene.orientation import Orientation
+from amibayes.scene.sources import Scene
 from amibayes.simulation.budget import LONGEST_S, PlanOptions, integrations, make_plan
 from amibayes.simulation.detector import Detector, DetectorMaps, detector_preset, draw_maps
 from amibayes.simulation.exposure import Exposure, refuse_too_many
-from amibayes.simulation.observe import Observation, Shutter, open_shutter, star_rate
+from amibayes.simulation.observe import Observation, PreparedExposure, open_shutter, star_rate
 from amibayes.simulation.wavefront import WAVEFRONT_PRESETS, WavefrontErrors
+from amibayes.support.toml import Section, read_toml
 from amibayes.units import DEGREE, MAS
 
 PHOTONS = 1e7
 """Photons of an exposure where the file does not say."""
 
-LARGEST_POINTING_MAS = 1000.0
+MAX_POINTING_MAS = 1000.0
 """Jitter or dither past this would leave the star out of most images."""
 
-MOST_PIXELS = 2048
+MAX_PIXELS = 2048
 """Side of the largest image: the detector's own."""
 
 BETWEEN_S = 300.0
@@ -52,7 +52,7 @@ class Overrides:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class ExposureSpec:
     """One exposure of a programme; the name is that of its file."""
 
     name: str
@@ -71,13 +71,13 @@ class Program:
 
     Parameters
     ----------
-    shots : tuple of Shot
+    shots : tuple of ExposureSpec
         Target first.
     text : str
         The file itself.
     """
 
-    shots: tuple[Shot, ...]
+    shots: tuple[ExposureSpec, ...]
     text: str
 
     @property
@@ -91,7 +91,7 @@ class Program:
         lines = [_without_comment(line) for line in self.text.expandtabs(4).splitlines()]
         return tuple(line.encode("ascii", "replace").decode() for line in lines if line)
 
-    def shutters(self, seed: int) -> Iterator[tuple[Shot, Shutter]]:
+    def shutters(self, seed: int) -> Iterator[tuple[ExposureSpec, PreparedExposure]]:
         """Open each exposure in turn: one detector and one telescope for all of them.
 
         Parameters
@@ -118,13 +118,13 @@ def _without_comment(line: str) -> str:
     return re.sub(r"""(^|\s)#[^"']*$""", "", line).rstrip()
 
 
-def _maps(shot: Shot, seed: np.random.SeedSequence) -> DetectorMaps:
+def _maps(shot: ExposureSpec, seed: np.random.SeedSequence) -> DetectorMaps:
     n = shot.observation.exposure.n_pixels
     return draw_maps(shot.observation.detector, (n, n), np.random.default_rng(seed))
 
 
 def _wavefront(
-    shot: Shot, shared: np.random.SeedSequence, drift: np.random.SeedSequence
+    shot: ExposureSpec, shared: np.random.SeedSequence, drift: np.random.SeedSequence
 ) -> Wavefront:
     n_holes = shot.observation.instrument.mask.n_holes
     return shot.errors.drifted(shot.errors.shared(n_holes, shared), n_holes, drift)
@@ -157,7 +157,7 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
         Where the overrides ask for a filter that there is not.
     """
     top = read_toml(path)
-    with blaming(str(path)):
+    with naming_source(str(path)):
         reader = _Reader(top, overrides or Overrides())
         stars = [reader.star(top, is_calibrator=False)]
         for number, section in enumerate(top.sections("calibrator"), 1):
@@ -168,7 +168,7 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
 
 
 @contextmanager
-def blaming(source: str, kind: type[DataError | UsageError] = DataError) -> Iterator[None]:
+def naming_source(source: str, kind: type[DataError | UsageError] = DataError) -> Iterator[None]:
     """Name the file or option in errors that do not know it: what it asks for is its own fault."""
     try:
         yield
@@ -210,7 +210,7 @@ class _Reader:
                 raise UsageError(what, source="--filter", remedy=error.remedy) from error
             raise DataError(what, source=self.top.source, remedy=error.remedy) from error
 
-    def star(self, section: Section, *, is_calibrator: bool, number: int = 0) -> list[Shot]:
+    def star(self, section: Section, *, is_calibrator: bool, number: int = 0) -> list[ExposureSpec]:
         """Give the exposures of the target or of a calibrator."""
         scene = scene_from(section)
         name = section.text("name", f"calibrator_{number}") if is_calibrator else scene.name
@@ -254,7 +254,7 @@ class _Reader:
         if n_groups is None:
             n_groups = self._groups(rate, rules)
         if self.overrides.photons is not None:
-            with blaming("--photons", UsageError):
+            with naming_source("--photons", UsageError):
                 n_integrations = integrations(
                     rate, max(n_groups, 1), rules, photons=self.overrides.photons
                 )
@@ -266,7 +266,7 @@ class _Reader:
             n_integrations,
             jitter_rad=_pointing(table, "jitter_mas", 7.0),
             dither_rad=_pointing(table, "dither_mas", 15.0),
-            n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MOST_PIXELS),
+            n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MAX_PIXELS),
             keep_ramps=table.flag("ramps", False) or self.overrides.ramps,
         )
 
@@ -286,7 +286,9 @@ class _Reader:
         )
         return plan.n_groups
 
-    def _dithered(self, name: str, observation: Observation, errors: WavefrontErrors) -> list[Shot]:
+    def _dithered(
+        self, name: str, observation: Observation, errors: WavefrontErrors
+    ) -> list[ExposureSpec]:
         """Repeat an exposure at every roll and dither."""
         dithers = self.exposure.whole("dithers", 1, at_least=1)
         rolls = self.exposure.numbers("roll_deg") if "roll_deg" in self.exposure else np.zeros(1)
@@ -294,7 +296,7 @@ class _Reader:
         angles = np.repeat(rolls, dithers) * DEGREE
         names = [name] if len(angles) == 1 else [f"{name}_{k + 1}" for k in range(len(angles))]
         return [
-            Shot(label, replace(observation, orientation=Orientation(float(angle))), errors)
+            ExposureSpec(label, replace(observation, orientation=Orientation(float(angle))), errors)
             for label, angle in zip(names, angles, strict=True)
         ]
 
@@ -347,7 +349,7 @@ def _slug(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9+.-]+", "_", name).strip("_.") or "star"
 
 
-def _scheduled(shots: list[Shot]) -> tuple[Shot, ...]:
+def _scheduled(shots: list[ExposureSpec]) -> tuple[ExposureSpec, ...]:
     """Put the exposures one after the other.
 
     Raises
@@ -371,4 +373,4 @@ def _scheduled(shots: list[Shot]) -> tuple[Shot, ...]:
 
 def _pointing(table: Section, key: str, default_mas: float) -> float:
     """Rms of the pointing along an axis, radians."""
-    return MAS * table.number(key, default_mas, at_least=0.0, at_most=LARGEST_POINTING_MAS)
+    return MAS * table.number(key, default_mas, at_least=0.0, at_most=MAX_POINTING_MAS)

@@ -13,7 +13,7 @@ from amibayes.instrument import instrument_names
 from amibayes.units import MAS
 
 if TYPE_CHECKING:
-    from amibayes.scene import Scene
+    from amibayes.scene.sources import Scene
     from amibayes.simulation.exposure import Pointings
     from amibayes.simulation.observe import Observation
 

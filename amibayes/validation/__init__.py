@@ -1,7 +1,15 @@
 """Whether the numbers mean what they say: the whole way, on exposures whose truth is known."""
 
-from amibayes.validation.plan import FULL, QUICK, Setting, ValidationPlan
+from amibayes.validation.plan import FULL, QUICK, SimulatedExposure, ValidationPlan
 from amibayes.validation.run import validate
 from amibayes.validation.tally import Check, Validation
 
-__all__ = ["FULL", "QUICK", "Check", "Setting", "Validation", "ValidationPlan", "validate"]
+__all__ = [
+    "FULL",
+    "QUICK",
+    "Check",
+    "SimulatedExposure",
+    "Validation",
+    "ValidationPlan",
+    "validate",
+]

@@ -18,7 +18,7 @@ MAGNITUDE = 6.0
 
 
 @dataclass(frozen=True)
-class Setting:
+class SimulatedExposure:
     """An exposure of a star of magnitude 6, and how many calibrators it comes with."""
 
     filter: str
@@ -34,7 +34,7 @@ class ValidationPlan:
     Parameters
     ----------
     name : str
-    settings : tuple of Setting
+    settings : tuple of SimulatedExposure
         Taken in turn.
     per_range : int
         Companions drawn from the prior in each of `RANGES`.
@@ -47,7 +47,7 @@ class ValidationPlan:
     """
 
     name: str
-    settings: tuple[Setting, ...]
+    settings: tuple[SimulatedExposure, ...]
     per_range: int
     n_alone: int
     null_draws: int
@@ -62,14 +62,14 @@ class ValidationPlan:
         return [name for _, name in turns]
 
 
-QUICK = ValidationPlan("quick", (Setting("F430M", 7, 30, 2),), 8, 12, 1000)
+QUICK = ValidationPlan("quick", (SimulatedExposure("F430M", 7, 30, 2),), 8, 12, 1000)
 
 FULL = ValidationPlan(
     "full",
     (
-        Setting("F380M", 7, 60, 3),
-        Setting("F430M", 14, 40, 4),
-        Setting("F480M", 19, 120, 3),
+        SimulatedExposure("F380M", 7, 60, 3),
+        SimulatedExposure("F430M", 14, 40, 4),
+        SimulatedExposure("F480M", 19, 120, 3),
     ),
     60,
     300,

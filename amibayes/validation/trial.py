@@ -8,25 +8,25 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import calibrate
+from amibayes.companion_search.search import resolution_mas
 from amibayes.cube import Cube
+from amibayes.data.observables import Observables
 from amibayes.errors import AmibayesError, RunError
 from amibayes.extraction import ExtractOptions, extract
-from amibayes.inference.grid_posterior import GridPosterior, grid_posterior
-from amibayes.inference.limits import detection_limit
-from amibayes.inference.priors import Prior
-from amibayes.inference.recovery import at_its_place
-from amibayes.inference.search import resolution_mas
 from amibayes.instrument import load_instrument
-from amibayes.job import SearchOptions
-from amibayes.observables import Observables
+from amibayes.limits.completeness import detection_limit
+from amibayes.limits.injection import at_its_place
 from amibayes.parallel import child_seeds
-from amibayes.pipeline import search_field
-from amibayes.scene import Point, Scene
+from amibayes.pipeline.false_alarm import weigh
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.search import search_field
+from amibayes.posterior.grid import GridPosterior, grid_posterior
+from amibayes.posterior.priors import Prior
+from amibayes.scene.sources import Point, Scene
+from amibayes.scene.spectrum import g2v
 from amibayes.simulation import Detector, Exposure, draw_maps, simulate
-from amibayes.spectrum import g2v
 from amibayes.units import MAS, FloatArray, position_angle_deg
-from amibayes.validation.plan import FIELD_MAS, MAGNITUDE, RANGES, Setting, ValidationPlan
-from amibayes.weighing import weigh
+from amibayes.validation.plan import FIELD_MAS, MAGNITUDE, RANGES, SimulatedExposure, ValidationPlan
 
 RANKED = ("east_mas", "north_mas", "ln_contrast")
 """Quantities whose ranks must be uniform; the position angle is circular."""
@@ -76,7 +76,7 @@ def run_trial(plan: ValidationPlan, piece: Piece) -> dict[str, Any]:
 
 
 def observe(
-    setting: Setting, truth: FloatArray | None, seed: np.random.SeedSequence
+    setting: SimulatedExposure, truth: FloatArray | None, seed: np.random.SeedSequence
 ) -> Observables:
     """Simulate a target and its calibrators on one detector, extract and calibrate them."""
     stars = [_scene(truth), *[_scene(None)] * setting.n_calibrators]
@@ -94,7 +94,7 @@ def _scene(truth: FloatArray | None) -> Scene:
 
 
 def _cube(
-    setting: Setting,
+    setting: SimulatedExposure,
     scene: Scene,
     of_maps: np.random.SeedSequence,
     seed: np.random.SeedSequence,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from amibayes.data.observables import Observables
 from amibayes.errors import DataError
-from amibayes.observables import Observables
 from amibayes.oifits.audit import geometry, noise, packages, structure, values
 from amibayes.oifits.audit.finding import Finding, Severity
 from amibayes.oifits.audit.repair import repair

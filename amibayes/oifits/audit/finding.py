@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from amibayes.observables import BoolArray
+from amibayes.data.observables import BoolArray
 from amibayes.oifits.rows import KINDS, Kind
 from amibayes.oifits.scales import ANGLE, scale_of
 from amibayes.oifits.tables import OIFits, OITable

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 
-from amibayes.closure import canonical
-from amibayes.observables import BoolArray, IntArray, Measurements, Observables, closure_sets
+from amibayes.data.closure import canonical
+from amibayes.data.observables import BoolArray, IntArray, Measurements, Observables, closure_sets
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
 from amibayes.oifits.tables import OIFits
 from amibayes.units import FloatArray

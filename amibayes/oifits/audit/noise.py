@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from amibayes.closure import canonical, canonical_uv, closure_matrix, kernel_basis
+from amibayes.data.closure import canonical, canonical_uv, closure_matrix, kernel_basis
+from amibayes.data.observables import IntArray, Measurements, Observables, closure_sets
 from amibayes.errors import DataError
-from amibayes.observables import IntArray, Measurements, Observables, closure_sets
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, listed
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.files import atomic_path
 from amibayes.oifits.audit.finding import Finding
 from amibayes.oifits.audit.packages import amplitude_ratio
 from amibayes.oifits.audit.structure import standard_unit
 from amibayes.oifits.audit.values import value_and_error
 from amibayes.oifits.dates import first_date
-from amibayes.oifits.rows import KINDS, absurd
+from amibayes.oifits.rows import KINDS, unusable
 from amibayes.oifits.scales import ANGLE
 from amibayes.oifits.standard import PRIMARY_KEYWORDS, TABLES
 from amibayes.oifits.tables import OIFits, OITable, plain
+from amibayes.support.atomic_files import atomic_path
 from amibayes.units import DEGREE
 
 Remedy = Callable[[Any, OIFits], None]
@@ -95,7 +95,7 @@ def _flag_unusable(hdus: Any, oifits: OIFits) -> None:
             continue
         value, error = pair
         with np.errstate(over="ignore", invalid="ignore"):
-            bad = absurd(kind, value, np.where(error > 0, error**2, np.nan))
+            bad = unusable(kind, value, np.where(error > 0, error**2, np.nan))
         flag = hdus[table.number].data[_column(hdus, table, "FLAG").name]
         flag |= bad.reshape(flag.shape)
 

@@ -15,7 +15,7 @@ from amibayes.oifits.audit.finding import (
     unflagged,
 )
 from amibayes.oifits.dates import mjd_of_date
-from amibayes.oifits.rows import Kind, absurd, times_of
+from amibayes.oifits.rows import Kind, times_of, unusable
 from amibayes.oifits.scales import LENGTH, TIME, scale_of
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
@@ -125,7 +125,7 @@ def unusable_unflagged(oifits: OIFits) -> Findings:
         value, error = pair
         used = unflagged(table, value.shape)
         with np.errstate(over="ignore", invalid="ignore"):
-            bad = absurd(kind, value, np.where(error > 0, error**2, np.nan)) & used
+            bad = unusable(kind, value, np.where(error > 0, error**2, np.nan)) & used
         if not used.any():
             yield Finding(
                 "error",

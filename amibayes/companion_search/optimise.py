@@ -1,0 +1,198 @@
+"""Nonlinear fits with NLopt: without a companion, from a seed, and over the whole field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import nlopt
+import numpy as np
+
+from amibayes.companion_search.result import Mode
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.parameters import MAX_CONTRAST, Box, nuisance_bounds
+from amibayes.units import FloatArray
+
+Objective = Callable[[FloatArray, FloatArray], float]
+
+
+EVALUATIONS_PER_FRINGE, MIN_EVALUATIONS, MAX_EVALUATIONS = 40, 400, 3000
+"""Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
+
+
+CONVERGED = 1e-9
+"""Relative change of χ² at which a local fit stops."""
+
+
+MAX_ROUNDS, SETTLED = 3, 1e-3
+"""A fit is taken up again, with new scales, until a round gains less than this in χ²."""
+
+
+CONSTRAINT_SLACK = 1e-7
+"""How far, in units of (λ/B)², a separation may stand outside the field."""
+
+
+EMPTY = np.empty(0)
+
+
+def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
+    """Best fit without a companion: its parameters (n_nuisance,) and deviance."""
+    without = single_likelihood(likelihood)
+    bounds = np.array(
+        nuisance_bounds(likelihood.parameters, likelihood.samples.frequency.min())
+    ).reshape(-1, 2)
+    if not len(bounds):
+        return np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0])
+    # A disc has lobes: the fit starts from the best of a ladder of values.
+    ladder = bounds[:, 0] + np.outer(np.linspace(0.0, 1.0, 201) ** 2, bounds[:, 1] - bounds[:, 0])
+    start = ladder[np.argmin(without.chi2(ladder))]
+    scale = np.maximum(ladder[10], 1e-6)
+    return _minimise(_objective(without, scale), start, scale, bounds)
+
+
+def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: float) -> Mode:
+    """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
+    model = likelihood.model
+    n_pairs = model.width * model.companions
+    bounds = np.empty((len(seed), 2))
+    bounds[:n_pairs] = seed[:n_pairs, None] + box.fringe_mas * np.array([-1.0, 1.0])
+    bounds[model.contrast_columns] = 0.0, MAX_CONTRAST
+    bounds[model.rate_columns] = -model.fastest_mas_yr, model.fastest_mas_yr
+    bounds[n_pairs:] = np.array(
+        nuisance_bounds(likelihood.parameters, likelihood.samples.frequency.min())
+    ).reshape(-1, 2)
+    theta, deviance = seed, np.inf
+    for _ in range(MAX_ROUNDS):
+        scale = _natural_scale(likelihood, theta, box)
+        places = range(0, n_pairs, model.width)
+        limits = [x for k in places for x in _field_limits(seed, box, scale, k)]
+        before = deviance
+        theta, deviance = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
+        if deviance > before - SETTLED:
+            break
+    return Mode(tuple(float(x) for x in theta), deviance_single - deviance)
+
+
+def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
+    """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
+    length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
+    model = likelihood.model
+    widest = np.full(len(theta), 1.0)
+    widest[: model.width * model.companions] = 0.3 * box.fringe_mas
+    widest[model.contrast_columns] = 0.3
+    widest[model.rate_columns] = 0.5 * model.fastest_mas_yr
+    return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
+
+
+def global_check(
+    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, deviance_single: float
+) -> Mode:
+    """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
+
+    It shares neither the lattice nor the choice of peaks with the search. A field of very
+    many fringes is more than it can cover; what it finds is a lower bound then.
+    """
+    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    best_at = bank.matched_filter(residuals)
+
+    def inside(position: FloatArray) -> bool:
+        return box.inner_mas <= float(np.hypot(*position)) <= box.outer_mas
+
+    def loss(position: FloatArray, _: FloatArray) -> float:
+        return -best_at(position)[1] if inside(position) else 0.0
+
+    optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
+    optimiser.set_lower_bounds([-box.outer_mas] * 2)
+    # The box is a little lopsided so that its first trial is not the star itself.
+    optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
+    optimiser.set_min_objective(loss)
+    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
+    wanted = int(EVALUATIONS_PER_FRINGE * patches)
+    optimiser.set_maxeval(min(max(wanted, MIN_EVALUATIONS), MAX_EVALUATIONS))
+    start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
+    position = np.asarray(optimiser.optimize(start))
+    position = position if inside(position) else start
+    seed = np.concatenate([position, best_at(position)[0], single])
+    bright = likelihood.model.contrast_columns
+    seed[bright] = np.clip(seed[bright], 0.0, MAX_CONTRAST)
+    return refine(likelihood, seed, box, deviance_single)
+
+
+def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:
+    """Deviance and its gradient in scaled variables, as NLopt asks for them."""
+
+    def deviance(x: FloatArray, gradient: FloatArray) -> float:
+        value, slope = likelihood.log_prob_and_gradient((x * scale)[None])
+        if gradient.size:
+            gradient[:] = -2.0 * slope[0] * scale
+        return float(-2.0 * (value[0] - likelihood.log_norm))
+
+    return deviance
+
+
+def _field_limits(seed: FloatArray, box: Box, scale: FloatArray, at: int) -> list[Objective]:
+    """Constraints ≤ 0 that keep the companion at ``at`` inside the field, if it might leave it."""
+    rho = float(np.hypot(seed[at], seed[at + 1]))
+    reach = 1.5 * box.fringe_mas
+    limits: list[Objective] = []
+    if rho + reach > box.outer_mas:
+        limits.append(_separation_limit(box, scale, at, +1.0, box.outer_mas))
+    if rho - reach < box.inner_mas:
+        limits.append(_separation_limit(box, scale, at, -1.0, box.inner_mas))
+    return limits
+
+
+def _separation_limit(
+    box: Box, scale: FloatArray, at: int, sign: float, limit_mas: float
+) -> Objective:
+    place = slice(at, at + 2)
+    squared = (scale[place] / box.fringe_mas) ** 2
+
+    def excess(x: FloatArray, gradient: FloatArray) -> float:
+        if gradient.size:
+            gradient[:] = 0.0
+            gradient[place] = 2.0 * sign * squared * x[place]
+        return float(sign * (squared @ x[place] ** 2 - (limit_mas / box.fringe_mas) ** 2))
+
+    return excess
+
+
+def _minimise(
+    objective: Objective,
+    start: FloatArray,
+    scale: FloatArray,
+    bounds: FloatArray,
+    limits: Sequence[Objective] = (),
+) -> tuple[FloatArray, float]:
+    """Minimise inside bounds (n, 2); what counts is the best allowed point seen.
+
+    SLSQP is the fastest; where it breaks down CCSAQ takes over from its best point.
+    """
+    low, high = bounds.T / scale
+    inside = np.clip(start / scale, low, high)
+    best, least = inside, np.inf
+
+    def watched(x: FloatArray, gradient: FloatArray) -> float:
+        nonlocal best, least
+        value = objective(x, gradient)
+        if value < least and all(limit(x, EMPTY) <= CONSTRAINT_SLACK for limit in limits):
+            best, least = x.copy(), value
+        return value
+
+    for algorithm in (nlopt.LD_SLSQP, nlopt.LD_CCSAQ):
+        optimiser = nlopt.opt(algorithm, len(start))
+        optimiser.set_lower_bounds(low)
+        optimiser.set_upper_bounds(high)
+        optimiser.set_min_objective(watched)
+        for limit in limits:
+            optimiser.add_inequality_constraint(limit, CONSTRAINT_SLACK)
+        optimiser.set_ftol_rel(CONVERGED)
+        optimiser.set_maxeval(200)
+        try:
+            optimiser.optimize(best)
+        except nlopt.RoundoffLimited:
+            pass  # it can improve no further: the best point stands
+        except nlopt.runtime_error:
+            continue  # its quadratic subproblem failed: the slower, sturdier one goes on
+        break
+    return best * scale, least

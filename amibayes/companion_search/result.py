@@ -1,0 +1,261 @@
+"""What a search gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+
+from amibayes.companion_search.template_bank import Grid
+from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
+from amibayes.likelihood.chi2 import candid_n_sigma
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.student import Robustness, SymmetricWhitening, symmetric_whitening
+from amibayes.models.uv_points import YEAR_DAYS
+from amibayes.support.quantities import takes_quantities
+from amibayes.units import (
+    FloatArray,
+    contrast_to_delta_mag,
+    position_angle_deg,
+    separation,
+)
+
+
+@takes_quantities
+@dataclass(frozen=True)
+class Companion:
+    """A companion's parameters with 1σ errors.
+
+    Errors come from the inverse Hessian of χ²; NaN where there is none.
+    """
+
+    east_mas: float
+    north_mas: float
+    contrast: float
+    east_error_mas: float = float("nan")
+    north_error_mas: float = float("nan")
+    contrast_error: float = float("nan")
+    separation_error_mas: float = float("nan")
+    position_angle_error_deg: float = float("nan")
+
+    @property
+    def separation_mas(self) -> float:
+        """Angular separation, mas."""
+        return float(separation(self.east_mas, self.north_mas))
+
+    @property
+    def position_angle_deg(self) -> float:
+        """Position angle, degrees east of north in [0, 360)."""
+        return float(position_angle_deg(self.east_mas, self.north_mas))
+
+    @property
+    def delta_mag(self) -> float:
+        """Magnitude difference to the primary."""
+        return float(contrast_to_delta_mag(self.contrast))
+
+    def coordinates(self, star: SkyCoord) -> SkyCoord:
+        """Position on the sky, from that of the star (at the epoch of the data)."""
+        return star.directional_offset_by(
+            self.position_angle_deg * units.deg, self.separation_mas * units.mas
+        )
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        errors = {
+            "separation_mas": self.separation_error_mas,
+            "position_angle_deg": self.position_angle_error_deg,
+            "contrast": self.contrast_error,
+            "delta_mag": self.delta_mag_error,
+            "east_mas": self.east_error_mas,
+            "north_mas": self.north_error_mas,
+        }
+        return [
+            (pretty(name), f"{getattr(self, name):.5g}", f"{error:.2g}")
+            for name, error in errors.items()
+        ]
+
+    def _repr_html_(self) -> str:
+        """Show the companion in a notebook."""
+        return html_table("Companion", ("", "value", "1σ"), self._rows())
+
+    @property
+    def delta_mag_error(self) -> float:
+        """1σ error of the magnitude difference."""
+        return (
+            2.5 / np.log(10.0) * self.contrast_error / self.contrast
+            if self.contrast > 0
+            else np.nan
+        )
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A local maximum of the likelihood: its parameters, and 2Δln L over no companion.
+
+    The gain is that in χ² where the covariance is known.
+    """
+
+    theta: tuple[float, ...]
+    delta_chi2: float
+
+    @property
+    def companion(self) -> Companion:
+        """The mode's companion, without errors."""
+        return Companion(*self.theta[:3])
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """What a search found.
+
+    Parameters
+    ----------
+    companion : Companion
+        Joint best fit with errors.
+    theta : (n_dim,) float array
+        The best parameter vector, in the order of ``likelihood.parameters``.
+    theta_covariance : (n_dim, n_dim) float array
+    single_theta : (n_nuisance,) float array
+        The best fit without a companion.
+    chi2_single, chi2_binary : float
+    ndof : int
+        Independent data minus free parameters of the binary fit.
+    modes : tuple of Mode
+        Distinct solutions left standing, best first.
+    grid : Grid
+    bank_contrast, bank_sigma : (n_grid,) float array
+        Best linear contrast and its error at every position, the same in every band.
+    global_check : Mode
+        What the independent global optimiser found.
+    warnings : tuple of str
+    robustness : Robustness, optional
+        How a robust search treated the data; ``likelihood`` has outliers' errors stretched.
+    joint_gain : (n_grid,) float array, optional
+        Gain in χ² at every position where bands have contrasts of their own or the companion
+        moves; otherwise it follows from the two above.
+    """
+
+    likelihood: Likelihood
+    companion: Companion
+    theta: FloatArray
+    theta_covariance: FloatArray
+    single_theta: FloatArray
+    chi2_single: float
+    chi2_binary: float
+    ndof: int
+    modes: tuple[Mode, ...]
+    grid: Grid
+    bank_contrast: FloatArray
+    bank_sigma: FloatArray
+    global_check: Mode
+    warnings: tuple[str, ...] = ()
+    robustness: Robustness | None = None
+    joint_gain: FloatArray | None = None
+
+    @property
+    def delta_chi2(self) -> float:
+        """2Δln L of the companion: χ² without minus χ² with it where the covariance is known."""
+        single, binary = self.likelihood.deviance([self.chi2_single, self.chi2_binary])
+        return float(single - binary)
+
+    @property
+    def candid_n_sigma(self) -> float:
+        """CANDID's nσ of the best fit."""
+        return float(candid_n_sigma(self.chi2_single, self.chi2_binary, self.ndof))
+
+    @property
+    def bank_delta_chi2(self) -> FloatArray:
+        """2Δln L at every position of the grid, for positive contrast."""
+        gain = self.bank_gain
+        if not np.isfinite(self.likelihood.degrees):
+            return gain
+        left = np.maximum(self.chi2_single - gain, 0.0)
+        deviance = self.likelihood.deviance
+        return np.asarray(deviance(self.chi2_single) - deviance(left))
+
+    @property
+    def bank_gain(self) -> FloatArray:
+        """Gain in χ² at every position of the grid, for positive contrast."""
+        if self.joint_gain is not None:
+            return self.joint_gain
+        return np.where(self.bank_contrast > 0, (self.bank_contrast / self.bank_sigma) ** 2, 0.0)
+
+    @property
+    def contrasts(self) -> dict[str, tuple[float, float]]:
+        """Contrast and its 1σ error of every band with its own; empty where all share one."""
+        model = self.likelihood.model
+        sigma = np.sqrt(np.diag(self.theta_covariance))
+        columns = zip(model.bands, model.contrast_columns, strict=False)
+        return {band: (float(self.theta[k]), float(sigma[k])) for band, k in columns}
+
+    def position_at(self, mjd: float) -> tuple[float, float]:
+        """East and north of the companion, mas, predicted for a date."""
+        model, (east, north) = self.likelihood.model, self.theta[:2]
+        if model.moves:
+            moved = self.theta[model.rate_columns] * (mjd - model.reference_mjd) / YEAR_DAYS
+            east, north = east + moved[0], north + moved[1]
+        return float(east), float(north)
+
+    def nuisance(self, name: str) -> float:
+        """Value of the diameter or background in the best fit, free or fixed."""
+        if name in self.likelihood.parameters:
+            return float(self.theta[self.likelihood.parameters.index(name)])
+        return float(getattr(self.likelihood.model, name))
+
+    def to_table(self) -> QTable:
+        """Every solution left standing, best first, as an astropy table with units."""
+        names = ("separation_mas", "position_angle_deg", "contrast", "delta_mag")
+        found = [mode.companion for mode in self.modes]
+        columns = {name: [getattr(c, name) for c in found] for name in names}
+        gains = {"delta_chi2": [mode.delta_chi2 for mode in self.modes]}
+        return quantity_table(columns | gains, UNITS)
+
+    def _repr_html_(self) -> str:
+        """Show the best fit in a notebook."""
+        more = [
+            ("Δχ²", f"{self.delta_chi2:.1f}", ""),
+            ("CANDID nσ", f"{self.candid_n_sigma:.1f}", ""),
+            ("modes", str(len(self.modes)), ""),
+            *(("warning", text, "") for text in self.warnings),
+        ]
+        rows = [*self.companion._rows(), *more]
+        return html_table("Best fit of the search", ("", "value", "1σ"), rows)
+
+    def __repr__(self) -> str:
+        """One line for a notebook."""
+        c = self.companion
+        return (
+            f"<SearchResult: {c.separation_mas:.2f} mas, PA {c.position_angle_deg:.2f}°, contrast "
+            f"{c.contrast:.3g}, Δχ² {self.delta_chi2:.1f}, {len(self.modes)} modes>"
+        )
+
+
+def null_likelihood(result: SearchResult) -> tuple[Likelihood, SymmetricWhitening | None]:
+    """Likelihood by which a search is judged, and the frame of robust residuals."""
+    if result.robustness is None:
+        return result.likelihood, None
+    # Weights were found with a companion; no companion may be judged by them.
+    base = result.robustness.base
+    return Likelihood(base, result.likelihood.model), symmetric_whitening(base)
+
+
+def companion_of(theta: FloatArray, covariance: FloatArray) -> Companion:
+    """First companion of a parameter vector, its errors carried over from the covariance."""
+    east, north, contrast = (float(x) for x in theta[:3])
+    matrix = covariance[:2, :2]
+    rho = max(float(np.hypot(east, north)), 1e-300)
+    outward = np.array([east, north]) / rho
+    around = np.array([north, -east]) / rho**2
+    sigma = np.sqrt(np.diag(covariance)[:3])
+    return Companion(
+        east,
+        north,
+        contrast,
+        float(sigma[0]),
+        float(sigma[1]),
+        float(sigma[2]),
+        float(np.sqrt(outward @ matrix @ outward)),
+        float(np.degrees(np.sqrt(around @ matrix @ around))),
+    )

@@ -1,0 +1,352 @@
+"""Observables: the one table of squared visibilities, closure phases and their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from astropy.table import QTable
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from amibayes.data.covariance import Covariance, stack_covariances
+from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
+from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.tables import observables_html, observables_table
+from amibayes.errors import DataError
+from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+CovarianceKind = Literal["diagonal", "assumed", "given", "estimated"]
+
+SIMULTANEOUS_S = 17.0
+"""Rows of one setup nearer in time than this, or than they were integrated, go together."""
+
+DAY_S = 86400.0
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """One instrument configuration: its name, stations and spectral channels.
+
+    Parameters
+    ----------
+    insname, arrname, target : str
+        Names as OIFITS gives them (stripped).
+    stations : tuple of str
+        Station names; `Measurements.stations` indexes them.
+    station_index : (n_stations,) int array
+        The numbers that OIFITS uses for them (STA_INDEX).
+    wavelength_m, band_m : (n_channels,) float array
+        Effective wavelength and width of each channel, in metres.
+    station_xyz_m : (n_stations, 3) float array, optional
+        Positions (holes of a mask, telescopes of an array) in metres.
+    station_diameter_m : (n_stations,) float array, optional
+    source : str
+        The file the data come from.
+    right_ascension_deg, declination_deg : float
+        Of the target (0 where unknown).
+    response : OffAxisResponse, optional
+        What the extraction lets through of light off the axis.
+    """
+
+    insname: str
+    arrname: str
+    target: str
+    stations: tuple[str, ...]
+    station_index: IntArray
+    wavelength_m: FloatArray
+    band_m: FloatArray
+    station_xyz_m: FloatArray | None = None
+    station_diameter_m: FloatArray | None = None
+    source: str = ""
+    right_ascension_deg: float = 0.0
+    declination_deg: float = 0.0
+    response: OffAxisResponse | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Numbers of one kind, squared visibilities or closure phases, one entry per number.
+
+    Parameters
+    ----------
+    value : (n,) float array
+        V² (dimensionless) or closure phase (radians).
+    u_m, v_m : (n, k) float array
+        Metres; k = 1 for V², 2 for closure phases (first two baselines of the triangle,
+        the third closes it: V(1)·V(2)·V*(1+2)).
+    wavelength_m, band_m : (n,) float array
+    mjd, integration_s : (n,) float array
+    stations : (n, k + 1) int array
+        Positions in `Setup.stations`.
+    setup, row, channel : (n,) int array
+        Which `Setup`, which table row and which spectral channel each entry comes from.
+    flag : (n,) bool array
+        True where the number must not be used.
+    """
+
+    value: FloatArray
+    u_m: FloatArray
+    v_m: FloatArray
+    wavelength_m: FloatArray
+    band_m: FloatArray
+    mjd: FloatArray
+    integration_s: FloatArray
+    stations: IntArray
+    setup: IntArray
+    row: IntArray
+    channel: IntArray
+    flag: BoolArray
+
+    def __post_init__(self) -> None:
+        n = len(self.value)
+        for field in fields(self):
+            if len(getattr(self, field.name)) != n:
+                raise ValueError(f"{field.name} has another length than value")
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def select(self, keep: IntArray | BoolArray) -> Measurements:
+        """The entries ``keep``, in that order."""
+        return Measurements(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class Observables:
+    """Squared visibilities and closure phases with the covariance of what is not flagged.
+
+    Parameters
+    ----------
+    vis2, closure_phase : Measurements
+    covariance : Covariance
+        Of the unflagged data, V² first, then closure phases in radians.
+    covariance_kind : {"diagonal", "assumed", "given", "estimated"}
+        Independent errors; errors only, closures correlated through shared baselines;
+        correlations from the file; from the scatter of ``n_integrations``.
+    setups : tuple of Setup
+    n_integrations : int, optional
+        Number of integrations an estimated covariance rests on.
+    notes : tuple of str
+        What the reader had to decide (tables not used, columns absent, …).
+    freedom : Freedom, optional
+        Of an estimated covariance; without it the covariance counts as known.
+    scatter : sparse array, optional
+        The covariance as the measured scatter alone has it, without the expected noise.
+
+    Raises
+    ------
+    DataError
+        Where a covariance does not fit the unflagged data, or a value in use is not finite.
+    """
+
+    vis2: Measurements
+    closure_phase: Measurements
+    covariance: Covariance
+    covariance_kind: CovarianceKind
+    setups: tuple[Setup, ...]
+    n_integrations: int | None = None
+    notes: tuple[str, ...] = ()
+    freedom: Freedom | None = None
+    scatter: csr_array | None = None
+
+    def __post_init__(self) -> None:
+        sizes = [self.covariance.size, *([] if self.scatter is None else self.scatter.shape)]
+        for size in sizes:
+            if size != len(self.data):
+                raise DataError(
+                    f"a covariance of size {size} for {len(self.data)} data", source=self.source
+                )
+        if not np.isfinite(self.data).all():
+            raise DataError("a value in use is not finite", source=self.source, remedy="flag it")
+
+    @property
+    def source(self) -> str:
+        """The files the data come from."""
+        return ", ".join(dict.fromkeys(s.source for s in self.setups if s.source))
+
+    @cached_property
+    def data(self) -> FloatArray:
+        """The unflagged data, V² first, then closure phases in radians."""
+        v, c = self.vis2, self.closure_phase
+        return np.concatenate([v.value[~v.flag], c.value[~c.flag]])
+
+    @property
+    def n_vis2(self) -> int:
+        """Number of unflagged squared visibilities."""
+        return int((~self.vis2.flag).sum())
+
+    @property
+    def n_closure_phases(self) -> int:
+        """Number of unflagged closure phases."""
+        return int((~self.closure_phase.flag).sum())
+
+    @property
+    def n_independent(self) -> int:
+        """Number of independent data."""
+        return self.covariance.rank
+
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the t distribution of the data; infinite where it is Gaussian."""
+        return np.inf if self.freedom is None else self.freedom.degrees
+
+    @cached_property
+    def errors(self) -> tuple[FloatArray, FloatArray]:
+        """1σ errors of V² and closure phase (radians); NaN where flagged."""
+        sigma = np.sqrt(self.covariance.variance)
+        vis2, closure = np.full(len(self.vis2), np.nan), np.full(len(self.closure_phase), np.nan)
+        vis2[~self.vis2.flag] = sigma[: self.n_vis2]
+        closure[~self.closure_phase.flag] = sigma[self.n_vis2 :]
+        return vis2, closure
+
+    def unflagged(self) -> Observables:
+        """The same data without the flagged entries."""
+        return replace(
+            self,
+            vis2=self.vis2.select(~self.vis2.flag),
+            closure_phase=self.closure_phase.select(~self.closure_phase.flag),
+        )
+
+    def select(self, vis2: BoolArray, closure_phase: BoolArray) -> Observables:
+        """The entries where the masks are true; the covariance follows."""
+        used = np.concatenate([vis2[~self.vis2.flag], closure_phase[~self.closure_phase.flag]])
+        return replace(
+            self,
+            vis2=self.vis2.select(vis2),
+            closure_phase=self.closure_phase.select(closure_phase),
+            covariance=self.covariance.select(np.flatnonzero(used)),
+            scatter=None if self.scatter is None else self.scatter[used][:, used],
+        )
+
+    def only(self, kinds: Sequence[str]) -> Observables:
+        """The data of the given kinds, out of ``vis2`` and ``cp``.
+
+        Raises
+        ------
+        DataError
+            Where nothing is left.
+        """
+        n, m = len(self.vis2), len(self.closure_phase)
+        chosen = self.select(np.full(n, "vis2" in kinds), np.full(m, "cp" in kinds))
+        if not len(chosen.data):
+            raise DataError(f"holds no usable {' or '.join(kinds)}", source=self.source)
+        return chosen
+
+    def to_table(self, kind: Literal["vis2", "closure_phase"] = "vis2") -> QTable:
+        """One kind of data as an astropy table with units."""
+        return observables_table(self, kind)
+
+    def _repr_html_(self) -> str:
+        return observables_html(self)
+
+    def __repr__(self) -> str:
+        return (
+            f"<Observables: {self.n_vis2} V², {self.n_closure_phases} closure phases, "
+            f"{self.n_independent} independent data, {self.covariance_kind} covariance, "
+            f"{', '.join(dict.fromkeys(s.insname for s in self.setups))}>"
+        )
+
+
+def _freeze(container: Any) -> None:
+    for field in fields(container):
+        value = getattr(container, field.name)
+        if isinstance(value, np.ndarray):
+            copy = value.copy()
+            copy.flags.writeable = False
+            object.__setattr__(container, field.name, copy)
+
+
+def exposure_labels(closure_phase: Measurements) -> IntArray:
+    """Number the exposure each closure phase belongs to: one set of triangles at one time.
+
+    Rows of one setup within `SIMULTANEOUS_S` (or their integration time) of each other are
+    simultaneous, unless a triangle comes back, which starts the next exposure.
+    """
+    m = closure_phase
+    if not len(m):
+        return np.empty(0, dtype=np.intp)
+    key = np.stack([m.setup, m.row], axis=1)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    in_time = np.lexsort((m.row[first], m.mjd[first], m.setup[first]))
+    label = np.empty(len(first), dtype=np.intp)
+    label[in_time] = _count_exposures(m.select(first[in_time]))
+    return np.asarray(label[inverse.ravel()])
+
+
+def _count_exposures(rows: Measurements) -> list[int]:
+    label: list[int] = []
+    seen: set[tuple[int, ...]] = set()
+    for i in range(len(rows)):
+        triangle = tuple(sorted(rows.stations[i].tolist()))
+        apart = i and (rows.setup[i] != rows.setup[i - 1] or _far_in_time(rows, i))
+        if apart or triangle in seen:
+            seen = set()
+        label.append(label[-1] + (not seen) if label else 0)
+        seen.add(triangle)
+    return label
+
+
+def _far_in_time(rows: Measurements, i: int) -> bool:
+    """Whether a row begins after the one before it can have ended."""
+    overlap = 0.5 * float(np.nan_to_num(rows.integration_s[[i - 1, i]]).sum())
+    gap = DAY_S * (rows.mjd[i] - rows.mjd[i - 1])
+    return bool(gap > max(SIMULTANEOUS_S, overlap))
+
+
+def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:
+    """Yield the entries of each exposure and channel: the closure phases that share baselines."""
+    if not len(closure_phase):
+        return
+    key = np.stack([exposure_labels(closure_phase), closure_phase.channel], axis=1)
+    order = np.lexsort((closure_phase.row, key[:, 1], key[:, 0]))
+    cuts = np.flatnonzero(np.any(np.diff(key[order], axis=0) != 0, axis=1)) + 1
+    yield from np.split(order, cuts)
+
+
+def join(parts: Sequence[Observables]) -> Observables:
+    """Lay independent data sets together for one fit.
+
+    The kind of the whole covariance is that of its least certain part, in the order
+    given, estimated, assumed, diagonal; its freedom that of `stacked_freedom`.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    shifts = np.cumsum([0, *(len(p.setups) for p in parts)])
+    order = [np.arange(p.n_vis2) for p in parts], [np.arange(p.n_closure_phases) for p in parts]
+    starts = np.cumsum([0, *(p.covariance.size for p in parts)])
+    vis2_first = np.concatenate(
+        [s + i for s, i in zip(starts, order[0], strict=False)]
+        + [s + p.n_vis2 + i for s, p, i in zip(starts, parts, order[1], strict=False)]
+    ).astype(np.intp)
+    kinds: list[CovarianceKind] = ["diagonal", "assumed", "estimated", "given"]
+    known = [p.n_integrations for p in parts if p.n_integrations is not None]
+    scatter = stacked_scatter((p.covariance, p.scatter) for p in parts)
+    return Observables(
+        _concatenate([p.vis2 for p in parts], shifts),
+        _concatenate([p.closure_phase for p in parts], shifts),
+        stack_covariances([p.covariance for p in parts]).select(vis2_first),
+        min((p.covariance_kind for p in parts), key=kinds.index),
+        tuple(s for p in parts for s in p.setups),
+        min(known) if known else None,
+        tuple(n for p in parts for n in p.notes),
+        stacked_freedom((p.n_independent, p.freedom) for p in parts),
+        None if scatter is None else scatter[vis2_first][:, vis2_first],
+    )
+
+
+def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurements:
+    columns = {
+        f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(parts[0])
+    }
+    columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
+    return Measurements(**columns)

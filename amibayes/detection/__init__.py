@@ -1,0 +1,1 @@
+"""How often noise alone gives what was found."""

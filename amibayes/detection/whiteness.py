@@ -1,0 +1,41 @@
+"""Whether residuals of neighbouring spectral channels are independent, as errors alone say."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Measurements
+from amibayes.likelihood.student import symmetric_whitening
+
+IntArray = NDArray[np.intp]
+
+
+def channel_correlation(result: SearchResult) -> tuple[float, int]:
+    """Correlation of the residuals of a fit between neighbouring channels of a row.
+
+    Residuals are whitened symmetrically, so that correlations which the covariance has in it
+    do not count.
+
+    Returns
+    -------
+    correlation : float
+        0 where there is one channel.
+    n_pairs : int
+        Pairs of data it rests on; by chance it scatters by 1/√n_pairs.
+    """
+    data = result.likelihood.observables
+    residuals = symmetric_whitening(data).residuals(result.likelihood.residuals(result.theta))[:, 0]
+    vis2, closure = _neighbours(data.vis2), _neighbours(data.closure_phase) + data.n_vis2
+    first, second = residuals[np.concatenate([vis2, closure], axis=1)]
+    norm = float(np.sqrt((first @ first) * (second @ second)))
+    return (float(first @ second) / norm if norm else 0.0), len(first)
+
+
+def _neighbours(data: Measurements) -> IntArray:
+    """Pairs (2, n) of entries of one row in neighbouring channels."""
+    order = np.lexsort((data.channel, data.row, data.setup))
+    step = np.diff(np.stack([data.setup, data.row, data.channel])[:, order], axis=1)
+    beside = np.flatnonzero((step[0] == 0) & (step[1] == 0) & (step[2] == 1))
+    return np.stack([order[beside], order[beside + 1]])

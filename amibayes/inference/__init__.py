@@ -1,1 +1,0 @@
-"""Model, likelihood, search and posterior of companions."""

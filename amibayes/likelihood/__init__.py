@@ -1,0 +1,1 @@
+"""The likelihood of data given a source model, and the noise models."""

@@ -1,0 +1,144 @@
+"""Extra noise: a variance per kind of observable, for errors that are too small.
+
+Where the best model leaves residuals that the stated errors cannot explain, a variance is
+added to every V² and one to every closure phase (through the baselines that its triangles
+share) that makes the residuals as likely as can be. A reduced χ² of ten then means errors
+three times larger, and not a companion. Of a joint fit each file may be judged by itself:
+one with calibration errors of its own then does not spoil the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from amibayes.data.closure import closure_matrix
+from amibayes.data.covariance import (
+    Block,
+    BlockCovariance,
+    Covariance,
+    DiagonalCovariance,
+    as_blocks,
+    sparse_covariance,
+)
+from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
+from amibayes.data.observables import Observables, closure_sets
+from amibayes.likelihood.residuals import files_of
+from amibayes.units import FloatArray
+
+IntArray = NDArray[np.intp]
+
+
+UNLIKELY = 1e-3
+"""Probability of a χ² as large as that of a kind of observable, below which noise is added."""
+
+
+MAX_ROUNDS = 4
+
+
+SETTLED = 0.01
+"""Relative change of the extra noise at which search and noise agree."""
+
+
+@dataclass(frozen=True)
+class FileNoise:
+    """Standard deviations added to the V² and to the closure phases of one file."""
+
+    source: str
+    vis2: float = 0.0
+    closure_phase_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class ExtraNoise:
+    """Standard deviations added in quadrature.
+
+    Parameters
+    ----------
+    vis2 : float
+        To every V².
+    closure_phase_rad : float
+        To every closure phase.
+    files : tuple of FileNoise
+        What each file gets, where files are told apart; the two above are then the root mean
+        squares over all data.
+    """
+
+    vis2: float = 0.0
+    closure_phase_rad: float = 0.0
+    files: tuple[FileNoise, ...] = ()
+
+    @property
+    def any(self) -> bool:
+        """Whether there is any."""
+        return self.vis2 > 0.0 or self.closure_phase_rad > 0.0
+
+    def of(self, data: Observables) -> tuple[FloatArray, FloatArray]:
+        """Variance added to each unflagged V² (n_vis2,) and closure phase (n_closure,)."""
+        vis2 = np.full(data.n_vis2, self.vis2**2)
+        closure = np.full(data.n_closure_phases, self.closure_phase_rad**2)
+        if self.files:
+            own = {f.source: f for f in self.files}
+            for part in files_of(data):
+                vis2[part.vis2] = own[part.source].vis2 ** 2
+                closure[part.closure_phase] = own[part.source].closure_phase_rad ** 2
+        return vis2, closure
+
+
+def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
+    """Add extra noise to the covariance of unflagged observables.
+
+    Its size is taken as known: an estimated covariance then has more degrees of freedom.
+    """
+    if not extra.any:
+        return observables
+    data = observables.unflagged()
+    noisy = _with_noise(data, extra)
+    if data.freedom is None:
+        return noisy
+    stated, whole = sparse_covariance(data.covariance), sparse_covariance(noisy.covariance)
+    freedom = welch_satterthwaite([(squared_share(stated, noisy.covariance), data.freedom)])
+    scatter = None if data.scatter is None else csr_array(data.scatter + whole - stated)
+    return replace(noisy, freedom=freedom, scatter=scatter)
+
+
+def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
+    n_vis2, (vis2, closure) = data.n_vis2, extra.of(data)
+    diagonal = np.concatenate([vis2, np.zeros(len(closure))])
+    if isinstance(data.covariance, DiagonalCovariance):
+        diagonal[n_vis2:] = closure
+        return replace(data, covariance=DiagonalCovariance(data.covariance.variance + diagonal))
+    blocks = as_blocks(data.covariance)
+    matrices = [b.matrix + np.diag(diagonal[b.index]) for b in blocks]
+    home, place = _places(blocks, data.covariance.size)
+    for entries, shared in _shared_noise(data):
+        at, block = place[entries + n_vis2], home[entries + n_vis2]
+        # A covariance may hold triangles of one exposure apart (independent errors).
+        for number in np.unique(block):
+            own = np.flatnonzero(block == number)
+            noise = closure[entries[0]] * shared[np.ix_(own, own)]
+            matrices[number][np.ix_(at[own], at[own])] += noise
+    noisy: Covariance = BlockCovariance(
+        data.covariance.size,
+        [Block(b.index, m, b.basis) for b, m in zip(blocks, matrices, strict=True)],
+    )
+    return replace(data, covariance=noisy)
+
+
+def _places(blocks: list[Block], size: int) -> tuple[IntArray, IntArray]:
+    """The block each datum stands in, and where in it."""
+    home, place = np.empty(size, dtype=np.intp), np.empty(size, dtype=np.intp)
+    for number, block in enumerate(blocks):
+        home[block.index], place[block.index] = number, np.arange(len(block.index))
+    return home, place
+
+
+def _shared_noise(data: Observables) -> Iterator[tuple[IntArray, FloatArray]]:
+    """Covariance K Kᵀ/3 of closure phases whose baseline phases have variance 1/3 each."""
+    for entries in closure_sets(data.closure_phase):
+        matrix, _ = closure_matrix(data.closure_phase.stations[entries])
+        yield entries, matrix @ matrix.T / 3.0

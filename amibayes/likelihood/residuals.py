@@ -1,0 +1,44 @@
+"""The data of each file of a joint fit, and what the fit leaves of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.data.observables import BoolArray, Observables
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.units import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class FileData:
+    """Which of the unflagged data come from a file: masks of V², of closure phases."""
+
+    source: str
+    vis2: BoolArray
+    closure_phase: BoolArray
+
+    def of_kind(self, kind: str) -> BoolArray:
+        """Mask of all data, V² first, of ``vis2`` or ``cp`` of this file."""
+        vis2 = self.vis2 if kind == "vis2" else np.zeros_like(self.vis2)
+        closure = self.closure_phase if kind == "cp" else np.zeros_like(self.closure_phase)
+        return np.concatenate([vis2, closure])
+
+
+def files_of(observables: Observables) -> tuple[FileData, ...]:
+    """Files that unflagged observables come from, in the order of their names."""
+    data = observables.unflagged()
+    sources = np.array([s.source for s in data.setups])
+    vis2, closure = sources[data.vis2.setup], sources[data.closure_phase.setup]
+    names = sorted(set(vis2.tolist()) | set(closure.tolist()))
+    return tuple(FileData(name, vis2 == name, closure == name) for name in names)
+
+
+def residual(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Data less model, closure phases the short way round, (n_data,)."""
+    data = likelihood.observables
+    difference = data.data - likelihood.predict(np.atleast_2d(theta))[:, 0]
+    closure = difference[data.n_vis2 :]
+    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+    return np.asarray(difference)

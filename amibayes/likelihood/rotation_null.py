@@ -1,0 +1,85 @@
+"""What data with an estimated covariance could have been, were there no companion.
+
+Noise of N integrations looks the same after any rotation among the integrations (Langsrud
+2005): given T = S + d dᵀ, the scatter and the mean together, every split of T into a mean d
+and a scatter S is as likely as what its rotation says, whatever the true covariance is, and
+however wrong the expected noise that S was shrunk towards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.data.observables import Observables
+from amibayes.units import FloatArray, read_only
+
+NEGLIGIBLE = 1e-9
+"""Share of the largest variance of the scatter below which a direction was not measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class RotationNull:
+    """A scatter S = FFᵀ and the residuals beside it, in data whitened by the estimate.
+
+    Parameters
+    ----------
+    degrees : float
+        ν of the t distribution of the data: the estimate is (prior + S)/(ν − 2).
+    rows : float
+        Integrations: degrees of freedom of scatter and mean together.
+    factor : (n_data, k) float array
+        F.
+    residual : (n_data,) float array
+        Of the fit without a companion, nuisance directions taken out: it was noise too.
+    """
+
+    degrees: float
+    rows: float
+    factor: FloatArray
+    residual: FloatArray
+
+    def __post_init__(self) -> None:
+        read_only(self, "factor", "residual")
+
+    def draw(self, noise: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Means d of other rotations, (n_data, n); their scatter is S + residual² − ddᵀ.
+
+        Parameters
+        ----------
+        noise : (n_data, n) float array
+            Independent unit normals.
+        rng : numpy.random.Generator
+            For the directions that are no datum.
+        """
+        k = self.factor.shape[1]
+        normal, along = noise[:k], rng.standard_normal(noise.shape[1])
+        left = self.rows - k - 1.0
+        rest = rng.chisquare(left, noise.shape[1]) if left > 0.0 else 0.0
+        length = np.sqrt((normal**2).sum(axis=0) + along**2 + rest)
+        return np.asarray((self.factor @ normal + np.outer(self.residual, along)) / length)
+
+
+def rotation_null(data: Observables, residual: FloatArray) -> RotationNull | None:
+    """Lay out what an estimated covariance rests on; None where the covariance is known.
+
+    Parameters
+    ----------
+    data : Observables
+        Unflagged. Where its covariance by scatter alone is not known, the prior counts as
+        scatter: there are then as many integrations as the t distribution is worth.
+    residual : (n_data,) float array
+        Whitened, of the fit without a companion.
+    """
+    if data.freedom is None:
+        return None
+    degrees, p = data.freedom.degrees, len(residual)
+    if data.scatter is None:
+        return RotationNull(degrees, degrees + p, np.sqrt(degrees - 2.0) * np.eye(p), residual)
+    whitening = data.covariance.whitening
+    variance, axes = np.linalg.eigh((whitening @ data.scatter @ whitening.T).toarray())
+    measured = variance > NEGLIGIBLE * variance[-1]
+    factor = axes[:, measured] * np.sqrt(data.freedom.scatter * variance[measured])
+    rows = max(data.freedom.scatter, factor.shape[1]) + 1.0
+    return RotationNull(degrees, rows, factor, residual)

@@ -1,0 +1,253 @@
+"""Residuals with Student's t distribution: a few bad data must not make or hide a companion.
+
+Every datum has a residual z in units of its error and loses weight as (ν + 1)/(ν + z²), ν = 4
+(Lange, Little & Taylor 1989). Closure phases that share baselines are not independent; the
+residual of a datum is its own row of the symmetric whitening of the data (Kessy, Lewin &
+Strimmer 2018, ZCA-cor), which stands for that datum as closely as can be. A triangle keeps
+its name, and for ν → ∞ the sum of squares is χ² exactly. The likelihood is raised to the power
+at which normal residuals give intervals of the right size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+
+from amibayes.data.covariance import (
+    Block,
+    BlockCovariance,
+    Covariance,
+    DiagonalCovariance,
+    as_blocks,
+)
+from amibayes.data.observables import Observables
+from amibayes.units import FloatArray
+
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+DEGREES = 4.0
+"""Degrees of freedom ν of the residuals."""
+
+SCALE_ROUNDS = 30
+
+OUTLIER_WEIGHT = 0.25
+"""A datum that keeps less than this share of its weight is called an outlier (3.5σ)."""
+
+
+@dataclass(frozen=True)
+class NormalMoments:
+    """What the t distribution makes of normal residuals z of unit variance.
+
+    Parameters
+    ----------
+    curvature : float
+        Mean of ψ′, ψ(z) = z(ν + 1)/(ν + z²); also of zψ.
+    weight : float
+        Mean of the weight ψ/z.
+    power : float
+        The likelihood's power that makes curvature and scatter of its slope agree.
+    efficiency : float
+        Information that is left of that of a normal likelihood.
+    """
+
+    curvature: float
+    weight: float
+    power: float
+    efficiency: float
+
+
+@cache
+def normal_moments(degrees: float = DEGREES) -> NormalMoments:
+    """Integrate over the normal distribution."""
+    z, mass = np.polynomial.hermite_e.hermegauss(150)
+    mass = mass / mass.sum()
+    weight = (degrees + 1.0) / (degrees + z * z)
+    curvature, scatter = float(mass @ (weight * z * z)), float(mass @ (weight * z) ** 2)
+    return NormalMoments(
+        curvature, float(mass @ weight), curvature / scatter, curvature**2 / scatter
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetricWhitening:
+    """One direction in whitened space for every datum.
+
+    Parameters
+    ----------
+    rows : (n_data, rank) sparse array
+        Their sum of squares is that of the whitened data.
+    share : (n_data,) float array
+        Independent data that each stands for: squared length of its row.
+    vis2 : (n_data,) bool array
+        Which are squared visibilities.
+    """
+
+    rows: csr_array
+    share: FloatArray
+    vis2: BoolArray
+
+    @cached_property
+    def groups(self) -> tuple[BoolArray, ...]:
+        """Masks of the kinds of observable that there are."""
+        return tuple(m for m in (self.vis2, ~self.vis2) if m.any())
+
+    def residuals(self, white: FloatArray) -> FloatArray:
+        """Residual of every datum, in its own errors, of whitened data (rank, n)."""
+        return np.asarray((self.rows @ white) / np.sqrt(self.share)[:, None])
+
+    def gather(self, standard: FloatArray) -> FloatArray:
+        """Whitened data (rank, n) of which `residuals` are the residuals of the data."""
+        return np.asarray(self.rows.T @ (standard * np.sqrt(self.share)[:, None]))
+
+
+def symmetric_whitening(observables: Observables) -> SymmetricWhitening:
+    """Make the directions of unflagged data."""
+    covariance = observables.covariance
+    vis2 = np.arange(covariance.size) < observables.n_vis2
+    if isinstance(covariance, DiagonalCovariance):
+        return SymmetricWhitening(
+            csr_array(eye_array(covariance.size)), np.ones(covariance.size), vis2
+        )
+    white = covariance.whitening
+    parts = [_symmetric(white, b) for b in as_blocks(covariance)]
+    rows = np.concatenate([np.repeat(b, len(w)) for b, w, _ in parts])
+    columns = np.concatenate([np.tile(w, len(b)) for b, w, _ in parts])
+    values = np.concatenate([q.ravel() for _, _, q in parts])
+    frame = csr_array((values, (rows, columns)), shape=(covariance.size, covariance.rank))
+    return SymmetricWhitening(frame, np.asarray((frame**2).sum(axis=1)).ravel(), vis2)
+
+
+def _symmetric(whitening: csr_array, block: Block) -> tuple[IntArray, IntArray, FloatArray]:
+    """Data, whitened rows, and Q = A (AᵀA)^{-1/2} of a block, A the standardised colouring."""
+    part = whitening[:, block.index]
+    used = np.flatnonzero(np.diff(part.indptr))
+    colour = block.matrix @ part[used].toarray().T
+    standard = colour / np.sqrt(np.diag(block.matrix))[:, None]
+    left, _, right = np.linalg.svd(standard, full_matrices=False)
+    return block.index, used, left @ right
+
+
+def weights_of(standard: FloatArray) -> FloatArray:
+    """Share of its weight that a datum of residual z keeps: 1 at z = 0, any shape."""
+    return np.asarray(DEGREES / (DEGREES + standard**2))
+
+
+def scales(frame: SymmetricWhitening, standard: FloatArray, n_fitted: float = 0.0) -> FloatArray:
+    """Robust scale of residuals (n_data, n), common to all data, (n,).
+
+    Solves Σ h zψ(z) = n E[zψ], which normal residuals of unit variance fulfil at 1, from the
+    median of |z|.
+    """
+    moments = normal_moments()
+    left = frame.share.sum() - n_fitted
+    scale = np.maximum(1.4826 * np.median(np.abs(standard), axis=0), 1e-12)
+    full = (DEGREES + 1.0) / DEGREES
+    for _ in range(SCALE_ROUNDS):
+        z = standard / scale
+        mean = full * (frame.share @ (weights_of(z) * z * z)) / left
+        scale = scale * np.sqrt(np.maximum(mean / moments.curvature, 1e-12))
+    return np.asarray(scale)
+
+
+def scores(frame: SymmetricWhitening, white: FloatArray) -> FloatArray:
+    """Whitened data (rank, n) whose residuals are bounded: what a robust search looks at.
+
+    The slope of the t likelihood of the fit without a companion, by the data; its products
+    with the templates are Rao's score statistics. Divided by the scale of each data set.
+    """
+    standard = frame.residuals(white)
+    standard = standard / scales(frame, standard)
+    return frame.gather(weights_of(standard) * standard)
+
+
+def reweighted(observables: Observables, stretch: FloatArray) -> Observables:
+    """Unflagged data whose errors (n_data,) are stretched, correlations as they are."""
+    data = observables.unflagged()
+    covariance: Covariance
+    if isinstance(data.covariance, DiagonalCovariance):
+        covariance = DiagonalCovariance(data.covariance.variance * stretch**2)
+    else:
+        covariance = BlockCovariance(
+            data.covariance.size,
+            [
+                Block(b.index, b.matrix * np.outer(stretch[b.index], stretch[b.index]), b.basis)
+                for b in as_blocks(data.covariance)
+            ],
+        )
+    return replace(data, covariance=covariance)
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A datum that lost most of its weight.
+
+    Parameters
+    ----------
+    kind : {"vis2", "closure_phase"}
+    stations : tuple of str
+    wavelength_m, mjd : float
+    source : str
+        Its file.
+    weight : float
+        Share of its weight that it keeps.
+    residual : float
+        Data minus model, in its own (fitted) errors.
+    """
+
+    kind: str
+    stations: tuple[str, ...]
+    wavelength_m: float
+    mjd: float
+    source: str
+    weight: float
+    residual: float
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """How Student's t distribution treated the data of a search.
+
+    Parameters
+    ----------
+    base : Observables
+        The data with their errors stretched by the fitted scale of each kind, and no weights.
+    stated : Observables
+        The data with the stated errors.
+    weights : (n_data,) float array
+        Share of its weight that every datum keeps.
+    residuals : (n_data,) float array
+        In the errors of ``base``.
+    """
+
+    base: Observables
+    stated: Observables
+    weights: FloatArray
+    residuals: FloatArray
+
+    @property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Data that lost most of their weight, worst first."""
+        data, n = self.stated, self.stated.n_vis2
+        worst = np.argsort(self.weights, kind="stable")
+        found = []
+        for i in worst[self.weights[worst] < OUTLIER_WEIGHT]:
+            kind, table = ("vis2", data.vis2) if i < n else ("closure_phase", data.closure_phase)
+            k = int(i if i < n else i - n)
+            setup = data.setups[table.setup[k]]
+            found.append(
+                Outlier(
+                    kind,
+                    tuple(setup.stations[s] for s in table.stations[k]),
+                    float(table.wavelength_m[k]),
+                    float(table.mjd[k]),
+                    setup.source,
+                    float(self.weights[i]),
+                    float(self.residuals[i]),
+                )
+            )
+        return tuple(found)

@@ -1,0 +1,1 @@
+"""Contrasts at which a companion would have been found."""

@@ -1,0 +1,1 @@
+"""Source models: what the sky may be, and its parameters."""

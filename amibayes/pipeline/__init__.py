@@ -1,0 +1,1 @@
+"""From files to the statement: prepare, search, limits, posterior."""

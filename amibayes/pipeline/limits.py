@@ -1,0 +1,281 @@
+"""The job of `amibayes limits`: what a target's data would have shown, and with what chance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from amibayes.calibration import Calibration
+from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Observables
+from amibayes.detection.false_alarm import Significance
+from amibayes.errors import DataError, UsageError
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.limits.analytic import AnalyticLimit, AnalyticMethod, analytic_limit
+from amibayes.limits.completeness import DetectionLimit, detection_limit
+from amibayes.limits.mass_table import MassTable
+from amibayes.limits.rings import N_SEPARATIONS
+from amibayes.parallel import Executor, Journals, Progress
+from amibayes.pipeline.false_alarm import weigh
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.prepare import Clock, Prepared, Stage, prepare
+from amibayes.pipeline.search import search_field
+from amibayes.pipeline.warnings import search_cautions
+
+Kinds = tuple[str, ...]
+
+Method = Literal["injection"] | AnalyticMethod
+
+KINDS: tuple[Kinds, ...] = (("vis2", "cp"), ("vis2",), ("cp",))
+"""What limits are drawn for, if nothing else is asked: all data, and each kind by itself."""
+
+NAMES: dict[Kinds, str] = {("vis2", "cp"): "V² + CP", ("vis2",): "V²", ("cp",): "CP"}
+"""Choices of observables, for readers."""
+
+NULL_DRAWS = 100_000
+"""The threshold of α = 0.0013 is then known to a tenth of α."""
+
+TRIALS_PER_CELL = 240
+
+
+@dataclass(frozen=True)
+class LimitsOptions:
+    """What is asked of `measure_limits`.
+
+    Parameters
+    ----------
+    search : SearchOptions
+        How the data are read and searched; null draws, α and seed.
+    method : {"injection", "absil", "candid", "posterior", "closure-phase"}
+    observables : tuple of {"vis2", "cp"}, optional
+        One limit from these; by default one from all data and one from each kind.
+    n_separations : int
+        Rings from the inner to the outer edge of the field.
+    trials_per_cell : int
+        Injections per separation and contrast, on average.
+    masses : MassTable, optional
+        For an axis of masses.
+    """
+
+    search: SearchOptions = field(default_factory=lambda: SearchOptions(null_draws=NULL_DRAWS))
+    method: Method = "injection"
+    observables: Kinds | None = None
+    n_separations: int = N_SEPARATIONS
+    trials_per_cell: int = TRIALS_PER_CELL
+    masses: MassTable | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredLimit:
+    """The limit from one choice of observables.
+
+    Parameters
+    ----------
+    observables : tuple of {"vis2", "cp"}
+    result : SearchResult
+        Of the search whose limit it is.
+    noise : ExtraNoise
+    significance : Significance or None
+    limit : DetectionLimit or AnalyticLimit
+    """
+
+    observables: Kinds
+    result: SearchResult
+    noise: ExtraNoise
+    significance: Significance | None
+    limit: DetectionLimit | AnalyticLimit
+
+
+@dataclass(frozen=True, eq=False)
+class LimitsReport:
+    """Everything `measure_limits` found; the first of ``limits`` is the main one."""
+
+    options: LimitsOptions
+    targets: tuple[str, ...]
+    calibrators: tuple[str, ...]
+    observables: Observables
+    calibration: Calibration | None
+    limits: tuple[MeasuredLimit, ...]
+    warnings: tuple[str, ...]
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def main(self) -> MeasuredLimit:
+        """The limit from all the observables that were asked for."""
+        return self.limits[0]
+
+
+@dataclass(frozen=True)
+class _Where:
+    """Where the work is done, and who is told."""
+
+    executor: Executor | None
+    journals: Journals | None
+    progress: Progress | None
+    clock: Clock
+
+
+def measure_limits(
+    targets: Sequence[str | Path],
+    calibrators: Sequence[str | Path] = (),
+    options: LimitsOptions | None = None,
+    *,
+    journals: Journals | None = None,
+    announce: Stage = lambda name: None,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+) -> LimitsReport:
+    """Measure what companions the data would have shown.
+
+    Parameters
+    ----------
+    targets, calibrators : sequence of path
+        OIFITS files or image cubes, as for `amibayes.search_companion`.
+    options : LimitsOptions, optional
+    journals : Journals, optional
+        Keep finished pieces, so that a run that was cut off goes on.
+    announce, progress, executor : optional
+        As for `amibayes.search_companion`.
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be read or the data cannot carry the fit.
+    UsageError
+        Where the request makes no sense.
+    """
+    options = options or LimitsOptions()
+    _refuse(options)
+    seeds = np.random.SeedSequence(options.search.seed).spawn(5 + len(KINDS))
+    where = _Where(executor, journals, progress, Clock(announce))
+    # One BLAS thread: the same bits on every machine and for any number of workers.
+    with threadpool_limits(1):
+        # The fourth stream, as in the main job: the same calibration for the same seed.
+        rng = np.random.default_rng(seeds[3])
+        ready = prepare(targets, calibrators, options.search, rng, where.clock)
+        limits, cautions = _all_limits(ready, options, seeds[5:], where)
+    return LimitsReport(
+        options,
+        tuple(str(p) for p in targets),
+        tuple(str(p) for p in calibrators),
+        ready.observables,
+        ready.calibration,
+        limits,
+        (*ready.cautions, *cautions),
+        where.clock.seconds,
+    )
+
+
+def _refuse(options: LimitsOptions) -> None:
+    if options.method == "injection" and options.search.null_draws < 1.0 / options.search.alpha:
+        raise UsageError(
+            f"{options.search.null_draws} null draws cannot tell a false-alarm probability of "
+            f"{options.search.alpha:g}",
+            source="--null-draws",
+            remedy=f"give {round(10.0 / options.search.alpha)} or more, or another --method",
+        )
+    if options.method == "closure-phase" and options.observables not in (None, ("cp",)):
+        raise UsageError("uses closure phases alone", source="--method closure-phase")
+
+
+def _all_limits(
+    ready: Prepared,
+    options: LimitsOptions,
+    seeds: Sequence[np.random.SeedSequence],
+    where: _Where,
+) -> tuple[tuple[MeasuredLimit, ...], list[str]]:
+    """Measure the main limit, then the others over the field and with the disc of the main one."""
+    limits: list[MeasuredLimit] = []
+    said: list[str] = []
+    for kinds, seed in zip(_kinds(ready.observables, options), seeds, strict=False):
+        search = replace(options.search, observables=kinds)
+        if limits:
+            search = _alike(search, limits[0].result)
+        try:
+            limit, cautions = _one_limit(ready.observables, search, options, seed, where)
+        except DataError as error:
+            if not limits:
+                raise
+            said.append(f"no limit from {' + '.join(kinds)} alone: {error.what}")
+            continue
+        limits.append(limit)
+        said += cautions if len(limits) == 1 else []
+    return tuple(limits), said
+
+
+def _kinds(data: Observables, options: LimitsOptions) -> list[Kinds]:
+    """List the choices of observables, the main one first."""
+    if options.observables is not None:
+        return [options.observables]
+    if options.method == "closure-phase":
+        return [("cp",)]
+    present = {"vis2": data.n_vis2 > 0, "cp": data.n_closure_phases > 0}
+    if all(present.values()):
+        return list(KINDS)
+    return [tuple(kind for kind, there in present.items() if there) or KINDS[0]]
+
+
+def _alike(search: SearchOptions, main: SearchResult) -> SearchOptions:
+    """Keep to the main limit's field; what one kind of data cannot fit is held at its value."""
+    search = replace(search, separation_mas=(main.grid.inner_mas, main.grid.outer_mas))
+    if "vis2" in search.observables:
+        return search
+    return replace(
+        search, diameter=main.nuisance("diameter_mas"), background=main.nuisance("background")
+    )
+
+
+def _one_limit(
+    data: Observables,
+    search: SearchOptions,
+    options: LimitsOptions,
+    seed: np.random.SeedSequence,
+    where: _Where,
+) -> tuple[MeasuredLimit, list[str]]:
+    name = NAMES[search.observables]
+    journals = where.journals.under("-".join(search.observables)) if where.journals else None
+    streams = [np.random.default_rng(k) for k in seed.spawn(2)]
+    with where.clock.stage(f"search {name}"):
+        result, noise, widened = search_field(data, search)
+    weight = None
+    if search.null_draws:
+        with where.clock.stage(f"null searches {name}"):
+            journal = journals.of("null") if journals else None
+            weight = weigh(
+                result, search, streams[0], where.executor, where.progress, journal=journal
+            )
+    with where.clock.stage(f"limits {name}"):
+        limit = _limit(result, weight, options, streams[1], journals, where)
+    measured = MeasuredLimit(search.observables, result, noise, weight, limit)
+    return measured, [*widened, *search_cautions(data, result, noise, weight, None)]
+
+
+def _limit(
+    result: SearchResult,
+    weight: Significance | None,
+    options: LimitsOptions,
+    rng: np.random.Generator,
+    journals: Journals | None,
+    where: _Where,
+) -> DetectionLimit | AnalyticLimit:
+    if options.method != "injection":
+        remove = weight is not None and bool(weight.detected)
+        return analytic_limit(
+            result, options.method, n_separations=options.n_separations, remove=remove
+        )
+    assert weight is not None
+    return detection_limit(
+        result,
+        weight,
+        rng,
+        n_separations=options.n_separations,
+        trials_per_cell=options.trials_per_cell,
+        executor=where.executor,
+        progress=where.progress,
+        journals=journals,
+    )

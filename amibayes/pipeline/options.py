@@ -1,0 +1,104 @@
+"""The main job's request and its answer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from amibayes.calibration import Method
+from amibayes.detection.false_alarm import ALPHA
+from amibayes.extraction.reading import ImageOptions
+from amibayes.likelihood.joint import ContrastKind
+from amibayes.posterior.evidence import Method as EvidenceMethod
+from amibayes.posterior.priors import PriorSetting
+from amibayes.support.quantities import takes_quantities
+
+
+@takes_quantities
+@dataclass(frozen=True)
+class SearchOptions:
+    """What the main job is asked to do.
+
+    Parameters
+    ----------
+    separation_mas : (inner, outer), optional
+        By default λ/2B_max to λ/B_min of the data.
+    observables : tuple of {"vis2", "cp"}
+    diameter : float, "free" or None
+        Uniform-disc diameter of the primary, mas. None: free where the longest baseline
+        would notice a disc of 0.3 mas and V² is used, else 0.
+    background : float or "free"
+        Over-resolved flux in units of the primary's.
+    smearing : bool
+    closure_covariance : {"assumed", "diagonal"}
+        For files that give errors and no correlations.
+    calibration : {"hierarchical", "weighted"}, optional
+        By default hierarchical where 3 calibrators or more share a baseline.
+    clip : float
+        Sigma clipping of the calibrators.
+    keep_all : bool
+        Use all calibrators, whatever vetting would say of them.
+    insname, target : str, optional
+        One instrument, one target of a file that holds several.
+    null_draws : int
+        0 leaves the false-alarm probability out.
+    alpha : float
+        False-alarm probability of a detection.
+    contrast : {"tied", "per-filter"}, optional
+        One contrast for all bands, or one for each: the default with several bands.
+    motion : bool
+        The companion moves linearly between the dates of the data.
+    fastest_mas_yr : float, optional
+        Largest rate of a motion along east and along north; by default λ/B_max over the span.
+    extra_noise : bool
+        Add noise per kind of observable where the residuals ask for it.
+    robust : bool
+        Student-t residuals: data that fit nothing lose their weight.
+    file_noise : bool, optional
+        Judge that noise for every file by itself; by default where there are several.
+    posterior, limits : bool
+        Whether to sample the posterior, and to measure detection limits (which need the
+        null draws).
+    companions : tuple of int, optional
+        Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
+        where the posterior is sampled.
+    evidence_method : {"direct", "laplace", "nested"}
+        See `amibayes.posterior.evidence`.
+    prior : tuple of PriorSetting
+        Changes of the default prior.
+    seed : int
+    images : ImageOptions, optional
+        How image cubes are turned into observables.
+    """
+
+    separation_mas: tuple[float, float] | None = None
+    observables: tuple[str, ...] = ("vis2", "cp")
+    diameter: float | Literal["free"] | None = None
+    background: float | Literal["free"] = 0.0
+    smearing: bool = True
+    closure_covariance: Literal["assumed", "diagonal"] = "assumed"
+    calibration: Method | None = None
+    clip: float = 3.0
+    keep_all: bool = False
+    insname: str | None = None
+    target: str | None = None
+    null_draws: int = 10_000
+    alpha: float = ALPHA
+    contrast: ContrastKind | None = None
+    motion: bool = False
+    fastest_mas_yr: float | None = None
+    extra_noise: bool = True
+    robust: bool = False
+    file_noise: bool | None = None
+    posterior: bool = True
+    limits: bool = True
+    companions: tuple[int, ...] | None = None
+    evidence_method: EvidenceMethod = "direct"
+    prior: tuple[PriorSetting, ...] = ()
+    seed: int = 1
+    images: ImageOptions | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """All of them in JSON's types, as ``result.json`` keeps them."""
+        return dict(json.loads(json.dumps(asdict(self), default=str)))

@@ -1,0 +1,156 @@
+"""From files to one calibrated table: read, vet the calibrators, calibrate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from amibayes.calibration import Calibration, calibrate
+from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
+from amibayes.data.observables import Observables, join
+from amibayes.errors import DataError, UsageError
+from amibayes.extraction.reading import read_observations
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.vetting import Vetting, vet
+from amibayes.pipeline.warnings import calibration_cautions, vetting_cautions
+
+Stage = Callable[[str], None]
+
+MIN_TO_VET = 3
+"""Of two calibrators that disagree nothing says which is the bad one."""
+
+VETTING_DRAWS = 1000
+
+
+class Clock:
+    """Times the stages and announces them."""
+
+    def __init__(self, announce: Stage) -> None:
+        self.seconds: dict[str, float] = {}
+        self._announce = announce
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Announce a stage and time it."""
+        self._announce(name)
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Calibrated observables, and what was done to get them.
+
+    Parameters
+    ----------
+    observables : Observables
+        All targets together.
+    references : tuple of Observables
+        Each calibrator as read.
+    calibration : Calibration, optional
+    vetting : Vetting, optional
+    cautions : tuple of str
+    """
+
+    observables: Observables
+    references: tuple[Observables, ...] = ()
+    calibration: Calibration | None = None
+    vetting: Vetting | None = None
+    cautions: tuple[str, ...] = ()
+
+
+def prepare(
+    targets: Sequence[str | Path],
+    calibrators: Sequence[str | Path],
+    options: SearchOptions,
+    rng: np.random.Generator,
+    clock: Clock,
+) -> Prepared:
+    """Read every file, vet the calibrators and calibrate all targets together.
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be read or vetting leaves no calibrator.
+    UsageError
+        Where no target is given, or one of them twice under two names.
+    """
+    if not targets:
+        raise UsageError("no target given", remedy="name at least one file")
+    with clock.stage("read"):
+        parts = [read(path, options) for path in targets]
+        references = [read(path, options) for path in calibrators]
+    parts = in_order(parts)
+    joined = (
+        *refuse_twice(parts),
+        *unused(parts, options.observables),
+        *different_targets(parts),
+    )
+    vetting, calibration, observables = _calibrated(parts, references, options, rng, clock)
+    cautions = (*vetting_cautions(vetting), *calibration_cautions(calibration), *joined)
+    return Prepared(observables, tuple(references), calibration, vetting, cautions)
+
+
+def read(path: str | Path, options: SearchOptions) -> Observables:
+    """Read one file, OIFITS or image cube, as the options say."""
+    return read_observations(
+        path,
+        options.images,
+        insname=options.insname,
+        target=options.target,
+        closure_covariance=options.closure_covariance,
+    )
+
+
+def _calibrated(
+    parts: list[Observables],
+    references: list[Observables],
+    options: SearchOptions,
+    rng: np.random.Generator,
+    clock: Clock,
+) -> tuple[Vetting | None, Calibration | None, Observables]:
+    """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
+    if not references:
+        return None, None, join(parts)
+    vetting, believed = None, references
+    if len(references) >= MIN_TO_VET and not options.keep_all:
+        with clock.stage("vet"):
+            vetting = vet(
+                references,
+                separation_mas=options.separation_mas,
+                null_draws=VETTING_DRAWS,
+                limits=False,
+                fewest=MIN_TO_VET,
+                seed=options.seed,
+            )
+            believed = _believed(references, vetting)
+    with clock.stage("calibrate"):
+        calibration = calibrate(
+            parts, believed, method=options.calibration, clip=options.clip, rng=rng
+        )
+    return vetting, calibration, calibration.observables
+
+
+def _believed(references: list[Observables], vetting: Vetting) -> list[Observables]:
+    """The calibrators that vetting kept.
+
+    Raises
+    ------
+    DataError
+        Where it kept none.
+    """
+    kept = [r for r, v in zip(references, vetting.calibrators, strict=True) if v.kept]
+    if not kept:
+        raise DataError(
+            f"no calibrator is left: {vetting.calibrators[0].path} "
+            f"{vetting.calibrators[0].reason}, and so on",
+            source="--cal",
+            remedy="give other calibrators, or --keep-all",
+        )
+    return kept

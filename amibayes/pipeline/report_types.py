@@ -1,0 +1,64 @@
+"""What a search reports, stage by stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from amibayes.calibration import Calibration
+from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Observables
+from amibayes.detection.false_alarm import Significance
+from amibayes.likelihood.averaged_noise import NoisePosterior
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.limits.completeness import DetectionLimit
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.vetting import Vetting
+from amibayes.posterior.ensemble import Posterior
+from amibayes.posterior.evidence import Evidence
+from amibayes.posterior.grid import GridPosterior
+
+
+@dataclass(frozen=True, eq=False)
+class SearchReport:
+    """Everything the main job found, for `amibayes.report` and `amibayes.plots`."""
+
+    options: SearchOptions
+    targets: tuple[str, ...]
+    calibrators: tuple[str, ...]
+    observables: Observables
+    calibration: Calibration | None
+    references: tuple[Observables, ...]
+    vetting: Vetting | None
+    result: SearchResult
+    noise: ExtraNoise
+    significance: Significance | None
+    posterior: Posterior | None
+    limits: DetectionLimit | None
+    warnings: tuple[str, ...]
+    grid: GridPosterior | None = None
+    evidence: Evidence | None = None
+    noise_posterior: dict[str, NoisePosterior] | None = None
+    second_significance: Significance | None = None
+    timing_s: dict[str, float] = field(default_factory=dict)
+
+
+def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
+    """Every calibrator in the order given: vetting's verdict, then what calibration used."""
+    if report.calibration is None:
+        return []
+    used = iter(report.calibration.calibrators)
+    verdicts = None if report.vetting is None else report.vetting.calibrators
+    out: list[dict[str, object]] = []
+    for k, path in enumerate(report.calibrators):
+        vetted = None if verdicts is None else verdicts[k]
+        judged = vetted if vetted is not None and not vetted.kept else next(used)
+        agreement = None if vetted is None else vetted.agreement
+        out.append(
+            {
+                "path": path,
+                "kept": judged.kept,
+                "reason": judged.reason,
+                "agreement_probability": agreement,
+            }
+        )
+    return out

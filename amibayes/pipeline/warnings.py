@@ -1,0 +1,218 @@
+"""What the reader of a result has to be warned of."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from amibayes.calibration import Calibration
+from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Observables
+from amibayes.detection.false_alarm import Significance
+from amibayes.detection.whiteness import channel_correlation
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.pipeline.vetting import Vetting, doubts
+from amibayes.posterior.ensemble import Posterior, modes_to_sample
+from amibayes.posterior.grid import integrable
+from amibayes.posterior.priors import Prior
+
+NOTABLE, SURE = 0.2, 5.0
+"""Correlation between channels that is worth a warning, and its size in chance errors."""
+
+MAX_NAMED = 3
+"""Outliers that a warning names."""
+
+ENOUGH, DOMINANT = 3.0, 0.5
+"""Integrations per datum, or else share of the expected noise, that make a covariance good."""
+
+BRIGHT = 0.03
+"""Contrast above which the square of a companion's light counts."""
+
+FAR_TOO_SMALL = 1e-6
+"""Probability of a χ² as small, below which the errors are far too large."""
+
+
+def calibration_cautions(calibration: Calibration | None) -> list[str]:
+    """Say what a single calibrator cannot tell."""
+    used = [] if calibration is None else [c for c in calibration.calibrators if c.n_used]
+    if len(used) != 1:
+        return []
+    return [
+        "one calibrator says nothing of how well it calibrates: the errors hold the noise of both "
+        "stars, but not what else differs between them (pointing on the flat field, drift, air); "
+        "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators what "
+        "they say"
+    ]
+
+
+def vetting_cautions(vetting: Vetting | None) -> list[str]:
+    """Name the calibrators that vetting dropped, and what it doubts of the kept ones."""
+    if vetting is None:
+        return []
+    dropped = [
+        f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
+    ]
+    return dropped + [
+        f"calibrator {v.path} {doubt}"
+        for v in vetting.calibrators
+        for doubt in doubts(v, vetting.alpha)
+    ]
+
+
+def _outliers(result: SearchResult) -> list[str]:
+    """Name the data that a robust search hardly used."""
+    if result.robustness is None or not (outliers := result.robustness.outliers):
+        return []
+    kinds = {"vis2": "V2", "closure_phase": "closure phase"}
+    names = [
+        f"{kinds[o.kind]} {'-'.join(o.stations)} at {o.wavelength_m * 1e6:.3g} um, MJD {o.mjd:.4f} "
+        f"({o.residual:+.1f} sigma, weight {o.weight:.2f})"
+        for o in outliers[:MAX_NAMED]
+    ]
+    more = f" and {len(outliers) - MAX_NAMED} more" if len(outliers) > MAX_NAMED else ""
+    return [
+        f"{len(outliers)} of {len(result.robustness.weights)} data are outliers that lost more "
+        f"than three quarters of their weight: {', '.join(names)}{more}"
+    ]
+
+
+def _of_covariance(result: SearchResult) -> list[str]:
+    """Say where too few integrations tell the covariance, and no expectation helps."""
+    freedom, p = result.likelihood.observables.freedom, result.likelihood.n_independent
+    if freedom is None or freedom.scatter + 1.0 >= ENOUGH * p:
+        return []
+    if freedom.scatter_share <= 1.0 - DOMINANT:
+        return []
+    return [
+        f"the covariance of {p} independent data rests on the scatter of about "
+        f"{freedom.scatter + 1.0:.0f} integrations (N/p = {(freedom.scatter + 1.0) / p:.1f}), "
+        "which the expected noise does not describe: errors are approximate"
+    ]
+
+
+def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
+    """Say where the errors are so large that CANDID's nσ has lost its meaning."""
+    if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
+        return []
+    which = "the errors, with the noise that was added," if noise.any else "the stated errors"
+    return [
+        f"{which} are far too large: chi2 is {result.chi2_binary:.2g} for {result.ndof} degrees "
+        "of freedom with the companion; CANDID's n_sigma, a ratio of two such chi2, means nothing"
+    ]
+
+
+def _of_bright(result: SearchResult) -> list[str]:
+    """Say where the response of an extraction is known to first order only."""
+    responses = [s.response for s in result.likelihood.observables.setups]
+    if result.companion.contrast < BRIGHT or all(r is None or r.single for r in responses):
+        return []
+    return [
+        "these images were measured with several samples to a baseline, whose response to light "
+        f"off the axis is known to first order in the contrast: above {BRIGHT:g} it comes out up "
+        "to some percent wrong; extract them with fringes, matched or unique"
+    ]
+
+
+def _noise_caution(noise: ExtraNoise) -> str:
+    each = [f for f in noise.files if f.vis2 > 0.0 or f.closure_phase_rad > 0.0]
+    if each:
+        added = ", ".join(f"{_amount(f.vis2, f.closure_phase_rad)} to {f.source}" for f in each)
+    else:
+        added = _amount(noise.vis2, noise.closure_phase_rad)
+    return (
+        f"the stated errors do not explain the residuals: noise of {added} was added in "
+        "quadrature; chi2 and errors include it"
+    )
+
+
+def _amount(vis2: float, closure_phase_rad: float) -> str:
+    parts = [f"{vis2:.2g} in V2"] * (vis2 > 0.0)
+    parts += [f"{np.degrees(closure_phase_rad):.2g} deg in closure phase"] * (closure_phase_rad > 0)
+    return " and ".join(parts)
+
+
+def _of_prior(result: SearchResult, prior: Prior) -> list[str]:
+    """Say where the prior leaves the best fit out."""
+    c = result.companion.contrast
+    if prior.contrast_min <= c <= prior.contrast_max:
+        return []
+    return [
+        f"the best fit's contrast of {c:.3g} lies outside the prior, {prior.contrast_min:.3g} to "
+        f"{prior.contrast_max:.3g}: posterior and evidence are of other companions"
+    ]
+
+
+def _joint_cautions(result: SearchResult) -> list[str]:
+    """Say what free contrasts and motion take away, and where the rate is no measurement."""
+    model = result.likelihood.model
+    if integrable(result.likelihood):
+        return []
+    free = [f"{model.n_contrasts} contrasts"] * (model.n_contrasts > 1) + ["motion"] * model.moves
+    found = [
+        f"with {' and '.join(free)} the posterior is not integrated directly: modes are weighed by "
+        "Laplace's approximation, one companion's evidence by importance sampling; limits are of "
+        "one contrast in every band, at rest"
+    ]
+    rates = result.theta[model.rate_columns]
+    if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
+        found.append(
+            f"the rate stands at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
+            "raise --fastest"
+        )
+    return found
+
+
+def _correlated(result: SearchResult) -> list[str]:
+    """Say where channels err together: errors alone count them as independent."""
+    correlation, n_pairs = channel_correlation(result)
+    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
+        return []
+    return [
+        f"residuals of neighbouring channels are correlated by {correlation:.2f}, which the "
+        "covariance does not have: the false-alarm probabilities, of a second companion above "
+        "all, and the errors of the fit are smaller than they ought to be"
+    ]
+
+
+def search_cautions(
+    observables: Observables,
+    result: SearchResult,
+    noise: ExtraNoise,
+    weight: Significance | None,
+    posterior: Posterior | None,
+) -> tuple[str, ...]:
+    """Say what makes the numbers of a search less than they seem."""
+    found = [*result.warnings, *observables.notes, *_joint_cautions(result)]
+    found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
+    if noise.any:
+        found.append(_noise_caution(noise))
+    elif result.chi2_binary / result.ndof > 2.0:
+        found.append(
+            f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "
+            "errors are too small or the model is incomplete, and significance and errors are "
+            "too optimistic"
+        )
+    if weight is not None and weight.detected is None:
+        found.append(
+            f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
+            f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
+        )
+    found += _outliers(result)
+    found += _correlated(result)
+    excluded = [] if posterior is None else _of_prior(result, posterior.prior)
+    found += excluded
+    if posterior is not None and not excluded and len(posterior.mode_probability) > 1:
+        share = posterior.mode_probability[0]
+        if share < 0.99 and len(modes_to_sample(result)) == 1:
+            found.append(
+                f"the posterior is that of the reported position, whose probability among "
+                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
+            )
+    if posterior is not None and not posterior.converged:
+        exact = "; posterior.integrated in result.json does not rest on the chain"
+        found.append(
+            f"the posterior has NOT converged: {posterior.n_steps} steps, autocorrelation time "
+            f"{posterior.autocorrelation_time:.0f}, split R-hat {posterior.split_rhat:.3f}"
+            + (exact if posterior.mode_method == "grid" else "")
+        )
+    return tuple(found)

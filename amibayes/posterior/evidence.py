@@ -1,0 +1,359 @@
+"""The evidence for 0, 1 and 2 companions under stated priors, by independent methods.
+
+- quadrature: no companion; only nuisance parameters are integrated.
+- grid: one companion, by `grid_posterior`.
+- importance: draws from the modes' Gaussians with heavy tails, from the modes beside the
+  prior, and from the prior itself, weighted; unbiased, with its own error.
+- laplace: a Gaussian at every mode; right for strong companions only.
+- nested: nested sampling with dynesty.
+
+Companions are alike: each has the same prior, and a solution counts in both orders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.special import gammaln, logsumexp
+
+from amibayes.companion_search.result import Mode, SearchResult
+from amibayes.companion_search.second_companion import TwoCompanions
+from amibayes.errors import UsageError
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.components import IntArray
+from amibayes.posterior.grid import GridPosterior
+from amibayes.posterior.integrand import log_evidence_none
+from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
+from amibayes.posterior.priors import Prior
+from amibayes.units import FloatArray
+
+Method = Literal["direct", "laplace", "nested"]
+
+MODEL_VALUES = 4e6
+"""Model values (samples × parameter sets) of an importance sum."""
+
+MIN_DRAWS, MAX_DRAWS = 10_000, 200_000
+
+TAILS = 5.0
+"""Degrees of freedom of the t distributions that are drawn from."""
+
+DEFENSIVE = 0.2
+"""Share of the draws that comes from the prior."""
+
+GRID_ERROR = 0.005
+"""Largest error of ln Z by grid and quadrature."""
+
+HALO_BACKGROUND = 1.0
+"""Largest over-resolved flux of the alternative, in units of the primary's; uniform from 0."""
+
+LIVE_POINTS = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidences of models and what they make of prior odds.
+
+    Parameters
+    ----------
+    companions : tuple of int
+    log_z, log_z_error : tuple of float
+        Logarithm of each evidence and its error (NaN where the method has none).
+    method : tuple of str
+    prior : Prior
+        Of every companion and of the nuisance parameters.
+    model_prior : tuple of float
+        Prior probability of each number of companions.
+    halo_log_z : float
+        Of over-resolved light instead of a companion; NaN where the light is in every model.
+    two : TwoCompanions or None
+        The joint fit, where two were asked for.
+    nuisance_names : tuple of str
+    """
+
+    companions: tuple[int, ...]
+    log_z: tuple[float, ...]
+    log_z_error: tuple[float, ...]
+    method: tuple[str, ...]
+    prior: Prior
+    model_prior: tuple[float, ...]
+    halo_log_z: float = float("nan")
+    two: TwoCompanions | None = None
+    nuisance_names: tuple[str, ...] = ()
+
+    @property
+    def probability(self) -> FloatArray:
+        """Posterior probability of each number of companions, (n,)."""
+        log = np.array(self.log_z) + np.log(self.model_prior)
+        return np.asarray(np.exp(log - logsumexp(log)))
+
+    def log_odds(self, more: int, fewer: int) -> float:
+        """Logarithm of the posterior odds of two numbers of companions."""
+        a, b = self.companions.index(more), self.companions.index(fewer)
+        prior = np.log(self.model_prior[a]) - np.log(self.model_prior[b])
+        return float(self.log_z[a] - self.log_z[b] + prior)
+
+    def __repr__(self) -> str:
+        each = zip(self.companions, self.log_z, strict=True)
+        return f"<Evidence: {', '.join(f'{k} companions ln Z {z:.2f}' for k, z in each)}>"
+
+
+def compare_models(
+    result: SearchResult,
+    prior: Prior,
+    rng: np.random.Generator,
+    *,
+    companions: Sequence[int] = (0, 1),
+    grid: GridPosterior | None = None,
+    two: TwoCompanions | None = None,
+    method: Method = "direct",
+    model_prior: Sequence[float] | None = None,
+) -> Evidence:
+    """Weigh numbers of companions against each other and against over-resolved light.
+
+    Parameters
+    ----------
+    result : SearchResult
+    prior : Prior
+    rng : numpy.random.Generator
+    companions : sequence of int
+        Out of 0, 1, 2.
+    grid : GridPosterior, optional
+        Of the same likelihood and prior; without it one companion is weighed by importance.
+    two : TwoCompanions
+        Needed for 2.
+    method : {"direct", "laplace", "nested"}
+        Direct: quadrature, grid (or importance) and importance, for 0, 1 and 2.
+    model_prior : sequence of float, optional
+        Prior probabilities of the numbers of companions; equal by default.
+
+    Raises
+    ------
+    UsageError
+        Where dynesty is asked for and not installed, or the request makes no sense.
+    """
+    if not set(companions) <= {0, 1, 2} or (2 in companions and two is None):
+        raise UsageError("numbers of companions are 0, 1 and 2 (two with their joint fit)")
+    weights = np.array(model_prior if model_prior is not None else [1.0] * len(companions))
+    if weights.shape != (len(companions),) or not (weights > 0).all():
+        raise UsageError("every number of companions needs a positive prior probability")
+    found = [
+        _weigh(result, prior, child, k, grid, two, method)
+        for k, child in zip(companions, rng.spawn(len(companions)), strict=True)
+    ]
+    log_z, error, how = zip(*found, strict=True)
+    halo = log_evidence_halo(result.likelihood, prior)
+    shares = tuple(float(w) for w in weights / weights.sum())
+    names = result.likelihood.parameters[result.likelihood.model.width :]
+    return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two, names)
+
+
+def _weigh(
+    result: SearchResult,
+    prior: Prior,
+    rng: np.random.Generator,
+    companions: int,
+    grid: GridPosterior | None,
+    two: TwoCompanions | None,
+    method: Method,
+) -> tuple[float, float, str]:
+    """(ln Z, error, method) of one model."""
+    none = single_likelihood(result.likelihood)
+    likelihood = (
+        none
+        if companions == 0
+        else two.likelihood
+        if two and companions == 2
+        else (result.likelihood)
+    )
+    if companions == 0 and (method != "nested" or not none.parameters):
+        return log_evidence_none(result.likelihood, prior), GRID_ERROR, "quadrature"
+    modes = two.modes if two and companions == 2 else result.modes
+    if method == "laplace":
+        return log_evidence_laplace(likelihood, modes, prior), float("nan"), "laplace"
+    if method == "nested":
+        return (*log_evidence_nested(likelihood, prior, rng), "nested")
+    if companions == 1 and grid is not None:
+        return grid.log_z, GRID_ERROR, "grid"
+    return (*log_evidence_importance(likelihood, modes, result.modes, prior, rng), "importance")
+
+
+def log_evidence_halo(likelihood: Likelihood, prior: Prior) -> float:
+    """ln Z of over-resolved light without a companion; NaN where it is in the model already."""
+    if likelihood.model.background == "free":
+        return float("nan")
+    halo = likelihood.with_model(replace(likelihood.model, background="free"))
+    names = [single_likelihood(one).parameters for one in (likelihood, halo)]
+    ranges = dict(zip(names[0], prior.nuisance, strict=True))
+    ranges["background"] = (0.0, HALO_BACKGROUND)
+    return log_evidence_none(halo, replace(prior, nuisance=tuple(ranges[n] for n in names[1])))
+
+
+def log_evidence_importance(
+    likelihood: Likelihood,
+    modes: Sequence[Mode],
+    one: Sequence[Mode],
+    prior: Prior,
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """ln Z and its error from weighted draws.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With one companion or two.
+    modes : sequence of Mode
+        Of that model.
+    one : sequence of Mode
+        Of the model with one companion.
+    prior : Prior
+    rng : numpy.random.Generator
+    """
+    k = likelihood.model.companions
+    sources = [_Gaussians(likelihood, modes, prior, n_free=0)]
+    if k == 2:
+        alone = likelihood.with_model(replace(likelihood.model, companions=1))
+        sources.append(_Gaussians(alone, one, prior, n_free=1))
+    share = (1.0 - DEFENSIVE) / len(sources)
+    wanted = MODEL_VALUES / len(likelihood.samples) / (1.0 - DEFENSIVE)
+    n = int(np.clip(wanted, MIN_DRAWS, MAX_DRAWS))
+    counts = [int(share * n)] * len(sources)
+    drawn = [s.draw(rng, m) for s, m in zip(sources, counts, strict=True)]
+    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), likelihood.model))
+    x = np.concatenate(drawn)
+    log_prior = prior.log_density(x)
+    x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
+    log_f = log_prior + _in_batches(likelihood, physical(x, likelihood.model))
+    terms = [log_prior + np.log(DEFENSIVE)]
+    terms += [s.log_density(x) + np.log(share) for s in sources]
+    log_w = log_f - logsumexp(terms, axis=0)
+    log_z = float(logsumexp(log_w) - np.log(n))
+    relative = np.exp(log_w - log_z)
+    # Draws outside the prior count, with weight 0.
+    spread = np.sqrt(max((relative**2).sum() / n - 1.0, 0.0) / n)
+    return log_z, float(spread)
+
+
+def _in_batches(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    pieces = np.array_split(theta, 1 + len(theta) * len(likelihood.samples) // 1_500_000)
+    return np.concatenate([likelihood.log_prob(piece) for piece in pieces])
+
+
+def _swapped(width: int, n_dim: int) -> IntArray:
+    """Columns of two companions in the other order."""
+    return np.asarray(np.r_[width : 2 * width, 0:width, 2 * width : n_dim])
+
+
+class _Heavy:
+    """A multivariate t distribution of `TAILS` degrees of freedom."""
+
+    def __init__(self, centre: FloatArray, scatter: FloatArray) -> None:
+        self.centre, self.scatter = centre, scatter
+        n = len(centre)
+        self._log_norm = (
+            gammaln(0.5 * (TAILS + n))
+            - gammaln(0.5 * TAILS)
+            - 0.5 * n * np.log(TAILS * np.pi)
+            - np.linalg.slogdet(scatter)[1]
+        )
+
+    def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
+        normal = rng.standard_normal((n, len(self.centre)))
+        stretch = np.sqrt(TAILS / rng.chisquare(TAILS, (n, 1)))
+        return np.asarray(self.centre + (normal * stretch) @ self.scatter.T)
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        z = np.linalg.solve(self.scatter, (x - self.centre).T)
+        square = (z * z).sum(axis=0)
+        power = 0.5 * (TAILS + len(self.centre))
+        return np.asarray(self._log_norm - power * np.log1p(square / TAILS))
+
+
+class _Gaussians:
+    """Multivariate t distributions around modes, the last companion drawn from the prior.
+
+    With two companions the density is that of both orders, each with half the weight.
+    """
+
+    def __init__(
+        self, likelihood: Likelihood, modes: Sequence[Mode], prior: Prior, n_free: int
+    ) -> None:
+        self.companions = likelihood.model.companions + n_free
+        self.model, self.width = likelihood.model, likelihood.model.width
+        self.prior, self.n_free = prior, n_free
+        fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
+        at_peak = [
+            likelihood.log_prob(physical(c[None], likelihood.model))[0]
+            + np.log(np.abs(np.linalg.det(s)))
+            for c, s in fits
+        ]
+        # Weaker modes keep a share: their Gaussians may be too narrow.
+        weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
+        self.weight = weight / weight.sum()
+        self.mixture = [_Heavy(*fit) for fit in fits]
+
+    def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
+        counts = rng.multinomial(n, self.weight)
+        x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
+        if not self.n_free:
+            return x
+        w = self.width
+        free = sampled(self.prior.draw(rng, n, 1), self.model)[:, :w]
+        return np.hstack([x[:, :w], free, x[:, w:]])
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        if self.companions == 1:
+            return self._ordered(x)
+        swapped = x[:, _swapped(self.width, x.shape[1])]
+        return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
+
+    def _ordered(self, x: FloatArray) -> FloatArray:
+        log = np.zeros(len(x))
+        if self.n_free:
+            bare = replace(self.prior, nuisance=())
+            free = np.s_[self.width : 2 * self.width]
+            log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
+        parts = [t.log_density(x) for t in self.mixture]
+        return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
+
+
+def log_evidence_nested(
+    likelihood: Likelihood,
+    prior: Prior,
+    rng: np.random.Generator,
+    *,
+    live_points: int = LIVE_POINTS,
+) -> tuple[float, float]:
+    """ln Z and its error by nested sampling with dynesty (extra ``amibayes[evidence]``).
+
+    Raises
+    ------
+    UsageError
+        Where dynesty is not installed.
+    """
+    try:
+        import dynesty
+    except ImportError as error:
+        raise UsageError(
+            "nested sampling needs dynesty", remedy="pip install 'amibayes[evidence]'"
+        ) from error
+    k, w = likelihood.model.companions, likelihood.model.width
+
+    def theta_of(cube: FloatArray) -> FloatArray:
+        theta = prior.from_cube(cube[None])[0]
+        # Both orders are one solution: the brighter one first, at the same evidence.
+        swap = k == 2 and theta[w + 2] > theta[2]
+        return np.asarray(theta[_swapped(w, len(theta))] if swap else theta)
+
+    sampler = dynesty.NestedSampler(
+        lambda theta: float(likelihood.log_prob(theta[None])[0]),
+        theta_of,
+        len(likelihood.parameters),
+        nlive=live_points,
+        sample="rwalk",
+        rstate=rng,
+    )
+    sampler.run_nested(print_progress=False)
+    return float(sampler.results.logz[-1]), float(sampler.results.logzerr[-1])

@@ -1,0 +1,267 @@
+"""The posterior of one companion by direct integration: no chain, no linearised model.
+
+The field is cut into cells of a polar lattice, on which the prior of the position is a
+product and the edge of the field an edge of cells. A cell is halved both ways while its
+share of the posterior matters and the likelihood may change within it by more than the
+midpoint rule forgives. In every cell the contrast is integrated over boxes that follow the
+likelihood there, and the nuisance parameters over Gauss–Legendre nodes. Strong modes, any
+number of them, and a sea of noise cost a few thousand cells alike; it is what chains, mode
+weights and evidences are held against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from amibayes.data.observables import BoolArray
+from amibayes.errors import DataError
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.quadrature import Marginal
+from amibayes.posterior.integrand import Cells, Integrand, Nuisance
+from amibayes.posterior.priors import Prior
+from amibayes.units import FloatArray
+
+FLOOR = 10.0
+"""Cells whose logarithm of the mass is this far below the largest are not cut any more."""
+
+STEP = 1.5
+"""Longest side of a cell that counts, in units of the shortest error a position can have."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridPosterior:
+    """The posterior of one companion on cells of the field.
+
+    Parameters
+    ----------
+    prior : Prior
+    nuisance_names : tuple of str
+    log_z : float
+        Logarithm of the evidence, normalisation of the likelihood and prior included.
+    log_z_none : float
+        The same without a companion.
+    cells : Cells
+    probability : (n_cells,) float array
+        Adds up to 1.
+    contrast_edges : (n_cells, n_boxes + 1) float array
+        Boxes of the contrast in every cell.
+    contrast_probability : (n_cells, n_boxes) float array
+        Share of each box; adds up to ``probability``.
+    nuisance : Nuisance
+    nuisance_probability : (n_nodes,) float array
+    n_evaluations : int
+        Number of parameter sets at which the likelihood was formed.
+    """
+
+    prior: Prior
+    nuisance_names: tuple[str, ...]
+    log_z: float
+    log_z_none: float
+    cells: Cells
+    probability: FloatArray
+    contrast_edges: FloatArray = field(repr=False)
+    contrast_probability: FloatArray = field(repr=False)
+    nuisance: Nuisance = field(repr=False)
+    nuisance_probability: FloatArray = field(repr=False)
+    n_evaluations: int = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"<GridPosterior: {len(self.cells)} cells, ln Z {self.log_z:.3f}, "
+            f"{self.log_z - self.log_z_none:+.3f} against no companion>"
+        )
+
+    def marginal(self, name: str) -> Marginal:
+        """Distribution of east_mas, north_mas, separation_mas, ln_contrast or a nuisance."""
+        if name in ("east_mas", "north_mas"):
+            return self._along(*((1, 0) if name == "east_mas" else (0, 1)))
+        if name == "separation_mas":
+            return Marginal(self.cells.inner, self.cells.outer, self.probability)
+        if name == "ln_contrast":
+            edges = np.log(self.contrast_edges)
+            kept = self.contrast_probability > 0
+            share = self.contrast_probability[kept]
+            return Marginal(edges[:, :-1][kept], edges[:, 1:][kept], share)
+        k = self.nuisance_names.index(name)
+        return Marginal(
+            self.nuisance.low[:, k], self.nuisance.high[:, k], self.nuisance_probability
+        )
+
+    def _along(self, east: int, north: int) -> Marginal:
+        """Distribution along a direction; each cell a box of its own variance."""
+        rho, angle = self.cells.centre
+        x = self.cells.position[0 if east else 1]
+        outward = np.abs(east * np.sin(angle) + north * np.cos(angle))
+        around = np.abs(east * np.cos(angle) - north * np.sin(angle))
+        deep = self.cells.outer - self.cells.inner
+        wide = rho * (self.cells.last - self.cells.first)
+        half = 0.5 * np.hypot(deep * outward, wide * around)
+        return Marginal(x - half, x + half, self.probability)
+
+    def cdf(self, name: str, value: float) -> float:
+        """Posterior probability of a smaller value of a quantity of `marginal`."""
+        return float(self.marginal(name).cdf(value))
+
+    def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
+        """(median, lower, upper), as `Posterior.interval` has it, of the same quantities."""
+        levels = np.array([0.5, 0.5 - level / 2, 0.5 + level / 2])
+        if name == "contrast":
+            mid, low, high = np.exp(self.marginal("ln_contrast").quantile(levels))
+        elif name == "delta_mag":
+            ln_c = self.marginal("ln_contrast").quantile(levels[[0, 2, 1]])
+            mid, low, high = -2.5 / np.log(10.0) * ln_c
+        elif name == "position_angle_deg":
+            mid, low, high = self._angles(levels)
+        else:
+            mid, low, high = self.marginal(name).quantile(levels)
+        return float(mid), float(low), float(high)
+
+    def _angles(self, levels: FloatArray) -> FloatArray:
+        """Quantiles of the position angle, degrees, cut opposite its mean; median in [0, 360)."""
+        middle = self.cells.centre[1]
+        mean = np.angle((self.probability * np.exp(1j * middle)).sum())
+        shift = (middle - mean + np.pi) % (2.0 * np.pi) - np.pi - middle
+        across = Marginal(self.cells.first + shift, self.cells.last + shift, self.probability)
+        angles = np.degrees(mean + across.quantile(levels))
+        return np.asarray(angles - 360.0 * (angles[0] // 360.0))
+
+    def upper_limit(self, level: float = 0.95, *, uniform: bool = False) -> float:
+        """Contrast below which the companion is with a probability.
+
+        Parameters
+        ----------
+        level : float
+        uniform : bool
+            As if the prior were uniform in contrast over the same range, which unlike a
+            log-uniform one does not depend on its lower end.
+        """
+        if not uniform or self.prior.contrast_form == "uniform":
+            return float(np.exp(self.marginal("ln_contrast").quantile(level)))
+        low, high = self.contrast_edges[:, :-1], self.contrast_edges[:, 1:]
+        mass = np.diff(self.prior.contrast_cdf(self.contrast_edges), axis=1)
+        share = self.contrast_probability * (high - low) / np.where(mass > 0, mass, np.inf)
+        return float(Marginal(low.ravel(), high.ravel(), share.ravel()).quantile(level))
+
+    def within(self, kept: BoolArray) -> GridPosterior:
+        """The posterior given that the companion is in the cells ``kept`` (n_cells,)."""
+        share = self.contrast_probability[kept]
+        share = share / share.sum()
+        return replace(
+            self,
+            cells=self.cells[kept],
+            probability=share.sum(axis=1),
+            contrast_edges=self.contrast_edges[kept],
+            contrast_probability=share,
+        )
+
+    def mass_near(self, positions: FloatArray, radius_mas: float) -> FloatArray:
+        """Probability of being within a radius of each position (n, 2) and nearest to it, (n,)."""
+        east, north = self.cells.position
+        away = np.hypot(east[:, None] - positions[:, 0], north[:, None] - positions[:, 1])
+        nearest = away.argmin(axis=1)
+        near = away.min(axis=1) <= radius_mas
+        mass = np.bincount(nearest[near], self.probability[near], minlength=len(positions))
+        return np.asarray(mass, dtype=float)
+
+
+def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) -> GridPosterior:
+    """Integrate the posterior of one companion over the whole field.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With a model of one companion.
+    prior : Prior
+    step : float
+        Longest side of a cell that counts, in units of the shortest error that a position
+        can have there: 1/(signal-to-noise × 2π/(λ/B)). Halving it shows the error.
+
+    Returns
+    -------
+    GridPosterior
+
+    Raises
+    ------
+    DataError
+        Where the likelihood is nowhere finite.
+    """
+    work = Integrand(likelihood, prior)
+    cells = work.start()
+    log_mass, peak = work.masses(cells)
+    if not np.isfinite(log_mass).any():
+        raise DataError("the likelihood is finite nowhere", source=likelihood.observables.source)
+    while (cut := _to_cut(work, cells, log_mass, work.delta_chi2(peak), step)).any():
+        children = cells[cut].halved()
+        mass, top = work.masses(children)
+        cells = Cells.join(cells[~cut], children)
+        log_mass = np.concatenate([log_mass[~cut], mass])
+        peak = np.concatenate([peak[~cut], top])
+    return _finished(work, cells, log_mass)
+
+
+def integrable(likelihood: Likelihood) -> bool:
+    """Whether the model has one contrast and stands still, as the grid posterior needs it."""
+    return likelihood.model.width == 3
+
+
+def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:
+    """Whether the grid posterior takes fewer model values than ``most`` (a few seconds).
+
+    Several contrasts and motion are dimensions that it does not have.
+    """
+    if not integrable(likelihood):
+        return False
+    work = Integrand(likelihood, prior)
+    n_sets = len(work.start()) * len(work.nuisance.value) * (work.n_boxes + 16)
+    return n_sets * len(likelihood.samples) < most
+
+
+def _to_cut(
+    work: Integrand, cells: Cells, log_mass: FloatArray, delta_chi2: FloatArray, step: float
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Say which cells are too large for what they hold.
+
+    No phase of the model turns faster than 2π per λ/B_max, so that at a signal-to-noise S a
+    position's error is not below (λ/B_max)/(2πS); near the star, where a template grows
+    with the separation, not below ρ/2S. What a centre may miss of its cell's peak is
+    bounded in the same way, by the half diagonal.
+    """
+    gain = np.maximum(delta_chi2, 1.0)
+    rate = np.maximum(2.0 * np.pi / work.fringe_mas, 2.0 / cells.centre[0])
+    too_large = cells.size * rate * np.sqrt(gain) > step
+    missed = work.likelihood.log_loss(0.5 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max())
+    density = log_mass - 2.0 * np.log(cells.size)
+    below = np.maximum(log_mass - log_mass.max(), density - density.max())
+    return np.asarray(too_large & (below > -FLOOR - missed))
+
+
+def _finished(work: Integrand, cells: Cells, log_mass: FloatArray) -> GridPosterior:
+    """Collect contrasts and nuisance of the cells that hold something."""
+    log_z = float(logsumexp(log_mass))
+    cells = cells[log_mass > log_z - 1.5 * FLOOR]
+    edges: list[FloatArray] = []
+    shares: list[FloatArray] = []
+    nodes = np.zeros(len(work.nuisance.value))
+    for batch in work.batches(cells):
+        edge, log_share, _ = work.shares(batch)
+        share = np.exp(log_share - log_z)
+        edges.append(edge)
+        shares.append(share.sum(axis=1))
+        nodes += share.sum(axis=(0, 2))
+    contrast = np.concatenate(shares) / sum(s.sum() for s in shares)
+    return GridPosterior(
+        work.prior,
+        replace(work.likelihood.model, companions=0).parameters,
+        log_z,
+        work.log_z_none,
+        cells,
+        contrast.sum(axis=1),
+        np.concatenate(edges),
+        contrast,
+        work.nuisance,
+        nodes / nodes.sum(),
+        work.n_evaluations,
+    )

@@ -1,0 +1,375 @@
+"""What a grid posterior adds up: the likelihood at cells, over contrast and nuisance.
+
+The contrast is integrated over boxes that follow the likelihood in every cell, each with
+its exact prior probability; nuisance parameters over Gauss–Legendre nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.special import logsumexp
+
+from amibayes.companion_search.optimise import fit_single, refine
+from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.parameters import Box
+from amibayes.posterior.priors import Prior
+from amibayes.units import MAS, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of a polar lattice: ranges of separation (mas) and position angle (radians)."""
+
+    inner: FloatArray
+    outer: FloatArray
+    first: FloatArray
+    last: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.inner)
+
+    def __getitem__(self, index: Any) -> Cells:
+        return Cells(self.inner[index], self.outer[index], self.first[index], self.last[index])
+
+    @property
+    def centre(self) -> tuple[FloatArray, FloatArray]:
+        """Separation (the mean over the cell's area) and position angle, (n,) each."""
+        a, b = self.inner, self.outer
+        rho = 2.0 / 3.0 * (a * a + a * b + b * b) / (a + b)
+        return rho, 0.5 * (self.first + self.last)
+
+    @property
+    def position(self) -> tuple[FloatArray, FloatArray]:
+        """East and north of the centres, mas, (n,) each."""
+        rho, angle = self.centre
+        return rho * np.sin(angle), rho * np.cos(angle)
+
+    @property
+    def size(self) -> FloatArray:
+        """Longer side, mas, (n,)."""
+        across = self.outer * (self.last - self.first)
+        return np.maximum(self.outer - self.inner, across)
+
+    def halved(self) -> Cells:
+        """Four cells for each one, halved in separation and in angle."""
+        rho, angle = 0.5 * (self.inner + self.outer), 0.5 * (self.first + self.last)
+        return Cells(
+            np.concatenate([self.inner, rho, self.inner, rho]),
+            np.concatenate([rho, self.outer, rho, self.outer]),
+            np.concatenate([self.first, self.first, angle, angle]),
+            np.concatenate([angle, angle, self.last, self.last]),
+        )
+
+    @staticmethod
+    def join(one: Cells, other: Cells) -> Cells:
+        """Cells of both."""
+        names = ("inner", "outer", "first", "last")
+        return Cells(*(np.concatenate([getattr(one, n), getattr(other, n)]) for n in names))
+
+
+def polar_cells(inner_mas: float, outer_mas: float, step_mas: float) -> Cells:
+    """Tile an annulus with cells of about a step in both directions."""
+    n_rings = max(1, int(np.ceil((outer_mas - inner_mas) / step_mas)))
+    edges = np.linspace(inner_mas, outer_mas, n_rings + 1)
+    counts = np.maximum(6, np.ceil(2.0 * np.pi * edges[1:] / step_mas)).astype(int)
+    ring = np.repeat(np.arange(n_rings), counts)
+    place = np.arange(len(ring)) - np.repeat(np.cumsum(counts) - counts, counts)
+    width = 2.0 * np.pi / counts[ring]
+    return Cells(edges[ring], edges[ring + 1], place * width, (place + 1) * width)
+
+
+CELLS_PER_FRINGE = 8
+"""Cells per λ/B_max to begin with."""
+
+
+CONTRAST_REACH = 7.0
+"""Errors of the contrast, to both sides of its best value, that are integrated finely."""
+
+
+FAINT_BOXES, FINE_BOXES, MORE_BOXES = 8, 40, 24
+"""Boxes in contrast: below the fine range, in it, and more of them with nuisance parameters."""
+
+
+NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.3
+
+
+MIN_NODES, MAX_NODES = 6, 32
+
+
+BRIGHT = (0.1, 0.2, 0.4, 0.8)
+"""Contrasts tried beside the best one of the linear theory."""
+
+
+BATCH = 1_500_000
+"""Model values (samples × parameter sets) held at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """Quadrature of the nuisance parameters.
+
+    Parameters
+    ----------
+    value : (n_nodes, n_nuisance) float array
+    log_weight : (n_nodes,) float array
+        Logarithm of the prior probability that a node stands for.
+    low, high : (n_nodes, n_nuisance) float array
+        Range that it stands for.
+    """
+
+    value: FloatArray
+    log_weight: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+def nuisance_nodes(prior: Prior, centres: FloatArray, errors: FloatArray) -> Nuisance:
+    """Gauss–Legendre nodes around fits, each parameter given the ones before it.
+
+    Parameters
+    ----------
+    prior : Prior
+    centres : (n_fits, n_nuisance) float array
+        Best values; nodes reach 5σ beyond all of them, as far as the prior goes.
+    errors : (n_nuisance, n_nuisance) float array
+        Their covariance: correlated parameters are followed along their ridge.
+    """
+    value, low, high = (np.empty((1, 0)) for _ in range(3))
+    log_weight = np.zeros(1)
+    for k, bounds in enumerate(prior.nuisance):
+        turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
+        sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
+        if not 0.0 < sigma < bounds[1] - bounds[0]:
+            sigma, turn = bounds[1] - bounds[0], 0.0 * turn
+        middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
+        x, w, a, b = _axis(middle, sigma, bounds)
+        n = x.shape[1]
+        value, low, high = (
+            np.hstack([np.repeat(old, n, axis=0), new.reshape(-1, 1)])
+            for old, new in ((value, x), (low, a), (high, b))
+        )
+        log_weight = np.repeat(log_weight, n) + np.log(w).ravel()
+    return Nuisance(value, log_weight, low, high)
+
+
+def _axis(
+    middle: FloatArray, sigma: float, bounds: tuple[float, float]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Nodes, weights and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
+    centres = np.clip(middle, *bounds)
+    begin = np.maximum(centres.min(axis=1) - NUISANCE_REACH * sigma, bounds[0])[:, None]
+    length = np.minimum(centres.max(axis=1) + NUISANCE_REACH * sigma, bounds[1])[:, None] - begin
+    wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
+    x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, MIN_NODES, MAX_NODES)))
+    edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
+    weight = 0.5 * w * length / (bounds[1] - bounds[0])
+    return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
+
+
+def log_evidence_none(
+    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
+) -> float:
+    """Logarithm of the evidence without a companion, nuisance parameters integrated.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With any number of companions in its model.
+    prior : Prior
+    single : (n_nuisance,) float array, optional
+        The best fit without a companion, if it is known.
+    """
+    alone = single_likelihood(likelihood)
+    best = fit_single(likelihood)[0] if single is None else single
+    errors = alone.errors(best) if len(best) else np.empty((0, 0))
+    nodes = nuisance_nodes(prior, best[None], errors)
+    return float(logsumexp(alone.log_prob(nodes.value) + nodes.log_weight))
+
+
+class Integrand:
+    """Likelihood times prior, integrated over contrast and nuisance, in batches of cells.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With a model of one companion.
+    prior : Prior
+    """
+
+    def __init__(self, likelihood: Likelihood, prior: Prior) -> None:
+        self.likelihood, self.prior = likelihood, prior
+        self.fringe_mas = float(1.0 / likelihood.samples.frequency.max() / MAS)
+        self.single, self.deviance_single = fit_single(likelihood)
+        lattice = self.fringe_mas / CELLS_PER_FRINGE
+        self.grid = make_grid(prior.inner_mas, prior.outer_mas, lattice)
+        self._scan()
+        self.nuisance = self._nuisance()
+        self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
+        self.log_z_none = log_evidence_none(likelihood, prior, self.single)
+        alone = single_likelihood(likelihood)
+        self.best_none = float(alone.log_prob(self.single[None])[0])
+        without, left = alone.chi2(self.single[None])[0], likelihood.chi2(self._best[None])[0]
+        self.most = max(float((without - left) / likelihood.inflation(left)), 0.0)
+        self.n_evaluations = 0
+
+    def _scan(self) -> None:
+        """Best contrast and gain in χ² of the linear theory over a lattice of the field."""
+        if not len(self.grid):
+            self.gain, self.contrast = np.zeros(0), np.zeros(0)
+            return
+        bank = TemplateBank(self.likelihood, self.grid, self.single)
+        residuals = single_likelihood(self.likelihood).residuals(self.single)[:, 0]
+        self.contrast, sigma = bank.scan(residuals)
+        self.gain = np.where(self.contrast > 0, (self.contrast / sigma) ** 2, 0.0)
+
+    def start(self) -> Cells:
+        """Cells of the field, without those that the linear theory rules out by far."""
+        p = self.prior
+        cells = polar_cells(p.inner_mas, p.outer_mas, self.fringe_mas / CELLS_PER_FRINGE)
+        if not len(self.grid) or self.contrast[self.gain.argmax()] > BRIGHT[0]:
+            return cells
+        image = np.nan_to_num(self.grid.image(self.gain), nan=0.0)
+        around = maximum_filter(image, 3)
+        half = self.grid.half_width
+        east, north = (
+            np.clip(np.rint(x / self.grid.step_mas).astype(int) + half, 0, 2 * half)
+            for x in cells.position
+        )
+        best = self.gain.max()
+        return cells[around[north, east] > 0.4 * best - 60.0]
+
+    def _nuisance(self) -> Nuisance:
+        """Nodes over what the fits with and without a companion allow."""
+        if not len(self.single):
+            return nuisance_nodes(self.prior, np.empty((1, 0)), np.empty((0, 0)))
+        best = self._best
+        errors = self.likelihood.errors(best)[3:, 3:]
+        return nuisance_nodes(self.prior, np.array([self.single, best[3:]]), errors)
+
+    @cached_property
+    def _best(self) -> FloatArray:
+        """A fit with a companion, from the best position of the linear scan."""
+        if not len(self.grid):
+            return np.concatenate([[self.prior.outer_mas, 0.0, 0.0], self.single])
+        k = int(self.gain.argmax())
+        place = [self.grid.east_mas[k], self.grid.north_mas[k], np.clip(self.contrast[k], 0, 1)]
+        box = Box(self.prior.inner_mas, self.prior.outer_mas, self.fringe_mas)
+        seed = np.concatenate([place, self.single])
+        return np.array(refine(self.likelihood, seed, box, self.deviance_single).theta)
+
+    def log_prob(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
+        """Log-likelihood (n, k) at sites (n, 2 + n_nuisance), each with k contrasts (n, k)."""
+        return self.likelihood.log_prob(self._thetas(sites, contrast)).reshape(contrast.shape)
+
+    def _log_prob_at_best_noise(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
+        """The same for one covariance, that of the search: a parabola at small contrast."""
+        chi2 = self.likelihood.chi2(self._thetas(sites, contrast))
+        return np.asarray(-0.5 * chi2).reshape(contrast.shape)
+
+    def _thetas(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
+        n, k = contrast.shape
+        theta = np.empty((n, k, sites.shape[1] + 1))
+        theta[:, :, :2] = sites[:, None, :2]
+        theta[:, :, 2] = contrast
+        theta[:, :, 3:] = sites[:, None, 2:]
+        self.n_evaluations += n * k
+        return theta.reshape(n * k, -1)
+
+    def _best_contrast(self, sites: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Most likely contrast (below zero where it is) and its error at sites, (n,) each."""
+        n, most = len(sites), self.prior.contrast_max
+        bright = [c for c in BRIGHT if c < most]
+        trial = np.broadcast_to([0.0, 1e-3, 2e-3, *bright], (n, 3 + len(bright)))
+        value = self._log_prob_at_best_noise(sites, trial)
+        best, sigma = _parabola(np.full(n, 1e-3), np.full(n, 1e-3), value[:, :3], np.full(n, 1.0))
+        if bright:
+            top = value[:, 3:].argmax(axis=1)
+            brighter = np.clip(best, 0.0, most)[:, None]
+            exceeds = (
+                value[np.arange(n), 3 + top] > self._log_prob_at_best_noise(sites, brighter)[:, 0]
+            )
+            best = np.where(exceeds, np.array(bright)[top], best)
+        for _ in range(2):
+            middle = np.clip(best, sigma, np.maximum(most, sigma))
+            points = middle[:, None] + sigma[:, None] * np.array([-1.0, 0.0, 1.0])
+            value = self._log_prob_at_best_noise(sites, points)
+            best, sigma = _parabola(middle, sigma, value, sigma)
+        return best, sigma
+
+    def boxes(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
+        """Boxes of the contrast (n, n_boxes + 1), and log-likelihood (n, n_nodes, n_boxes)."""
+        n, nodes = len(cells), self.nuisance.value
+        place = np.repeat(np.column_stack(cells.position), len(nodes), axis=0)
+        sites = np.hstack([place, np.tile(nodes, (n, 1))])
+        best, sigma = self._best_contrast(sites)
+        edges = self._edges(*(x.reshape(n, -1) for x in (best, sigma)))
+        contrast = np.repeat(self._inside(edges), len(nodes), axis=0)
+        return edges, self.log_prob(sites, contrast).reshape(n, len(nodes), -1)
+
+    def _edges(self, best: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Boxes: logarithmic below the fine range, even in it; (n, n_nodes) → (n, n_boxes + 1)."""
+        p, small = self.prior, sigma.min(axis=1)
+        low = np.maximum((best - CONTRAST_REACH * sigma).min(axis=1), 0.3 * small)
+        high = (np.maximum(best, 0.0) + CONTRAST_REACH * sigma).max(axis=1)
+        low = np.clip(low, p.contrast_min, 0.9 * p.contrast_max)
+        # Where the data want less than the prior allows, what lies above its lower end counts.
+        high = np.minimum(np.maximum(high, low + CONTRAST_REACH * small), p.contrast_max)
+        faint = np.geomspace(np.full(len(low), p.contrast_min), low, FAINT_BOXES + 1, axis=1)
+        fine = np.linspace(low, high, self.n_boxes - FAINT_BOXES + 1, axis=1)
+        return np.hstack([faint, fine[:, 1:]])
+
+    def _inside(self, edges: FloatArray) -> FloatArray:
+        """Mean contrast of every box under the prior."""
+        low, high = edges[:, :-1], edges[:, 1:]
+        if self.prior.contrast_form == "uniform":
+            return 0.5 * (low + high)
+        ratio = np.log(high / low)
+        return np.where(ratio > 1e-6, (high - low) / np.where(ratio > 0, ratio, 1.0), low)
+
+    def batches(self, cells: Cells) -> list[Cells]:
+        """Cut cells into groups whose model values fit in memory."""
+        each = len(self.likelihood.samples) * len(self.nuisance.value) * self.n_boxes
+        at_once = max(1, BATCH // each)
+        return [cells[k : k + at_once] for k in range(0, len(cells), at_once)]
+
+    def shares(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Boxes, logarithm of their mass (n, n_nodes, n_boxes), and best log-likelihood (n,)."""
+        p = self.prior
+        edges, log_prob = self.boxes(cells)
+        ring = p.ring_cdf(cells.outer) - p.ring_cdf(cells.inner)
+        place = np.log(ring * (cells.last - cells.first) / (2.0 * np.pi))
+        bright = np.log(np.maximum(np.diff(p.contrast_cdf(edges), axis=1), 1e-300))
+        log_mass = log_prob + (place[:, None] + bright)[:, None, :]
+        return edges, log_mass + self.nuisance.log_weight[:, None], log_prob.max(axis=(1, 2))
+
+    def delta_chi2(self, peak: FloatArray) -> FloatArray:
+        """Δχ² over no companion of cells whose best log-likelihoods are given, (n,)."""
+        gain = self.likelihood.delta_chi2(peak - self.best_none)
+        return np.minimum(gain, max(self.most, 2.0 * float(np.max(peak - self.best_none))))
+
+    def masses(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
+        """Logarithm of each cell's share of the evidence, and its best log-likelihood."""
+        masses, peaks = [], []
+        for batch in self.batches(cells):
+            _, log_mass, peak = self.shares(batch)
+            masses.append(logsumexp(log_mass, axis=(1, 2)))
+            peaks.append(peak)
+        return np.concatenate(masses), np.concatenate(peaks)
+
+
+def _parabola(
+    middle: FloatArray, step: FloatArray, value: FloatArray, otherwise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Top and width of the parabolas through values (n, 3) at middle − step, middle, + step."""
+    slope = 0.5 * (value[:, 2] - value[:, 0]) / step
+    curvature = (2.0 * value[:, 1] - value[:, 0] - value[:, 2]) / step**2
+    arched = curvature > 1e-4 / otherwise**2
+    safe = np.where(arched, curvature, 1.0)
+    best = np.where(arched, middle + slope / safe, middle + np.sign(slope) * step)
+    return best, np.where(arched, 1.0 / np.sqrt(safe), otherwise)

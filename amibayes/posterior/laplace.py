@@ -1,0 +1,103 @@
+"""Laplace's approximation: a Gaussian at every mode, in the coordinates that are sampled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import factorial
+
+import numpy as np
+from scipy import stats
+from scipy.special import logsumexp
+
+from amibayes.companion_search.result import Mode
+from amibayes.likelihood.likelihood import LOG_TWO_PI, Likelihood
+from amibayes.models.components import BinaryModel, IntArray
+from amibayes.posterior.priors import Prior
+from amibayes.units import FloatArray
+
+
+def log_evidence_laplace(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> float:
+    """ln Z as the sum over the modes; every order of the companions counts.
+
+    Right where companions are strong: at a contrast of few errors the posterior in ln
+    contrast is no Gaussian.
+    """
+    parts = log_masses(likelihood, modes, prior)
+    return float(logsumexp(parts) + np.log(factorial(likelihood.model.companions)))
+
+
+def log_masses(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> FloatArray:
+    """Logarithm of what each mode adds to the evidence, (n_modes,)."""
+    return np.array([_log_mass(likelihood, np.array(m.theta), prior) for m in modes])
+
+
+def _log_mass(likelihood: Likelihood, theta: FloatArray, prior: Prior) -> float:
+    """Mass of one mode's Gaussian, cut off at the ranges of rates and nuisance parameters."""
+    model = likelihood.model
+    centre, scatter = gaussian_of(likelihood, theta, prior)
+    bounded, ranges = _bounded(likelihood, prior)
+    sigma = np.sqrt(np.diag(scatter @ scatter.T))[bounded]
+    pull = (ranges - centre[bounded, None]) / sigma[:, None]
+    inside = np.prod(stats.norm.cdf(pull[:, 1]) - stats.norm.cdf(pull[:, 0]))
+    volume = np.linalg.slogdet(scatter)[1] + 0.5 * len(centre) * LOG_TWO_PI
+    at_peak = likelihood.log_prob(physical(centre[None], model))[0]
+    return float(at_peak + _log_prior(centre, prior) + volume + np.log(inside))
+
+
+def _bounded(likelihood: Likelihood, prior: Prior) -> tuple[IntArray, FloatArray]:
+    """Columns of rates and nuisance parameters, and their ranges (n, 2)."""
+    model = likelihood.model
+    columns = [*model.rate_columns, *range(model.width * model.companions, len(model.parameters))]
+    rate = prior.fastest_mas_yr
+    ranges = [(-rate, rate)] * len(model.rate_columns) + list(prior.nuisance)
+    return np.array(columns, dtype=np.intp), np.array(ranges).reshape(-1, 2)
+
+
+def _log_prior(centre: FloatArray, prior: Prior) -> float:
+    """Density of the prior at a mode, which may stand on the edge of the field."""
+    density = float(prior.log_density(centre[None])[0])
+    if np.isfinite(density):
+        return density
+    moved = centre.copy()
+    for k in range(0, len(centre) - len(prior.nuisance), prior.width):
+        rho = max(float(np.hypot(*centre[k : k + 2])), 1e-300)
+        slack = 1e-6 * (prior.outer_mas - prior.inner_mas)
+        moved[k : k + 2] *= np.clip(rho, prior.inner_mas + slack, prior.outer_mas - slack) / rho
+    return float(prior.log_density(moved[None])[0])
+
+
+def gaussian_of(
+    likelihood: Likelihood, theta: FloatArray, prior: Prior, widest: float = 0.5
+) -> tuple[FloatArray, FloatArray]:
+    """Centre and scatter matrix of a mode in the sampled coordinates (ln contrast).
+
+    Contrasts below their error are moved up to it: there the posterior in ln contrast ends.
+    No axis is longer than ``widest`` times the field.
+    """
+    bright = likelihood.model.contrast_columns
+    sigma = np.sqrt(np.diag(likelihood.errors(theta)))
+    theta = np.array(theta)
+    least = np.maximum(np.minimum(sigma[bright], 0.1), 1.01 * prior.contrast_min)
+    theta[bright] = np.clip(theta[bright], least, prior.contrast_max)
+    bounded, ranges = _bounded(likelihood, prior)
+    theta[bounded] = np.clip(theta[bounded], ranges[:, 0], ranges[:, 1])
+    stretch = np.ones(len(theta))
+    stretch[bright] = 1.0 / theta[bright]
+    values, vectors = np.linalg.eigh(likelihood.errors(theta) * np.outer(stretch, stretch))
+    theta[bright] = np.log(theta[bright])
+    limit = max(widest * prior.outer_mas, 1.0)
+    return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
+
+
+def physical(x: FloatArray, model: BinaryModel) -> FloatArray:
+    """From the sampled coordinates to the model's."""
+    theta = x.copy()
+    theta[..., model.contrast_columns] = np.exp(theta[..., model.contrast_columns])
+    return theta
+
+
+def sampled(theta: FloatArray, model: BinaryModel) -> FloatArray:
+    """From the model's coordinates to the sampled ones."""
+    x = theta.copy()
+    x[..., model.contrast_columns] = np.log(x[..., model.contrast_columns])
+    return x

@@ -1,0 +1,1 @@
+"""What is observed in a simulation: sources, spectra, orientation."""

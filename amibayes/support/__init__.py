@@ -1,0 +1,1 @@
+"""Files, options and messages that every package uses."""

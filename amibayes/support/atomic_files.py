@@ -1,0 +1,188 @@
+"""Writing files whole or not at all, and saying what a file was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows has other locks
+    fcntl = None  # type: ignore[assignment]
+
+from amibayes.errors import RunError, UsageError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside ``path`` that replaces it when the block succeeds.
+
+    Raises
+    ------
+    RunError
+        Where the folder cannot be written or the disk is full.
+    """
+    final = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(
+            dir=final.parent, prefix=f".{final.stem}.", suffix=final.suffix
+        )
+        os.close(handle)
+    except OSError as error:
+        raise cannot_write(final, error) from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(final)
+    except OSError as error:
+        raise cannot_write(final, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def cannot_write(path: Path, error: OSError) -> RunError:
+    """Describe in one line an output that could not be written."""
+    return RunError(
+        f"cannot be written: {_reason(error)}",
+        source=path,
+        remedy="choose a writable folder with space left",
+    )
+
+
+def _reason(error: OSError) -> str:
+    """What the system said, without what a library wraps around it."""
+    return os.strerror(error.errno) if error.errno else str(error)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write ``text`` to ``path``, whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write strict JSON (no NaN, no infinity) to ``path``, whole or not at all."""
+    write_text(path, to_json(content))
+
+
+def to_json(content: Any) -> str:
+    """Strict, indented JSON text; a NaN in it is a programming error."""
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def sha256(path: str | Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as stream:
+        while chunk := stream.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def short_names(paths: Sequence[str | Path]) -> list[str]:
+    """Names of files, with as many of their folders as it takes to tell each from the others."""
+    parts = [Path(path).parts for path in paths]
+    names = []
+    for mine in parts:
+        others = [other for other in parts if other != mine]
+        depth = 1
+        while depth < len(mine) and any(o[-depth:] == mine[-depth:] for o in others):
+            depth += 1
+        names.append(str(Path(*mine[-depth:])) if mine else "")
+    return names
+
+
+_held: dict[Path, int] = {}
+"""Folders that this process writes into, each with the handle that locks it."""
+
+_made: set[Path] = set()
+"""Folders that were not there before."""
+
+
+@contextmanager
+def output_locks() -> Iterator[None]:
+    """Let go, at the end, of the folders that `output_folder` has taken meanwhile.
+
+    Those that it made and nothing was written into are taken away again.
+    """
+    before, made_before = set(_held), set(_made)
+    try:
+        yield
+    finally:
+        for folder in _made - made_before:
+            with suppress(OSError):  # what holds files stays
+                folder.rmdir()
+        _made.intersection_update(made_before)
+        for folder in set(_held) - before:
+            os.close(_held.pop(folder))
+
+
+def _hold(folder: Path) -> None:
+    """Keep other runs out of a folder; the lock ends with this process, however it ends.
+
+    Raises
+    ------
+    UsageError
+        Where another run has it.
+    """
+    key = folder.resolve()
+    if fcntl is None or key in _held:
+        return
+    handle = os.open(key, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise UsageError(
+            "another run is writing here", source=folder, remedy="wait for it, or choose --out"
+        ) from None
+    except OSError:  # a file system without locks: nothing can be known, and work goes on
+        os.close(handle)
+    else:
+        _held[key] = handle
+
+
+def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
+    """Make ``folder`` ready for files called ``names``, and keep other runs out of it.
+
+    The lock is released by `output_locks`, or with the process; a folder that stays empty goes
+    with it.
+
+    Raises
+    ------
+    UsageError
+        Where one of the files is there already and ``overwrite`` is false, where another
+        run has the folder, or where it is a file, cannot be made or not be written into.
+    """
+    path = Path(folder)
+    is_new = not path.exists()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"cannot be made a folder: {error.strerror}", source=path, remedy="choose another --out"
+        ) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise UsageError("cannot be written into", source=path, remedy="choose another --out")
+    if is_new:
+        _made.add(path.resolve())
+    _hold(path)
+    present = [name for name in names if (path / name).exists()]
+    if present and not overwrite:
+        raise UsageError(
+            "is there already", source=path / present[0], remedy="give --overwrite or another --out"
+        )
+    return path

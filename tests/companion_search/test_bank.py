@@ -1,0 +1,107 @@
+"""The template bank against finite differences and brute force; CANDID's nσ against scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+
+from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.components import BinaryModel
+
+MODELS = [
+    BinaryModel(),
+    BinaryModel(smearing=False),
+    BinaryModel(diameter_mas="free", background="free"),
+    BinaryModel(diameter_mas=40.0, background=0.1),
+]
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("kinds", [("vis2", "cp"), ("cp",), ("vis2",)])
+def test_templates_are_the_derivative_of_the_model(model, kinds, rng) -> None:
+    if kinds == ("cp",):
+        model = BinaryModel(smearing=model.smearing)
+    likelihood = Likelihood(simulated(niriss(channels=2), [0.0, 0.0, 0.0], rng).only(kinds), model)
+    nuisance = np.array([30.0, 0.1])[: model.n_nuisance]
+    bank = TemplateBank(likelihood, make_grid(40.0, 400.0, 35.0), nuisance)
+    step, free = 1e-6, np.linalg.qr(likelihood.jacobian([100.0, 0.0, 0.0, *nuisance])[:, 3:])[0]
+    seen = np.zeros(len(bank), dtype=int)
+    for index, templates in bank.chunks():
+        seen[index] += 1
+        east, north = bank.grid.east_mas[index], bank.grid.north_mas[index]
+        theta = np.column_stack([east, north, np.zeros(len(index))])
+        theta = np.hstack([theta, np.broadcast_to(nuisance, (len(index), len(nuisance)))])
+        brighter = theta + step * np.eye(theta.shape[1])[2]
+        numerical = (likelihood.residuals(theta) - likelihood.residuals(brighter)) / step
+        numerical -= free @ (free.T @ numerical)
+        numerical /= np.linalg.norm(numerical, axis=0)
+        np.testing.assert_allclose(templates, numerical, atol=2e-4)
+    assert (seen == 1).all()
+
+
+def test_scan_is_the_least_squares_contrast_of_every_position(rng) -> None:
+    data = simulated(niriss(), [120.0, -90.0, 0.01], rng)
+    likelihood = Likelihood(data, BinaryModel(background="free"))
+    single, _ = fit_single(likelihood)
+    bank = TemplateBank(likelihood, make_grid(50.0, 300.0, 40.0), single)
+    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    contrast, sigma = bank.scan(residuals)
+    for k in range(0, len(bank), 7):
+        theta = [bank.grid.east_mas[k], bank.grid.north_mas[k], 0.0, *single]
+        design = likelihood.jacobian(theta)[:, 2:]
+        best = np.linalg.lstsq(design, residuals, rcond=None)[0]
+        error = np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
+        np.testing.assert_allclose([contrast[k], sigma[k]], [best[0], error], rtol=1e-5)
+        (found,), off_lattice = bank.matched_filter(residuals)(np.array(theta[:2]))
+        gain = max(best[0], 0.0) ** 2 / error**2
+        np.testing.assert_allclose([found, off_lattice], [best[0], gain], rtol=1e-5, atol=1e-9)
+
+
+def test_largest_gain_of_many_data_sets_is_the_scan_of_each(rng) -> None:
+    likelihood = Likelihood(niriss(), BinaryModel(background="free"))
+    bank = TemplateBank(likelihood, make_grid(50.0, 400.0, 25.0), np.array([0.05]))
+    noise = bank.project(rng.standard_normal((bank.n_data, 20)))
+    gain, position = bank.largest_gain(noise.astype(np.float32))
+    for one, largest, where in zip(noise.T, gain, position, strict=True):
+        contrast, sigma = bank.scan(one)
+        each = np.maximum(contrast / sigma, 0.0) ** 2
+        np.testing.assert_allclose([largest, each[where]], each.max(), rtol=1e-5)
+
+
+def test_grid_fills_the_annulus_and_mirrors_itself() -> None:
+    grid = make_grid(50.0, 400.0, 9.7)
+    rho = np.hypot(grid.east_mas, grid.north_mas)
+    assert rho.min() >= 50.0
+    assert rho.max() <= 400.0
+    area = np.pi * (400.0**2 - 50.0**2) / 9.7**2
+    assert abs(len(grid) - area) < 3 * np.sqrt(2 * np.pi * 450 / 9.7)
+    half = len(grid) // 2
+    np.testing.assert_array_equal(grid.columns[:half], -grid.columns[half:])
+    assert len(np.unique(np.stack([grid.columns, grid.rows]), axis=1).T) == len(grid)
+    image = grid.image(grid.north_mas)
+    assert image[grid.half_width + 10, grid.half_width] == pytest.approx(97.0)
+    assert np.isnan(image[grid.half_width, grid.half_width])
+
+
+@pytest.mark.parametrize(("dof", "delta"), [(32, 26.7), (34, 27.4)])
+def test_three_candid_sigma(dof: int, delta: float) -> None:
+    assert candid_n_sigma(dof + delta, dof, dof) == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize("dof", [3, 30, 1346])
+def test_survival_of_chi2_joins_smoothly_past_underflow(dof: int) -> None:
+    x = stats.chi2.isf(1e-250, dof)
+    assert log_chi2_survival(x, dof) == pytest.approx(stats.chi2.logsf(x, dof), rel=1e-10)
+    assert log_chi2_survival(10 * x, dof) < -2000
+
+
+def test_candid_n_sigma_is_plain_where_it_can_be_and_finite_elsewhere() -> None:
+    p = stats.chi2.sf(100.0, 33)
+    assert candid_n_sigma(100.0, 33.0, 33) == pytest.approx(stats.norm.isf(p / 2))
+    assert candid_n_sigma(10.0, 10.0, 33) < 1.0
+    assert 1e3 < candid_n_sigma(1e9, 1e3, 1e3) < 1e5

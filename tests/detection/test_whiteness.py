@@ -1,0 +1,49 @@
+"""Channels that err together are noticed; independent ones are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+
+from amibayes.companion_search.search import search
+from amibayes.detection.whiteness import channel_correlation
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.pipeline.warnings import search_cautions
+
+TRUTH = [150.0, -80.0, 0.02]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_common_errors_of_channels_are_measured(share, rng) -> None:
+    """Six channels; variance ``share`` in common. 280 pairs: within 5/√280 of the truth."""
+    sheet = niriss(channels=6)
+    data = simulated(sheet, TRUTH, rng)
+    clean = Likelihood(sheet).predict([TRUTH])[:, 0]
+    noise = data.data - clean
+    parts = []
+    for table, error in zip((data.vis2, data.closure_phase), data.errors, strict=True):
+        own, noise = noise[: len(table)], noise[len(table) :]
+        common = rng.standard_normal(table.row.max() + 1)[table.row] * error
+        parts.append(np.sqrt(1.0 - share) * own + np.sqrt(share) * common)
+    values = clean + np.concatenate(parts)
+    vis2, closure = np.split(values, [len(data.vis2)])
+    data = replace(
+        data,
+        vis2=replace(data.vis2, value=vis2),
+        closure_phase=replace(data.closure_phase, value=closure),
+    )
+    result = search(Likelihood(data), (50.0, 400.0))
+    correlation, n_pairs = channel_correlation(result)
+    assert n_pairs == 5 * 56
+    assert correlation == pytest.approx(share, abs=0.3)
+    said = search_cautions(data, result, ExtraNoise(), None, None)
+    assert any("neighbouring channels" in text for text in said) == (share > 0)
+
+
+def test_one_channel_says_nothing(rng) -> None:
+    result = search(Likelihood(simulated(niriss(), TRUTH, rng)), (50.0, 400.0))
+    assert channel_correlation(result) == (0.0, 0)

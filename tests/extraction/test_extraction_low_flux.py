@@ -1,0 +1,48 @@
+"""Expected errors of faint integrations, against closed forms and against drawn photons."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import script
+
+from amibayes.extraction.fourier.sampling import OneEach
+from amibayes.extraction.low_flux import expected_covariance
+from amibayes.instrument import load_instrument
+
+faint = script("extraction_faint")
+
+MASK = load_instrument("niriss", "F430M").mask
+
+
+def bare_sampling() -> OneEach:
+    """Pixels that are the numbers: flux, 21 real parts, 21 imaginary parts."""
+    return OneEach.of(np.eye(43, 44), MASK, MASK.uv_m)
+
+
+@pytest.mark.parametrize("relative", [0.01, 1.0, 10.0])
+def test_independent_fringes_have_the_closed_form(relative: float) -> None:
+    """Var Im(T/T̄) = ½[(1 + ν)³ − 1] and Var V² = 2ν + ν², ν noise power over signal power."""
+    rng = np.random.default_rng(1)
+    samples = np.exp(2j * np.pi * rng.random(21))
+    variance = np.full(43, relative / 2.0)
+    variance[0] = 0.0
+    found = expected_covariance(bare_sampling(), 1.0, samples, variance, np.zeros(43))
+    variances = np.diag(found)
+    np.testing.assert_allclose(variances[:21], 2.0 * relative + relative**2, rtol=1e-12)
+    np.testing.assert_allclose(variances[21:], 0.5 * ((1.0 + relative) ** 3 - 1.0), rtol=1e-12)
+    # Triangles that share a baseline have its noise in common, and nothing else.
+    shared = found[21:, 21:][~np.eye(35, dtype=bool)]
+    expected = np.unique(np.round(np.abs(shared) / relative, 9))
+    np.testing.assert_allclose(expected, [0.0, 0.5])
+
+
+@pytest.mark.parametrize("method", ["fringes", "matched", "unique"])
+@pytest.mark.parametrize(("photons", "read_noise"), [(300.0, 0.0), (8000.0, 21.0)])
+def test_drawn_photons_scatter_as_expected(method: str, photons: float, read_noise: float) -> None:
+    full, first = faint.ratios(method, photons, read_noise, np.random.default_rng(11))
+    for part in (faint.VIS2, faint.CLOSURE):
+        # A variance of 3000 draws to 2.6 %, more where the third order has long tails, and the
+        # mean of 21 or 35 of them to 1 %. What is left out of photons is 4 % at 300 of them.
+        assert np.mean(full[part]) == pytest.approx(1.0, abs=0.08)
+        assert np.mean(first[part]) > (1.05 if read_noise == 0.0 else 1.12)

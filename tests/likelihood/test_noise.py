@@ -1,0 +1,124 @@
+"""Extra noise: found where it is, absent where it is not, and no companion made of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+
+from amibayes.companion_search.draws import profiled
+from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
+from amibayes.data.observables import join
+from amibayes.detection.false_alarm import bank_statistic, null_maxima
+from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+
+FIELD = (50.0, 400.0)
+EXTRA = ExtraNoise(0.02, np.radians(1.0))
+
+
+def understated(theta, rng, extra=EXTRA, sheet=None):
+    """Data with more noise than their errors say."""
+    sheet = sheet or niriss()
+    noisy = simulated(add_noise(sheet, extra), theta, rng)
+    return replace(noisy, covariance=sheet.covariance)
+
+
+@pytest.mark.parametrize("kind", ["assumed", "diagonal"])
+def test_noise_is_added_as_baseline_noise(kind: str) -> None:
+    sheet = niriss(covariance=kind)
+    added = add_noise(sheet, EXTRA).covariance
+    change = added.dense() - sheet.covariance.dense()
+    np.testing.assert_allclose(np.diag(change)[:21], 0.02**2)
+    np.testing.assert_allclose(np.diag(change)[21:], np.radians(1.0) ** 2)
+    assert added.rank == sheet.covariance.rank
+    if kind == "assumed":
+        ratio = sheet.covariance.dense()[21:, 21:] / sheet.covariance.dense()[21, 21]
+        np.testing.assert_allclose(change[21:, 21:] / change[21, 21], ratio, atol=1e-12)
+    assert add_noise(sheet, ExtraNoise()) is sheet
+
+
+def test_extra_noise_is_recovered() -> None:
+    """40 epochs at once: σ to 1/√(2n) of n = 840 V² and 600 kernel phases; 5 sigma."""
+    rng = np.random.default_rng(3)
+    theta = [110.0, -75.0, 0.05]
+    epochs = [understated(theta, rng, sheet=_at(niriss(), 60000.0 + k)) for k in range(40)]
+    found = fit_noise(Likelihood(join(epochs)), np.array(theta))
+    assert found.vis2 == pytest.approx(0.02, rel=5 * 1.1 / np.sqrt(2 * 840))
+    assert found.closure_phase_rad == pytest.approx(
+        EXTRA.closure_phase_rad, rel=5 * 1.2 / np.sqrt(1200)
+    )
+
+
+def _at(data, mjd):
+    def moved(m):
+        return replace(m, mjd=np.full(len(m), mjd))
+
+    return replace(data, vis2=moved(data.vis2), closure_phase=moved(data.closure_phase))
+
+
+def test_honest_errors_get_no_extra_noise() -> None:
+    """Two tests at 1e-3 each: more than 4 of 300 data sets would be a 4e-4 accident."""
+    rng = np.random.default_rng(4)
+    theta = [110.0, -75.0, 0.05]
+    hits = sum(
+        fit_noise(Likelihood(simulated(niriss(), theta, rng)), np.array(theta)).any
+        for _ in range(300)
+    )
+    assert hits <= 4
+
+
+@pytest.mark.slow
+def test_search_of_noisy_data_has_a_reduced_chi2_of_one_and_fair_errors() -> None:
+    """Pulls of 40 companions in data whose errors are four times too small; 5 sigma."""
+    rng = np.random.default_rng(5)
+    theta, n = np.array([110.0, -75.0, 0.15]), 40
+    pulls, reduced = np.empty((n, 3)), np.empty(n)
+    for k in range(n):
+        result, noise = search_with_noise(Likelihood(understated(theta, rng)), FIELD)
+        pulls[k] = (result.theta - theta) / np.sqrt(np.diag(result.theta_covariance))
+        reduced[k] = result.chi2_binary / result.ndof
+        assert noise.any
+    assert reduced.mean() == pytest.approx(1.0, abs=0.1)
+    # The noise is known to 1/√(2·15) only, which widens the pulls by a few per cent.
+    assert np.abs(pulls.std(axis=0) - 1.05).max() < 5 / np.sqrt(2 * n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 1.5, 4.0])
+def test_false_alarms_stay_at_their_rate_whatever_the_errors_say(factor: float) -> None:
+    """Null data whose noise is ``factor`` times the stated errors: the reported p is uniform.
+
+    P(p < 0.1) and P(p < 0.02) of 300 searches against binomial chance, 1e-4 each. Trusting
+    the errors would call half of the data with a factor of 1.5 and nearly all with 4 unlikely.
+    """
+    rng = np.random.default_rng(6)
+    extra = ExtraNoise(*(np.sqrt(factor**2 - 1.0) * np.array([0.005, np.radians(0.3)])))
+    n, p = 300, []
+    for _ in range(n):
+        data = understated([0.0, 0.0, 0.0], rng, extra)
+        result, _ = search_with_noise(Likelihood(data), FIELD)
+        bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+        white = single_likelihood(result.likelihood).residuals(result.single_theta)
+        statistic = bank_statistic(bank, white, free_scale=True)[0]
+        null = null_maxima(bank, 1000, rng, free_scale=True)
+        p.append((1 + (null >= statistic).sum()) / 1001)
+    for level in (0.1, 0.02):
+        hits = int((np.array(p) < level).sum())
+        assert stats.binomtest(hits, n, level, alternative="greater").pvalue > 1e-4
+
+
+def test_profiled_statistic_does_not_depend_on_the_scale(rng) -> None:
+    data = niriss().only(("cp",))
+    bank = TemplateBank(Likelihood(data), make_grid(50.0, 400.0, 30.0), np.empty(0))
+    white = rng.standard_normal((bank.n_data, 5))
+    first = bank_statistic(bank, white, free_scale=True)
+    np.testing.assert_allclose(bank_statistic(bank, 7 * white, free_scale=True), first, rtol=1e-5)
+    gain = bank_statistic(bank, white, free_scale=False)
+    expected = -15 * np.log(1 - gain / (white**2).sum(axis=0))
+    np.testing.assert_allclose(first, expected, rtol=1e-6)
+    np.testing.assert_allclose(profiled(np.array([1e-6]), np.array([36.0]), 36), 1e-6, rtol=1e-5)

@@ -1,0 +1,272 @@
+"""Limits by injection and recovery: their rate of success is the one they state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+
+from amibayes.companion_search.result import null_likelihood
+from amibayes.companion_search.search import search
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.data.covariance import sparse_covariance
+from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.detection.false_alarm import bank_statistic, significance
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.limits.completeness import detection_limit, fit_logistic
+from amibayes.limits.injection import recover
+from amibayes.oifits import write_oifits
+from amibayes.pipeline.limits import LimitsOptions, measure_limits
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.search import search_field, weigh
+from amibayes.units import offset
+
+
+@pytest.fixture(scope="module")
+def setting():
+    data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    result = search(Likelihood(data), (50.0, 400.0))
+    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    rng = np.random.default_rng(2)
+    weight = significance(bank, 0.0, 20_000, rng, alpha=0.01)
+    limit = detection_limit(result, weight, rng, n_separations=6, trials_per_cell=200)
+    return result, bank, weight, limit
+
+
+def found_by_a_full_search(theta: list[float], rng, threshold: float) -> bool:
+    """Fresh data, a new search of them, its best statistic and the position it reports."""
+    again = search(Likelihood(simulated(niriss(), theta, rng)), (50.0, 400.0))
+    away = np.hypot(again.companion.east_mas - theta[0], again.companion.north_mas - theta[1])
+    return bool(again.bank_delta_chi2.max() > threshold and away < 94.0)
+
+
+def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
+    """Fresh companions at c50 and at c95, each found by an independent full search.
+
+    The bounds add the binomial error of the count to what the fit's own error of c50 moves
+    (its slope is near 6 per unit of ln c); 4.5 sigma.
+    """
+    _, _, weight, limit = setting
+    rng = np.random.default_rng(3)
+    n, k = 40, 3
+    for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
+        places = zip(*offset(limit.separation_mas[k], rng.uniform(0, 360, n)), strict=True)
+        found = sum(
+            found_by_a_full_search([float(e), float(m), contrast], rng, weight.threshold())
+            for e, m in places
+        )
+        spread = np.sqrt(n * expected * (1 - expected)) + 6 * 0.25 * limit.log_error_50[k] * n
+        assert abs(found - n * expected) < 4.5 * spread
+
+
+def test_probability_of_any_companion_is_that_of_the_injections(setting) -> None:
+    """χ² of the recovered counts of all rings and levels; its 1e-4 quantile."""
+    limit = setting[3]
+    rho, k = limit.separation_mas, 3
+    for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
+        assert limit.probability(rho[k], contrast) == pytest.approx(expected, abs=1e-6)
+    p = np.array(
+        [[limit.probability(r, c) for c in row] for r, row in zip(rho, limit.level, strict=True)]
+    )
+    expected, spread = limit.trials * p, np.sqrt(limit.trials * p * (1.0 - p))
+    sure = spread > 1.0
+    chi2 = (((limit.recovered - expected) / np.where(sure, spread, 1.0))[sure] ** 2).sum()
+    assert chi2 < stats.chi2.isf(1e-4, sure.sum())
+    middle = limit.probability(0.5 * (rho[1] + rho[2]), 1e-3)
+    ends = sorted(limit.probability(r, 1e-3) for r in rho[1:3])
+    assert ends[0] <= middle <= ends[1]
+    assert limit.probability(rho[k], 1e-9) < 1e-3
+    assert limit.probability(rho[k], 1.0) > 0.9999
+    assert np.isnan([limit.probability(r, 1e-3) for r in (0.9 * rho[0], 1.1 * rho[-1])]).all()
+
+
+@pytest.mark.slow
+def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) -> None:
+    """c50 and c95 of `measure_limits` against the search job's own verdict on 1000 new data sets.
+
+    Each is simulated in the space of the data, read by nothing of the limits, searched as
+    `search_companion` does (extra noise and all), weighed by the statistic without scale, and
+    located by the position that it reports. 4.5 sigma of count and fit together.
+    """
+    write_oifits(tmp_path / "t.oifits", simulated(niriss(), [0.0] * 3, np.random.default_rng(1)))
+    asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=100_000)
+    options = LimitsOptions(asked, observables=("vis2", "cp"), n_separations=8)
+    limit = measure_limits([tmp_path / "t.oifits"], options=options).main.limit
+    rng, k, n = np.random.default_rng(21), 4, 1000
+    for contrast, expected, error in (
+        (limit.contrast_50[k], 0.5, limit.log_error_50[k]),
+        (limit.contrast[k], 0.95, limit.log_error[k]),
+    ):
+        found = 0
+        for angle in rng.uniform(0, 360, n):
+            east, north = (float(x) for x in offset(limit.separation_mas[k], angle))
+            data = simulated(niriss(), [east, north, contrast], rng)
+            result, _, _ = search_field(data, asked)
+            bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+            white = single_likelihood(result.likelihood).residuals(result.single_theta)
+            seen = bank_statistic(bank, white, free_scale=True)[0] > limit.threshold
+            c = result.companion
+            found += bool(seen and np.hypot(c.east_mas - east, c.north_mas - north) < 94.0)
+        slope = 7.0 * expected * (1.0 - expected)
+        spread = np.hypot(np.sqrt(n * expected * (1 - expected)), n * slope * error)
+        assert abs(found - n * expected) < 4.5 * spread
+
+
+def test_false_positive_rate_is_alpha(setting) -> None:
+    """Noise in the space of the data, templates by finite differences, generalised χ²: no bank.
+
+    Both the threshold (20 000 draws) and the count (20 000) scatter; 4.5 sigma.
+    """
+    result, bank, weight, limit = setting
+    likelihood = result.likelihood
+    covariance, n = likelihood.observables.covariance, 20_000
+    step = 1e-6
+    places = np.column_stack([bank.grid.east_mas, bank.grid.north_mas, np.full(len(bank), step)])
+    alone = likelihood.predict([[100.0, 0.0, 0.0]])
+    templates = (likelihood.predict(places) - alone) / step
+    weighted = covariance.solve(templates)
+    norm = (templates * weighted).sum(axis=0)
+    noise = covariance.draw(np.random.default_rng(9), n)
+    gain = np.maximum(weighted.T @ noise, 0.0) ** 2 / norm[:, None]
+    rate = (gain.max(axis=0) > weight.threshold()).mean()
+    sigma = np.sqrt(0.01 * 0.99 * (1 / n + 1 / 20_000))
+    assert abs(rate - limit.false_positive_rate) < 4.5 * sigma
+    exceeding, drawn = limit.false_positives
+    assert abs(exceeding / drawn - rate) < 4.5 * sigma
+    low, high = limit.false_positive_interval
+    assert low < exceeding / drawn < high
+
+
+def test_rounds_change_nothing_but_where_trials_go(setting) -> None:
+    *_, limit = setting
+    assert limit.trials.sum() == 6 * 14 * 200
+    middle = np.abs(limit.share - 0.5) < 0.3
+    assert limit.trials[middle].mean() > 1.5 * limit.trials[~middle].mean()
+
+
+def test_spread_over_angles_is_what_injections_at_single_angles_find(setting) -> None:
+    """Limits at single position angles, by many injections at each: their median and 68 %."""
+    result, bank, weight, limit = setting
+    k, rng = 2, np.random.default_rng(12)
+    each = []
+    for angle in np.arange(0.0, 360.0, 15.0) + 3.0:
+        east, north = offset(limit.separation_mas[k], angle)
+        level = np.repeat(limit.contrast_50[k] * np.geomspace(0.6, 2.2, 8), 250)
+        theta = np.column_stack([np.full(2000, east), np.full(2000, north), level])
+        found = recover(result.likelihood, bank, np.empty(0), theta, weight.threshold(), rng)
+        share = found.located.reshape(8, 250).sum(axis=1).astype(float)
+        fit = fit_logistic(np.log(level[::250]), share, np.full(8, 250.0))
+        each.append(np.exp(fit.crossing(0.95)[0]))
+    low, middle, high = np.log(np.quantile(each, (0.16, 0.5, 0.84)))
+    stated = np.log(limit.spread[k])
+    # 24 angles sample the quantiles to 0.03, each limit has an error of 0.03.
+    np.testing.assert_allclose(stated, [low, middle, high], atol=0.12)
+
+
+def test_completeness_rises_with_contrast(setting) -> None:
+    *_, limit = setting
+    share = limit.recovered / limit.trials
+    assert (share[:, -1] > 0.95).all()
+    assert (share[:, 0] < 0.2).all()
+    assert (limit.contrast > limit.contrast_50).all()
+    low, high = limit.jeffreys()
+    assert ((low <= share + 1e-12) | (share == 0)).all()
+    assert ((high >= share - 1e-12) | (share == 1)).all()
+    found, tried = limit.recovered[0, 4], limit.trials[0, 4]
+    expected = stats.beta.ppf([0.16, 0.84], found + 0.5, tried + 0.5 - found)
+    np.testing.assert_allclose([low[0, 4], high[0, 4]], expected)
+
+
+def test_bright_companions_are_recovered_and_absent_ones_are_not(setting) -> None:
+    result, bank, weight, _ = setting
+    rng = np.random.default_rng(6)
+    east, north = offset(200.0, rng.uniform(0, 360, 500))
+    for contrast, low, high in ((0.05, 500, 500), (0.0, 0, 15)):
+        theta = np.column_stack([east, north, np.full(500, contrast)])
+        found = recover(
+            result.likelihood, bank, result.single_theta, theta, weight.threshold(), rng
+        )
+        assert low <= found.located.sum() <= high
+
+
+def test_same_seed_same_limit(setting) -> None:
+    result, _, weight, _ = setting
+    first = detection_limit(result, weight, np.random.default_rng(5), trials_per_cell=10)
+    again = detection_limit(result, weight, np.random.default_rng(5), trials_per_cell=10)
+    np.testing.assert_array_equal(first.contrast, again.contrast)
+
+
+def test_robust_search_has_limits_of_its_own_statistic() -> None:
+    """One closure phase is 30 sigma off: threshold, rate and limit are those of robust searches.
+
+    Injections of nothing are found at the rate α, and the limit is that of clean data but for the
+    scale, which the outlier stretches a little.
+    """
+    clean = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    phases = clean.closure_phase.value.copy()
+    phases[3] += np.radians(9.0)
+    spoilt = replace(clean, closure_phase=replace(clean.closure_phase, value=phases))
+    asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=20_000, alpha=0.01, robust=True)
+    found = []
+    for data in (clean, spoilt):
+        result, _, _ = search_field(data, asked)
+        weight = weigh(result, asked, np.random.default_rng(2), None, None)
+        rng = np.random.default_rng(3)
+        limit = detection_limit(result, weight, rng, separation_mas=[200.0], trials_per_cell=300)
+        likelihood, frame = null_likelihood(result)
+        assert frame is not None
+        bank = TemplateBank(likelihood, result.grid, result.single_theta)
+        nothing = np.column_stack([np.full(10_000, 200.0), np.zeros((10_000, 2))])
+        blank = recover(
+            likelihood,
+            bank,
+            np.empty(0),
+            nothing,
+            limit.threshold,
+            rng,
+            free_scale=True,
+            frame=frame,
+        )
+        sigma = np.sqrt(0.01 * 0.99 * (1 / 10_000 + 1 / 20_000))
+        assert abs(blank.detected.mean() - 0.01) < 4.5 * sigma
+        found.append(limit.delta_mag[0])
+    assert abs(found[0] - found[1]) < 0.4
+
+
+def test_limits_of_an_estimated_covariance_do_not_feel_the_companion_that_is_there() -> None:
+    """Rotations of the integrations would hold it as noise: 3 mag, in these data."""
+    limits = {}
+    for contrast in (0.0, 0.05):
+        sheet = replace(niriss(), freedom=Freedom(3000.0, 78.0), covariance_kind="estimated")
+        sheet = replace(sheet, scatter=sparse_covariance(sheet.covariance))
+        data = simulated(sheet, [150.0, 90.0, contrast], np.random.default_rng(6))
+        result = search(Likelihood(data), (50.0, 400.0))
+        weight = weigh(
+            result, SearchOptions(null_draws=2000, alpha=0.01), np.random.default_rng(1), None, None
+        )
+        assert weight.detected == (contrast > 0.0)
+        limits[contrast] = detection_limit(
+            result, weight, np.random.default_rng(2), separation_mas=[150.0, 300.0]
+        )
+        if contrast:
+            assert weight.threshold() > 1.5 * limits[contrast].threshold
+    without, beside = limits[0.0], limits[0.05]
+    # 1 % quantiles of 2000 draws: each about 4 % off; their residuals are not the same either.
+    assert beside.threshold == pytest.approx(without.threshold, rel=0.25)
+    error = np.hypot(without.log_error, beside.log_error)
+    assert (np.abs(np.log(beside.contrast / without.contrast)) < 0.15 + 4.0 * error).all()
+
+
+def test_a_kind_of_observable_that_cannot_carry_a_fit_is_left_out_and_named(tmp_path) -> None:
+    """Two squared visibilities say nothing by themselves of a companion's three numbers."""
+    data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    few = data.select(np.arange(data.n_vis2) < 2, np.ones(data.n_closure_phases, dtype=bool))
+    path = tmp_path / "few.oifits"
+    write_oifits(path, few)
+    search = SearchOptions(separation_mas=(60.0, 200.0), null_draws=500)
+    report = measure_limits([path], [], LimitsOptions(search, method="candid", n_separations=3))
+    assert [limit.observables for limit in report.limits] == [("vis2", "cp"), ("cp",)]
+    assert any("no limit from vis2 alone" in said for said in report.warnings)

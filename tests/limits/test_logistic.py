@@ -1,0 +1,104 @@
+"""The logistic fit: maximum likelihood, honest errors, and data that are all or nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import optimize, special, stats
+
+from amibayes.limits.completeness import fit_logistic
+from amibayes.limits.injection import allocate
+
+X = np.log(np.geomspace(0.4, 4.0, 14))
+
+
+def test_fit_is_that_of_a_general_optimiser() -> None:
+    rng = np.random.default_rng(1)
+    trials = rng.integers(100, 1000, len(X)).astype(float)
+    found = rng.binomial(trials.astype(int), special.expit(5.0 * (X - 0.2) - 2.0 * X**2)) * 1.0
+    fit = fit_logistic(X, found, trials)
+
+    def loss(beta: np.ndarray) -> float:
+        p = special.expit(np.polynomial.Polynomial(beta)(X - fit.centre))
+        return -float(stats.binom.logpmf(found, trials, p).sum())
+
+    best = optimize.minimize(loss, fit.beta, method="Nelder-Mead", options={"xatol": 1e-6}).x
+    # The wide prior moves it by a small part of its error.
+    assert np.abs(fit.beta - best).max() < 0.15 * np.sqrt(np.diag(fit.covariance)).min()
+
+
+def test_beyond_the_fitted_range_the_logit_goes_on_as_its_tangent() -> None:
+    trials = np.full(len(X), 1e4)
+    fit = fit_logistic(X, special.expit(5.0 * X - X**2) * trials, trials)
+    for end, away in ((fit.low, -1.0), (fit.high, 1.0)):
+        step = 1e-5 * away
+        logit = special.logit(fit(np.array([end - step, end, end + away, end + 3 * away])))
+        slope = (logit[1] - logit[0]) / step
+        np.testing.assert_allclose(logit[2:] - logit[1], slope * away * np.array([1, 3]), rtol=1e-3)
+    falling = fit_logistic(X, trials * special.expit(-4.0 * X - 10.0 * X**2), trials)
+    assert falling(falling.high + 5.0) == falling(falling.high)
+
+
+def test_errors_of_both_crossings_are_what_the_crossings_scatter() -> None:
+    """400 sets of binomial counts: mean of the pulls within 4.5/√400, their variance of χ²."""
+    rng = np.random.default_rng(2)
+    truth = special.expit(5.0 * X - 0.5 * X**2)
+    trials = np.full(len(X), 200.0)
+    n = 400
+    for probability in (0.5, 0.95):
+        level = special.logit(probability)
+        at = optimize.brentq(lambda x, a=level: 5.0 * x - 0.5 * x * x - a, -1.0, 2.0)
+        found = rng.binomial(200, truth, (n, len(X))).astype(float)
+        pulls = [
+            (x - at) / error
+            for x, error in (fit_logistic(X, f, trials).crossing(probability) for f in found)
+        ]
+        assert abs(np.mean(pulls)) < 4.5 / np.sqrt(n) + 0.1  # curvature: second order in the error
+        low, high = stats.chi2.ppf([1e-5, 1 - 1e-5], n - 1) / (n - 1)
+        assert low * 0.9 < np.var(pulls, ddof=1) < high * 1.1
+
+
+@pytest.mark.parametrize("unequal", [0.0, 0.15, 0.3])
+def test_normal_law_of_the_contrast_is_followed(unequal: float) -> None:
+    """A statistic that scatters normally is no logistic curve in ln c; 95 % must still be 95 %.
+
+    Expected counts, allocated as the rounds do, of directions whose sensitivities differ.
+    """
+    sigma = np.exp(unequal * stats.norm.ppf((np.arange(50) + 0.5) / 50))
+
+    def share(x: np.ndarray) -> np.ndarray:
+        return stats.norm.cdf(4.7 * np.exp(x)[..., None] / sigma - 4.7).mean(axis=-1)
+
+    p = share(X)
+    trials = 3360.0 * np.sqrt(p * (1 - p)) / np.sqrt(p * (1 - p)).sum()
+    fit = fit_logistic(X, p * trials, trials)
+    for probability, off in ((0.5, 0.005), (0.95, 0.004)):
+        x, _ = fit.crossing(probability)
+        assert share(np.array(x)) == pytest.approx(probability, abs=off)
+
+
+def test_all_or_nothing() -> None:
+    trials = np.full(len(X), 40.0)
+    step = np.where(X > 0.0, 40.0, 0.0)
+    x, error = fit_logistic(X, step, trials).crossing(0.5)
+    assert abs(x) < 0.12
+    assert 0.0 < error < 0.2
+    assert fit_logistic(X, 0.0 * step, trials).crossing(0.95)[0] == np.inf
+    assert fit_logistic(X, trials, trials).crossing(0.5)[0] == -np.inf
+
+
+def test_rounds_go_where_the_map_is_uncertain_and_are_whole() -> None:
+    first = allocate(np.zeros((3, 14), int), np.zeros((3, 14), int), 421)
+    assert first.sum() == 421
+    assert np.ptp(first) == 1
+    p = np.tile(special.expit(5.0 * X), (3, 1))
+    trials = np.full((3, 14), 1000)
+    extra = allocate(trials, np.rint(1000 * p).astype(int), 90_000)
+    assert extra.sum() == 90_000
+    assert extra.min() >= 0
+    share = (trials + extra)[0] / (trials + extra)[0].sum()
+    wanted = np.sqrt(p[0] * (1 - p[0]))
+    free = extra[0] > 100  # what was there already is too much at the ends
+    np.testing.assert_allclose(
+        share[free] / share[free].sum(), wanted[free] / wanted[free].sum(), rtol=0.05
+    )

@@ -1,0 +1,491 @@
+"""The audit: silent on our own files, and each mistake found where it was made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from oi_builders import HandMade, diagonal, table
+
+from amibayes.data.closure import closure_matrix
+from amibayes.data.observables import Observables, join
+from amibayes.data.point_source import point_source
+from amibayes.errors import DataError
+from amibayes.oifits import observables_of, open_oifits, read_oifits, write_oifits
+from amibayes.oifits.audit import audit, repair
+from amibayes.oifits.audit.repair import REMEDIES
+
+DEGREE = np.pi / 180
+
+
+def star(
+    rng: np.random.Generator,
+    *,
+    n: int = 7,
+    channels: int = 1,
+    kind: str = "assumed",
+    mjd: float = 6e4,
+    scatter: float = 1.0,
+    sigma: float = 0.01,
+) -> Observables:
+    """A source with closure phases that close, noise of the stated covariance."""
+    stations = rng.uniform(-3, 3, (n, 2))
+    waves = np.linspace(4.3e-6, 4.8e-6, channels)
+    sheet = point_source(
+        stations,
+        waves,
+        np.full(channels, 1e-7),
+        vis2_error=sigma,
+        closure_error_rad=sigma,
+        covariance="assumed",
+        mjd=mjd,
+    )
+    matrix = closure_matrix(sheet.closure_phase.stations[::channels])[0]
+    truth = np.repeat(matrix @ rng.normal(size=matrix.shape[1]) * 0.05, channels)
+    noise = scatter * sheet.covariance.draw(rng, 1)[:, 0]
+    n_vis2 = len(sheet.vis2)
+    made = replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=0.8 + noise[:n_vis2]),
+        closure_phase=replace(sheet.closure_phase, value=truth + noise[n_vis2:]),
+        covariance_kind=kind if kind != "diagonal" else "assumed",  # type: ignore[arg-type]
+        n_integrations=69 if kind == "estimated" else None,
+    )
+    return diagonal(made) if kind == "diagonal" else made
+
+
+def codes(path: Path) -> set[str]:
+    return {f.code for f in audit(path).findings}
+
+
+@pytest.mark.parametrize("kind", ["assumed", "given", "estimated"])
+@pytest.mark.parametrize("n", [3, 4, 7])
+def test_no_alarm_on_our_own_files(
+    n: int, kind: str, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    for seed in range(8):
+        made = star(rng, n=n, channels=1 + seed % 3, kind=kind, mjd=6e4 + seed / 7)
+        path = tmp_path / "a.fits"
+        write_oifits(path, made, overwrite=True)
+        assert audit(path).findings == ()
+
+
+def test_no_alarm_on_several_exposures(rng: np.random.Generator, tmp_path: Path) -> None:
+    one = star(rng, n=5)
+    parts = []
+    for k in range(12):
+        noise = one.covariance.draw(rng, 1)[:, 0]
+        parts.append(
+            replace(
+                one,
+                vis2=replace(one.vis2, value=0.8 + noise[:10], mjd=one.vis2.mjd + k / 50),
+                closure_phase=replace(
+                    one.closure_phase, value=noise[10:], mjd=one.closure_phase.mjd + k / 50
+                ),
+            )
+        )
+    write_oifits(tmp_path / "a.fits", join(parts))
+    assert audit(tmp_path / "a.fits").findings == ()
+    wild = [replace(p, covariance=scaled(p, 0.2)) for p in parts]
+    write_oifits(tmp_path / "b.fits", join(wild))
+    found = audit(tmp_path / "b.fits").findings
+    assert {f.code for f in found} == {"errors-too-small"}
+    assert len(found) == 2
+    ratio = float(found[0].what.split("scatter ")[1].split(" ")[0])
+    # 110 degrees of freedom: 7 %; 5 standard errors.
+    assert ratio == pytest.approx(5.0, rel=0.35)
+
+
+def scaled(observables: Observables, factor: float) -> Any:
+    from amibayes.data.covariance import Block, BlockCovariance, as_blocks
+
+    blocks = [
+        Block(b.index, b.matrix * factor**2, b.basis) for b in as_blocks(observables.covariance)
+    ]
+    return BlockCovariance(observables.covariance.size, blocks)
+
+
+def test_closures_given_as_independent(rng: np.random.Generator, tmp_path: Path) -> None:
+    write_oifits(tmp_path / "a.fits", star(rng, kind="diagonal"))
+    (finding,) = audit(tmp_path / "a.fits").findings
+    assert finding.code == "closures-as-independent"
+    assert "35 closure phases of which 15 are independent" in finding.what
+    assert "1.53" in finding.why
+
+
+Change = Callable[[fits.HDUList], None]
+
+
+def changed(rng: np.random.Generator, path: Path, change: Change, **options: Any) -> Path:
+    """One of our clean files with something done to it."""
+    write_oifits(path, star(rng, **options), overwrite=True)
+    with fits.open(path, memmap=False) as hdus:
+        change(hdus)
+        hdus.writeto(path.with_name("changed.fits"), overwrite=True)
+    return path.with_name("changed.fits")
+
+
+def set_column(name: str, column: str, rows: Any, value: Any) -> Change:
+    def change(hdus: fits.HDUList) -> None:
+        hdus[name].data[column][rows] = value
+
+    return change
+
+
+def scale_column(name: str, factor: float, *columns: str) -> Change:
+    def change(hdus: fits.HDUList) -> None:
+        for column in columns:
+            hdus[name].data[column] *= factor
+
+    return change
+
+
+def delete(name: str) -> Change:
+    def change(hdus: fits.HDUList) -> None:
+        del hdus[name]
+
+    return change
+
+
+def keyword(name: int | str, key: str, value: Any) -> Change:
+    def change(hdus: fits.HDUList) -> None:
+        hdus[name].header[key] = value
+
+    return change
+
+
+def unit(name: str, column: str, text: str | None) -> Change:
+    def change(hdus: fits.HDUList) -> None:
+        hdus[name].columns[column].unit = text
+
+    return change
+
+
+def in_radians(hdus: fits.HDUList) -> None:
+    scale_column("OI_T3", DEGREE, "T3PHI", "T3PHIERR")(hdus)
+    for column in ("T3PHI", "T3PHIERR"):
+        hdus["OI_T3"].columns[column].unit = "rad"
+
+
+def swap_stations(hdus: fits.HDUList) -> None:
+    stations = hdus["OI_T3"].data["STA_INDEX"]
+    stations[4] = stations[4][[1, 0, 2]]
+
+
+def swap_sides(hdus: fits.HDUList) -> None:
+    data = hdus["OI_T3"].data
+    data["U1COORD"], data["U2COORD"] = data["U2COORD"].copy(), data["U1COORD"].copy()
+
+
+def duplicate(hdus: fits.HDUList) -> None:
+    copy = hdus["OI_WAVELENGTH"].copy()
+    copy.header["EXTVER"] = 2
+    hdus.append(copy)
+
+
+CASES: dict[str, tuple[Change, set[str]]] = {
+    "no target": (delete("OI_TARGET"), {"table-missing"}),
+    "no array": (delete("OI_ARRAY"), {"table-missing", "reference"}),
+    "no wavelengths": (delete("OI_WAVELENGTH"), {"table-missing", "reference"}),
+    "no correlations": (delete("OI_CORR"), {"reference"}),
+    "no observer": (keyword(0, "OBSERVER", ""), {"primary-keyword"}),
+    "content": (keyword(0, "CONTENT", "OIFITS3"), {"primary-keyword"}),
+    "no date": (keyword("OI_VIS2", "DATE-OBS", ""), {"table-keyword"}),
+    "revision": (keyword("OI_T3", "OI_REVN", 1), {"revision"}),
+    "wrong night": (keyword("OI_VIS2", "DATE-OBS", "1999-01-01"), {"date"}),
+    "no night": (keyword("OI_VIS2", "DATE-OBS", "yesterday"), {"date"}),
+    "spelling": (unit("OI_VIS2", "UCOORD", "METERS"), {"unit-spelling"}),
+    "no unit": (unit("OI_T3", "T3PHI", None), {"unit-spelling"}),
+    "radians": (in_radians, {"unit"}),
+    "kilometres": (unit("OI_VIS2", "UCOORD", "km"), {"unit", "uv-stations", "uv-length"}),
+    "target": (set_column("OI_VIS2", "TARGET_ID", 3, 9), {"reference"}),
+    "station": (set_column("OI_VIS2", "STA_INDEX", 3, [1, 9]), {"reference"}),
+    "instrument": (keyword("OI_VIS2", "INSNAME", "X"), {"reference"}),
+    "repeated": (duplicate, {"repeated"}),
+    "target 0": (
+        lambda h: (
+            [
+                set_column(n, "TARGET_ID", slice(None), 0)(h)
+                for n in ("OI_TARGET", "OI_VIS2", "OI_T3")
+            ]
+            and None
+        ),
+        {"number-below-one"},
+    ),
+    "nan": (set_column("OI_VIS2", "VIS2DATA", 3, np.nan), {"unusable-unflagged"}),
+    "zero error": (set_column("OI_VIS2", "VIS2ERR", 3, 0.0), {"unusable-unflagged"}),
+    "negative error": (set_column("OI_T3", "T3PHIERR", 3, -1.0), {"unusable-unflagged"}),
+    "all flagged": (set_column("OI_T3", "FLAG", slice(None), True), {"all-flagged"}),
+    "V2 above 1": (set_column("OI_VIS2", "VIS2DATA", 3, 1.2), {"vis2-above-one"}),
+    "V2 below 0": (set_column("OI_VIS2", "VIS2DATA", 3, -0.2), {"vis2-negative"}),
+    "two turns": (set_column("OI_T3", "T3PHI", 3, 800.0), {"phase-range", "non-closing"}),
+    "said degrees": (
+        scale_column("OI_T3", DEGREE, "T3PHI", "T3PHIERR"),
+        {"phase-in-radians"},
+    ),
+    "microns": (scale_column("OI_WAVELENGTH", 1e6, "EFF_WAVE"), {"wavelength"}),
+    "no width": (set_column("OI_WAVELENGTH", "EFF_BAND", 0, 0.0), {"wavelength"}),
+    "long": (set_column("OI_VIS2", "INT_TIME", 3, 1e6), {"integration-time"}),
+    "station twice": (set_column("OI_T3", "STA_INDEX", 3, [1, 1, 2]), {"station-twice"}),
+    "station order": (swap_stations, {"uv-stations", "non-closing"}),
+    "sides": (swap_sides, {"uv-stations"}),
+    "turned phase": (
+        lambda h: h["OI_T3"].data["T3PHI"].__setitem__(4, h["OI_T3"].data["T3PHI"][4] + 20),
+        {"non-closing"},
+    ),
+    "off the Earth": (keyword("OI_ARRAY", "FRAME", "GEOCENTRIC"), {"array-centre"}),
+    "correlation 2": (set_column("OI_CORR", "CORR", 3, 2.0), {"correlations"}),
+    "correlation index": (keyword("OI_CORR", "NDATA", 5), {"correlations"}),
+    "correlation order": (
+        lambda h: (
+            [set_column("OI_CORR", c, 3, i)(h) for c, i in (("IINDX", 56), ("JINDX", 1))] and None
+        ),
+        {"correlations"},
+    ),
+    "not a matrix": (
+        lambda h: h["OI_CORR"].data["CORR"].__setitem__(slice(None), 0.999),
+        {"correlations"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_mistake_is_found(name: str, rng: np.random.Generator, tmp_path: Path) -> None:
+    change, expected = CASES[name]
+    found = audit(changed(rng, tmp_path / "a.fits", change, sigma=1e-3))
+    assert {f.code for f in found.findings} == expected
+    for finding in found.findings:
+        assert finding.what
+        assert finding.why
+        assert finding.remedy
+        assert not finding.certain or finding.code in REMEDIES
+
+
+def test_trailing_bytes(rng: np.random.Generator, tmp_path: Path) -> None:
+    path = tmp_path / "a.fits"
+    write_oifits(path, star(rng))
+    path.write_bytes(path.read_bytes() + b"\0" * 99)
+    assert codes(path) == {"trailing-bytes"}
+
+
+def test_turned_triangle_is_named(rng: np.random.Generator, tmp_path: Path) -> None:
+    def turn(hdus: fits.HDUList) -> None:
+        hdus["OI_T3"].data["T3PHI"][4] *= -1
+
+    path = changed(rng, tmp_path / "a.fits", turn, sigma=1e-3)
+    (finding,) = audit(path).findings
+    assert finding.code == "non-closing"
+    stations = open_oifits(path).named("OI_T3")[0].columns["STA_INDEX"][4]
+    assert "with " + "-".join(f"H{i}" for i in stations) + " turned round" in finding.what
+
+
+def test_phases_that_fill_a_circle_of_radians(rng: np.random.Generator, tmp_path: Path) -> None:
+    def wild(hdus: fits.HDUList) -> None:
+        data = hdus["OI_T3"].data
+        data["T3PHI"] = rng.uniform(-np.pi, np.pi, data["T3PHI"].shape)
+        data["T3PHI"][0] = 3.1
+
+    assert "phase-in-radians" in codes(changed(rng, tmp_path / "a.fits", wild))
+
+
+def jwst_like(hdus: fits.HDUList, n: int, *, normalized: bool = False) -> None:
+    """OI_VIS, errors and pistons as the `ami` steps write them."""
+    vis2 = hdus["OI_VIS2"]
+    amplitude = np.sqrt(vis2.data["VIS2DATA"])
+    sigma = vis2.data["VIS2ERR"] / (2 * amplitude)
+    vis2.data["VIS2ERR"] /= np.sqrt(n)
+    same = {
+        c: (vis2.columns[c].format, vis2.data[c].copy(), vis2.columns[c].unit or "")
+        for c in ("TARGET_ID", "TIME", "MJD", "INT_TIME", "UCOORD", "VCOORD", "STA_INDEX", "FLAG")
+    }
+    vis = table(
+        "OI_VIS",
+        same
+        | {
+            "VISAMP": ("1D", amplitude, ""),
+            "VISAMPERR": ("1D", sigma, ""),
+            "VISPHI": ("1D", 0 * sigma, "deg"),
+            "VISPHIERR": ("1D", np.degrees(sigma), "deg"),
+        },
+        OI_REVN=2,
+        INSNAME=vis2.header["INSNAME"],
+        ARRNAME=vis2.header["ARRNAME"],
+        DATE_OBS=vis2.header["DATE-OBS"],
+    )
+    hdus.append(vis)
+    if normalized:
+        array = hdus["OI_ARRAY"]
+        columns = fits.ColDefs(
+            [
+                fits.Column(c, "1D", array=np.zeros(len(array.data)))
+                for c in ("PISTON_T", "PISTON_C")
+            ]
+        )
+        index = hdus.index_of("OI_ARRAY")
+        hdus[index] = fits.BinTableHDU.from_columns(array.columns + columns, header=array.header)
+
+
+@pytest.mark.parametrize("n", [1, 2, 69])
+def test_vis2_errors_divided_twice(n: int, rng: np.random.Generator, tmp_path: Path) -> None:
+    path = changed(rng, tmp_path / "a.fits", lambda h: jwst_like(h, n))
+    found = audit(path)
+    assert {f.code for f in found.findings} == ({"vis2-error-divided-twice"} if n > 1 else set())
+    if n > 1:
+        repair(found.oifits, list(found.findings), tmp_path / "b.fits")
+        mended = observables_of(open_oifits(tmp_path / "b.fits"))
+        np.testing.assert_allclose(mended.errors[0], 0.01, rtol=1e-6)
+        assert audit(tmp_path / "b.fits").findings == ()
+
+
+def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Target 0.9 ± 0.001 over calibrator 0.8 ± 0.004, propagated rightly and exchanged."""
+    target, calibrator = rng.uniform(0.5, 1.0, 21), rng.uniform(0.5, 1.0, 21)
+    e_t, e_c = 0.001, 0.004
+
+    def write(hdus: fits.HDUList, *, wrong: bool) -> None:
+        jwst_like(hdus, 1, normalized=True)
+        value = target / calibrator
+        right = value * np.hypot(e_t / target, e_c / calibrator)
+        exchanged = value * np.hypot(e_c / target, e_t / calibrator)
+        hdus["OI_VIS2"].data["VIS2DATA"] = value
+        hdus["OI_VIS2"].data["VIS2ERR"] = exchanged if wrong else right
+        hdus["OI_VIS"].data["VISAMP"] = np.sqrt(value)
+        hdus["OI_VIS"].data["VISAMPERR"] = right / (2 * np.sqrt(value))
+
+    for wrong in (True, False):
+        path = changed(
+            rng, tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal"
+        )
+        assert ("exchanged-errors" in codes(path)) == wrong
+
+
+def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Noise alike along and across the bispectrum of N = 69 integrations."""
+    amplitude = rng.uniform(0.2, 0.9, 35)
+    estimates = rng.chisquare(68, (2, 35)) / 68
+    along, across = 0.004 * np.sqrt(estimates)
+
+    def write(hdus: fits.HDUList, *, wrong: bool) -> None:
+        data = hdus["OI_T3"].data
+        data["T3AMP"], data["T3AMPERR"] = amplitude, along
+        data["T3PHIERR"] = np.degrees(across / (1 if wrong else amplitude))
+
+    for wrong in (True, False):
+        path = changed(
+            rng, tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal"
+        )
+        assert ("phase-error-times-amplitude" in codes(path)) == wrong
+
+
+def test_repair_mends_what_is_certain_and_nothing_else(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    def spoil(hdus: fits.HDUList) -> None:
+        in_radians(hdus)
+        hdus["OI_VIS2"].data["VIS2DATA"][3] = np.nan
+        hdus["OI_VIS2"].columns["UCOORD"].unit = "METERS"
+        hdus[0].header["OBSERVER"] = ""
+        hdus[0].header["DATE-OBS"] = ""
+
+    path = changed(rng, tmp_path / "a.fits", spoil)
+    path.write_bytes(path.read_bytes() + b"\0" * 10)
+    found = audit(path)
+    mended = repair(found.oifits, list(found.findings), tmp_path / "mended.fits")
+    assert {f.code for f in mended} == {
+        "trailing-bytes",
+        "primary-keyword",
+        "unit-spelling",
+        "unit",
+        "unusable-unflagged",
+    }
+    assert audit(tmp_path / "mended.fits").findings == ()
+    before, after = read_oifits(path), read_oifits(tmp_path / "mended.fits")
+    np.testing.assert_allclose(after.data, before.data, rtol=1e-13)
+    np.testing.assert_array_equal(after.vis2.flag, before.vis2.flag)
+    header = fits.getheader(tmp_path / "mended.fits")
+    assert (header["OBSERVER"], header["DATE-OBS"]) == ("UNKNOWN", "2023-02-25")
+
+
+def test_a_version_1_file(rng: np.random.Generator, tmp_path: Path) -> None:
+    made = HandMade(rng)
+    path = made.write(tmp_path / "a.fits")
+    found = {f.code for f in audit(path).findings}
+    assert found == {
+        "column-missing",
+        "unit-spelling",
+        "closures-as-independent",
+        "table-keyword",
+    }
+
+
+def test_file_without_interferometry_is_audited(rng: np.random.Generator, tmp_path: Path) -> None:
+    made = HandMade(rng)
+    del made.tables["OI_VIS2"], made.tables["OI_T3"]
+    assert "table-missing" in codes(made.write(tmp_path / "a.fits"))
+    with pytest.raises(DataError):
+        audit(tmp_path / "none.fits")
+
+
+def test_public_files(data: Path) -> None:
+    """The findings, each checked by hand against the files."""
+    expected = {
+        "axcir_pionier.oifits": {
+            "array-centre",
+            "unit-spelling",
+            "integration-time",
+            "closures-as-independent",
+        },
+        "axcir_pionier_cov.oifits": {"array-centre", "unit-spelling", "integration-time"},
+        "beauty2004.fits": {"unit-spelling", "number-below-one", "date"},
+        "contest2008_binary.oifits": {
+            "array-centre",
+            "unit-spelling",
+            "number-below-one",
+            "closures-as-independent",
+        },
+        "created_v2.fits": {"vis2-above-one", "phase-range", "uv-stations", "uv-length"},
+        "gravity_singlesci.fits": {
+            "unusable-unflagged",
+            "vis2-negative",
+            "closures-as-independent",
+        },
+        "niriss_f430m_amical.oifits": {
+            "primary-keyword",
+            "table-keyword",
+            "unit-spelling",
+            "closures-as-independent",
+        },
+        "testdata_opt.fits": set(),
+    }
+    for name, wanted in expected.items():
+        assert codes(data / "oifits" / name) == wanted, name
+    with pytest.raises(DataError, match="is cut short"):
+        audit(data / "oifits" / "corrupted" / "truncated.fits")
+
+
+@pytest.mark.parametrize("spoilt", ["absent", "words", "wide"])
+def test_any_column_may_be_anything(spoilt: str, tmp_path: Path) -> None:
+    """Whichever column it is, the audit ends, with the column named or the file refused."""
+    whole = HandMade(np.random.default_rng(1)).tables
+    for name, column in [(t, c) for t, columns in whole.items() for c in columns]:
+        made = HandMade(np.random.default_rng(1))
+        form, values, _ = made.tables[name][column]
+        if spoilt == "absent":
+            del made.tables[name][column]
+        elif spoilt == "wide":
+            made.put(name, column, np.ones((len(values), 5)), form="5D")
+        elif form.endswith("A"):
+            continue
+        else:
+            made.put(name, column, ["x"] * len(values), form="4A", unit="")
+        path = made.write(tmp_path / f"{name}_{column}.fits")
+        try:
+            said = [f"{f.where} {f.what}" for f in audit(open_oifits(path)).findings]
+        except DataError as refused:
+            said = [f"{column} {refused}"] if str(path) in str(refused) else []
+        assert any(column in text for text in said), (name, column)

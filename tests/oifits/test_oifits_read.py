@@ -1,0 +1,613 @@
+"""Reading OIFITS: files made by hand whose truth is known, odd files, broken files."""
+
+from __future__ import annotations
+
+import gzip
+import tracemalloc
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy import units
+from astropy.io import fits
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oi_builders import HandMade, table
+
+from amibayes.data.covariance import DiagonalCovariance
+from amibayes.errors import DataError
+from amibayes.oifits import observables_of, open_oifits, read_oifits
+from amibayes.oifits.scales import ANGLE, LENGTH, TIME
+
+DEGREE = np.pi / 180
+
+
+@pytest.fixture
+def made(rng: np.random.Generator) -> HandMade:
+    return HandMade(rng)
+
+
+def test_reads_what_is_in_the_file(made: HandMade, tmp_path: Path) -> None:
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_array_equal(data.vis2.value, made.vis2.ravel())
+    np.testing.assert_allclose(data.closure_phase.value, made.phase_deg.ravel() * DEGREE)
+    vis2_error, phase_error = data.errors
+    np.testing.assert_allclose(vis2_error, made.vis2_error.ravel())
+    # The ridge reproduces errors to 1e-3 where baselines can.
+    assert phase_error.shape == (12,)
+    np.testing.assert_array_equal(data.vis2.stations[::3] + 1, made.baselines)
+    np.testing.assert_array_equal(data.closure_phase.stations[::3] + 1, made.triangles)
+    np.testing.assert_array_equal(data.vis2.channel, np.tile([0, 1, 2], 6))
+    np.testing.assert_allclose(data.vis2.wavelength_m[:3], made.wavelength_m, rtol=1e-7)
+    np.testing.assert_array_equal(data.vis2.u_m[::3, 0], made.tables["OI_VIS2"]["UCOORD"][1])
+    setup = data.setups[0]
+    assert (setup.target, setup.insname, setup.arrname) == ("alf Test", "I", "X")
+    assert setup.stations == ("A", "B", "C", "D")
+    assert (setup.right_ascension_deg, setup.declination_deg) == (10.0, -20.0)
+    assert data.covariance_kind == "assumed"
+    assert data.n_independent == 18 + 9
+    assert data.notes == ()
+
+
+def test_closure_phase_follows_the_first_two_baselines(made: HandMade, tmp_path: Path) -> None:
+    m = read_oifits(made.write(tmp_path / "a.fits")).closure_phase
+    uv = {tuple(b): made.xy[b[1] - 1] - made.xy[b[0] - 1] for b in made.baselines}
+    for i in range(len(m)):
+        a, b, c = m.stations[i] + 1
+        np.testing.assert_allclose((m.u_m[i, 0], m.v_m[i, 0]), uv[a, b])
+        np.testing.assert_allclose((m.u_m[i, 1], m.v_m[i, 1]), uv[b, c])
+
+
+def test_diagonal_takes_errors_as_they_are(made: HandMade, tmp_path: Path) -> None:
+    data = read_oifits(made.write(tmp_path / "a.fits"), closure_covariance="diagonal")
+    assert isinstance(data.covariance, DiagonalCovariance)
+    np.testing.assert_allclose(data.errors[1], made.phase_error_deg.ravel() * DEGREE)
+    assert data.n_independent == 30
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("", 1.0), ("DEGREES", 1.0), ("rad", DEGREE), ("mrad", 1e3 * DEGREE)]
+)
+def test_phase_units_are_honoured(made: HandMade, tmp_path: Path, unit: str, scale: float) -> None:
+    truth = made.phase_deg * DEGREE
+    made.put("OI_T3", "T3PHI", made.phase_deg * scale, unit=unit)
+    made.put("OI_T3", "T3PHIERR", made.phase_error_deg * scale, unit=unit)
+    data = read_oifits(made.write(tmp_path / "a.fits"), closure_covariance="diagonal")
+    np.testing.assert_allclose(data.closure_phase.value, truth.ravel())
+    np.testing.assert_allclose(data.errors[1], made.phase_error_deg.ravel() * DEGREE)
+
+
+def test_error_unit_follows_the_phase_where_it_has_none(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_T3", "T3PHI", made.phase_deg * DEGREE, unit="rad")
+    made.put("OI_T3", "T3PHIERR", made.phase_error_deg * DEGREE, unit="")
+    data = read_oifits(made.write(tmp_path / "a.fits"), closure_covariance="diagonal")
+    np.testing.assert_allclose(data.errors[1], made.phase_error_deg.ravel() * DEGREE)
+
+
+def test_unknown_unit_is_read_as_the_standard_and_noted(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_T3", "T3PHI", made.phase_deg, unit="furlong")
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_allclose(data.closure_phase.value, made.phase_deg.ravel() * DEGREE)
+    assert any("furlong" in note for note in data.notes)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("micron", 1e6), ("nm", 1e9), ("Angstrom", 1e10)])
+def test_wavelength_units_are_honoured(
+    made: HandMade, tmp_path: Path, unit: str, scale: float
+) -> None:
+    made.put("OI_WAVELENGTH", "EFF_WAVE", made.wavelength_m * scale, unit=unit)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_allclose(data.setups[0].wavelength_m, made.wavelength_m, rtol=1e-6)
+
+
+def test_wavelengths_in_microns_without_unit_are_refused(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_WAVELENGTH", "EFF_WAVE", made.wavelength_m * 1e6)
+    with pytest.raises(DataError, match="EFF_WAVE is no wavelength in metres"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+
+
+def test_flags_and_unusable_numbers(made: HandMade, tmp_path: Path) -> None:
+    flag = np.zeros((6, 3), bool)
+    flag[0, 1] = True
+    made.put("OI_VIS2", "FLAG", flag)
+    made.vis2[1, 0] = np.nan
+    for i, bad in enumerate([np.nan, 0.0, -1.0, np.inf, 1e20]):
+        made.vis2_error[1 + i, 2] = bad
+    made.phase_error_deg[0, 0] = 1e9
+    made.phase_deg[1, 1] = 9.97e36
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    expected = flag.copy()
+    expected[1:, 2] = expected[1, 0] = True
+    np.testing.assert_array_equal(data.vis2.flag.reshape(6, 3), expected)
+    phase = np.zeros((4, 3), bool)
+    phase[0, 0] = phase[1, 1] = True
+    np.testing.assert_array_equal(data.closure_phase.flag.reshape(4, 3), phase)
+    assert any("6 value(s) without" in note for note in data.notes)
+    assert np.isfinite(data.data).all()
+
+
+def test_triple_amplitude_never_flags_the_phase(made: HandMade, tmp_path: Path) -> None:
+    assert np.isnan(made.tables["OI_T3"]["T3AMP"][1]).all()
+    assert read_oifits(made.write(tmp_path / "a.fits")).n_closure_phases == 12
+    del made.tables["OI_T3"]["T3AMP"], made.tables["OI_T3"]["T3AMPERR"]
+    assert read_oifits(made.write(tmp_path / "b.fits")).n_closure_phases == 12
+
+
+@pytest.mark.parametrize("missing", ["OI_TARGET", "OI_ARRAY", "STA_INDEX", "FLAG", "INT_TIME"])
+def test_missing_optional_parts(made: HandMade, tmp_path: Path, missing: str) -> None:
+    if missing == "STA_INDEX":
+        del made.tables["OI_ARRAY"]["STA_INDEX"]
+    elif missing in ("FLAG", "INT_TIME"):
+        del made.tables["OI_VIS2"][missing], made.tables["OI_T3"][missing]
+    else:
+        del made.tables[missing]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.n_vis2 == 18
+    assert data.n_closure_phases == 12
+    assert data.n_independent == 27
+    assert len(data.setups[0].stations) == 4
+
+
+def test_stations_that_the_array_does_not_list(made: HandMade, tmp_path: Path) -> None:
+    short = made.tables["OI_ARRAY"]
+    made.tables["OI_ARRAY"] = {n: (f, v[:2], u) for n, (f, v, u) in short.items()}
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.setups[0].stations == ("A", "B", "station 3", "station 4")
+    assert data.n_independent == 27
+
+
+def test_padding_and_case(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_ARRAY", "STA_NAME", ["A\0\0", "B  ", " C", "D"])
+    made.put("OI_TARGET", "TARGET", ["alf Test   \0"])
+    made.keywords["OI_VIS2"]["INSNAME"] = "i  "
+    made.tables["OI_VIS2"] = {n.lower(): v for n, v in made.tables["OI_VIS2"].items()}
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.setups[0].stations == ("A", "B", "C", "D")
+    assert data.setups[0].target == "alf Test"
+    assert data.n_vis2 == 18
+
+
+def test_one_channel_as_scalar_column(made: HandMade, tmp_path: Path) -> None:
+    for name, columns in made.tables.items():
+        for key, (form, values, unit) in columns.items():
+            if form in ("3D", "3L") and key != "STAXYZ":
+                columns[key] = (f"1{form[1]}", np.asarray(values)[:, 0], unit)
+            elif name == "OI_WAVELENGTH":
+                columns[key] = (form, values[:1], unit)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_array_equal(data.vis2.value, made.vis2[:, 0])
+
+
+def test_version_1_clock(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_VIS2", "MJD", np.full(6, 57000.0))
+    made.put("OI_VIS2", "TIME", 100.0 * np.arange(6), unit="s")
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_allclose((data.vis2.mjd[::3] - 57000) * 86400, 100.0 * np.arange(6))
+    made.put("OI_VIS2", "MJD", np.full(6, np.nan))
+    again = read_oifits(made.write(tmp_path / "b.fits"))
+    np.testing.assert_allclose((again.vis2.mjd[::3] - 57000) * 86400, 100.0 * np.arange(6))
+
+
+def test_several_targets(made: HandMade, tmp_path: Path) -> None:
+    made.tables["OI_TARGET"] = {
+        "TARGET_ID": ("1I", [1, 7, 9], ""),
+        "TARGET": ("16A", ["alf Test", "bet Test", "unseen"], ""),
+    }
+    assert read_oifits(made.write(tmp_path / "a.fits")).setups[0].target == "alf Test"
+    made.put("OI_VIS2", "TARGET_ID", [1, 1, 1, 7, 7, 7])
+    path = made.write(tmp_path / "b.fits")
+    with pytest.raises(DataError, match=r"several targets: alf Test, bet Test \(choose"):
+        read_oifits(path)
+    chosen = read_oifits(path, target="BET test")
+    np.testing.assert_array_equal(chosen.vis2.value, made.vis2[3:].ravel())
+    assert chosen.n_closure_phases == 0
+    np.testing.assert_array_equal(chosen.vis2.row[::3], [0, 1, 2])
+    with pytest.raises(DataError, match=r"no data of target 'gamma'.*alf Test, bet Test"):
+        read_oifits(path, target="gamma")
+
+
+def test_several_instruments(made: HandMade, rng: np.random.Generator, tmp_path: Path) -> None:
+    other = HandMade(rng)
+    other.wavelength_m = np.array([2.1e-6, 2.2e-6, 2.3e-6])
+    made.more += [
+        table("OI_WAVELENGTH", other.tables["OI_WAVELENGTH"], INSNAME="J"),
+        table("OI_VIS2", other.tables["OI_VIS2"], INSNAME="J", ARRNAME="X"),
+    ]
+    path = made.write(tmp_path / "a.fits")
+    both = read_oifits(path)
+    assert [s.insname for s in both.setups] == ["I", "J"]
+    np.testing.assert_array_equal(
+        both.vis2.value, np.concatenate([made.vis2.ravel(), other.vis2.ravel()])
+    )
+    one = read_oifits(path, insname="J")
+    np.testing.assert_array_equal(one.vis2.value, other.vis2.ravel())
+    with pytest.raises(DataError, match=r"no INSNAME 'K' \(it has I, J\)"):
+        read_oifits(path, insname="K")
+
+
+def test_tables_that_are_not_used_are_kept_and_named(made: HandMade, tmp_path: Path) -> None:
+    flux = table("OI_FLUX", {"FLUX": ("3D", made.vis2, "Jy")}, EXTVER=4)
+    made.more += [flux, fits.ImageHDU(np.arange(6.0).reshape(2, 3), name="EXTRA")]
+    oifits = open_oifits(made.write(tmp_path / "a.fits"))
+    assert [(t.name, t.extver) for t in oifits.unused] == [("OI_FLUX", 4), ("EXTRA", 1)]
+    np.testing.assert_array_equal(oifits.named("OI_FLUX")[0].columns["FLUX"], made.vis2)
+    np.testing.assert_array_equal(oifits.named("EXTRA")[0].image, np.arange(6.0).reshape(2, 3))
+    assert "OI_FLUX 4 is not used" in observables_of(oifits).notes
+    with pytest.raises(ValueError, match="read-only"):
+        oifits.named("OI_FLUX")[0].columns["FLUX"][0] = 1.0
+
+
+def test_correlations_of_oi_corr(made: HandMade, tmp_path: Path) -> None:
+    # V² 1 with 2, V² 3 with closure phase 19, closure phases 19 with 22 (same channel).
+    made.correlate([(1, 2, 0.5), (19, 3, -0.25), (19, 22, 0.3), (4, 4, 1.0)])
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.covariance_kind == "given"
+    dense = data.covariance.dense()
+    vis2, phase = made.vis2_error.ravel(), made.phase_error_deg.ravel() * DEGREE
+    np.testing.assert_allclose(dense[0, 1], 0.5 * vis2[0] * vis2[1])
+    np.testing.assert_allclose(dense[18, 2], -0.25 * phase[0] * vis2[2])
+    np.testing.assert_allclose(dense[18, 21], 0.3 * phase[0] * phase[3])
+    assert dense[3, 4] == 0
+    assert data.n_independent == 27
+    # Channels 1 and 2 have no correlation in the file: shared baselines are assumed there.
+    assert np.count_nonzero(dense[19, 18:]) == 4
+    np.testing.assert_allclose(np.diag(dense)[18:21:3], phase[:3:3] ** 2)
+
+
+def test_a_correlation_with_the_billionth_datum_takes_no_memory(made, tmp_path: Path) -> None:
+    """A damaged table of 9 GB would be asked for; the other pairs stand as they are."""
+    made.correlate([(1, 2, 0.5), (3, 1_275_068_417, 0.2)])
+    path = made.write(tmp_path / "a.fits")
+    tracemalloc.start()
+    dense = read_oifits(path).covariance.dense()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e7
+    vis2 = made.vis2_error.ravel()
+    np.testing.assert_allclose(dense[0, 1], 0.5 * vis2[0] * vis2[1])
+    assert np.count_nonzero(dense[:18, :18]) == 18 + 2
+
+
+def test_full_and_deficient_closure_matrix_have_kernel_rank(made: HandMade, tmp_path: Path) -> None:
+    from amibayes.data.closure import closure_matrix
+
+    matrix = closure_matrix(made.triangles - 1)[0]
+    shared = matrix @ matrix.T / 3
+    pairs = [
+        (19 + 3 * i + c, 19 + 3 * j + c, shared[i, j])
+        for c in range(3)
+        for i in range(4)
+        for j in range(i + 1, 4)
+    ]
+    made.correlate(pairs)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.covariance.rank == 27
+    draws = data.covariance.draw(np.random.default_rng(1), 3)
+    assert np.isfinite(draws).all()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "fault"),
+    [
+        ([(1, 2, 1.5)], "not between -1 and 1"),
+        ([(1, 2, np.nan)], "not between -1 and 1"),
+        ([(0, 2, 0.5)], "index below 1"),
+        ([(1, 2, 0.5), (2, 1, 0.4)], "two values for one correlation"),
+        ([(1, 2, 0.9), (1, 3, 0.9), (2, 3, -0.9)], "not positive definite"),
+    ],
+)
+def test_bad_correlations(
+    made: HandMade, tmp_path: Path, pairs: list[tuple[int, int, float]], fault: str
+) -> None:
+    made.correlate(pairs)
+    path = made.write(tmp_path / "a.fits")
+    with pytest.raises(DataError, match=rf"a\.fits: .*{fault}.*\(correct the correlations"):
+        read_oifits(path)
+    assert read_oifits(path, closure_covariance="diagonal").n_independent == 30
+
+
+def test_missing_correlation_table(made: HandMade, tmp_path: Path) -> None:
+    made.correlate([(1, 2, 0.5)])
+    made.more.clear()
+    with pytest.raises(DataError, match="no OI_CORR has that CORRNAME"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+
+
+@pytest.mark.parametrize("order", ["channels", "baselines"])
+@pytest.mark.parametrize("degrees", [False, True])
+def test_covariance_images(
+    made: HandMade, rng: np.random.Generator, tmp_path: Path, order: str, degrees: bool
+) -> None:
+    def image(sigma: np.ndarray, name: str) -> tuple[np.ndarray, fits.ImageHDU]:
+        n = sigma.size
+        # Of low rank and off the constant, so that every pair is correlated a little.
+        correlation = np.eye(n) + 0.3 * np.outer(*[np.linspace(0.2, 1, n)] * 2)
+        correlation /= np.sqrt(np.outer(np.diag(correlation), np.diag(correlation)))
+        truth = correlation * np.outer(sigma.ravel(), sigma.ravel())
+        grid = np.arange(n).reshape(sigma.shape)
+        written = (grid if order == "channels" else grid.T).ravel()
+        hdu = fits.ImageHDU(truth[np.ix_(written, written)][None], name=name)
+        hdu.header["INSNAME"] = "I"
+        return truth, hdu
+
+    vis2, first = image(made.vis2_error, "V2COV")
+    phase, second = image(made.phase_error_deg * (1 if degrees else DEGREE), "CPCOV")
+    made.more += [first, second]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert data.covariance_kind == "given"
+    np.testing.assert_allclose(data.covariance.dense()[:18, :18], vis2)
+    scale = DEGREE**2 if degrees else 1
+    np.testing.assert_allclose(data.covariance.dense()[18:, 18:], phase * scale)
+    assert not data.covariance.dense()[:18, 18:].any()
+    assert data.n_independent == 27
+
+
+def test_covariance_image_that_fits_nothing(made: HandMade, tmp_path: Path) -> None:
+    made.more.append(fits.ImageHDU(np.eye(18)[None], name="V2COV"))
+    with pytest.raises(DataError, match=r"diagonal of V2COV .* does not fit the errors"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+    made.more = [fits.ImageHDU(np.eye(5)[None], name="V2COV")]
+    with pytest.raises(DataError, match="is for 5 data, the tables hold 18"):
+        read_oifits(made.write(tmp_path / "b.fits"))
+
+
+def test_gzip(made: HandMade, tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "a.fits").read_bytes()
+    path = tmp_path / "a.fits.gz"
+    path.write_bytes(gzip.compress(raw))
+    assert read_oifits(path).n_vis2 == 18
+    path.write_bytes(gzip.compress(raw)[:-500])
+    with pytest.raises(DataError, match="compression is damaged"):
+        read_oifits(path)
+
+
+def test_files_that_are_no_oifits(made: HandMade, tmp_path: Path) -> None:
+    image = tmp_path / "image.fits"
+    fits.PrimaryHDU(np.zeros((4, 4))).writeto(image)
+    (tmp_path / "empty.fits").touch()
+    (tmp_path / "text.fits").write_text("SIMPLE words\n" * 400)
+    faults = {
+        "none.fits": "does not exist",
+        ".": "is a folder",
+        "empty.fits": "is empty",
+        "text.fits": "is not a FITS file",
+        "image.fits": "holds no OIFITS table",
+    }
+    for name, fault in faults.items():
+        with pytest.raises(DataError, match=fault) as caught:
+            read_oifits(tmp_path / name)
+        assert str(tmp_path / name) in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_without_interferometry(made: HandMade, tmp_path: Path) -> None:
+    del made.tables["OI_VIS2"], made.tables["OI_T3"]
+    path = made.write(tmp_path / "a.fits")
+    assert len(open_oifits(path).tables) == 3
+    with pytest.raises(DataError, match="neither squared visibilities nor closure phases"):
+        read_oifits(path)
+
+
+def test_everything_flagged(made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_VIS2", "FLAG", np.ones((6, 3), bool))
+    made.put("OI_T3", "FLAG", np.ones((4, 3), bool))
+    path = made.write(tmp_path / "a.fits")
+    for kind in ("assumed", "diagonal"):
+        with pytest.raises(DataError, match="every value is flagged"):
+            read_oifits(path, closure_covariance=kind)
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [
+        ("OI_VIS2", "VIS2DATA"),
+        ("OI_VIS2", "VIS2ERR"),
+        ("OI_VIS2", "UCOORD"),
+        ("OI_VIS2", "STA_INDEX"),
+        ("OI_T3", "T3PHI"),
+        ("OI_T3", "V2COORD"),
+        ("OI_WAVELENGTH", "EFF_WAVE"),
+    ],
+)
+def test_missing_required_columns(made: HandMade, tmp_path: Path, name: str, column: str) -> None:
+    del made.tables[name][column]
+    with pytest.raises(DataError, match=f"{name} .*has no column {column}"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+
+
+def test_shapes_that_do_not_fit(made: HandMade, tmp_path: Path) -> None:
+    for name, column, form, width in (
+        ("OI_VIS2", "VIS2ERR", "2D", 2),
+        ("OI_VIS2", "FLAG", "2L", 2),
+        ("OI_T3", "STA_INDEX", "2I", 2),
+    ):
+        kept = made.tables[name][column]
+        made.put(name, column, np.ones((len(kept[1]), width), int), form=form)
+        with pytest.raises(DataError, match=column):
+            read_oifits(made.write(tmp_path / "a.fits"))
+        made.tables[name][column] = kept
+    made.tables["OI_WAVELENGTH"] = {
+        n: (f, v[:2], u) for n, (f, v, u) in made.tables["OI_WAVELENGTH"].items()
+    }
+    with pytest.raises(
+        DataError, match=r"has 3 channel\(s\) in a row, its OI_WAVELENGTH 'I' has 2"
+    ):
+        read_oifits(made.write(tmp_path / "a.fits"))
+    del made.tables["OI_WAVELENGTH"]
+    with pytest.raises(DataError, match="no OI_WAVELENGTH has that INSNAME"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+
+
+def test_triangle_that_names_a_station_twice_is_flagged(made: HandMade, tmp_path: Path) -> None:
+    triangles = made.triangles.copy()
+    triangles[0] = [1, 2, 2]
+    made.put("OI_T3", "STA_INDEX", triangles)
+    assert read_oifits(made.write(tmp_path / "a.fits")).closure_phase.flag.sum() == 3
+
+
+def test_cut_files_are_unreadable(made: HandMade, tmp_path: Path) -> None:
+    raw = made.write(tmp_path / "a.fits").read_bytes()
+    path = tmp_path / "cut.fits"
+    whole = read_oifits(tmp_path / "a.fits")
+    for end in [1000, 2880 + 500, len(raw) // 2, len(raw) - 2881, len(raw) - 3000, len(raw) - 1]:
+        path.write_bytes(raw[:end])
+        with pytest.raises(DataError, match=r"cut\.fits"):
+            read_oifits(path)
+    path.write_bytes(raw + b"\0" * 100)
+    assert open_oifits(path).trailing_bytes == 100
+    assert "100 bytes after the last table" in read_oifits(path).notes
+    np.testing.assert_array_equal(read_oifits(path).data, whole.data)
+
+
+@settings(
+    max_examples=100,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(st.data())
+def test_damaged_bytes_give_an_error_or_data(tmp_path: Path, data: st.DataObject) -> None:
+    good = tmp_path / "good.fits"
+    if not good.exists():
+        made = HandMade(np.random.default_rng(3))
+        made.correlate([(1, 2, 0.5)])
+        made.write(good)
+    raw = bytearray(good.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path / "damaged.fits"
+    path.write_bytes(raw)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        message = ""
+        try:
+            assert np.isfinite(read_oifits(path).data).all()
+        except DataError as error:
+            message = str(error)
+    assert not message or "damaged.fits" in message
+    assert "\n" not in message
+
+
+@settings(
+    max_examples=30,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(order=st.permutations(range(4)), columns=st.permutations(range(3)))
+def test_rows_and_stations_in_any_order(
+    tmp_path: Path, order: list[int], columns: list[int]
+) -> None:
+    """Row order moves entries; station order turns sign and (u, v) as the closure demands."""
+    made = HandMade(np.random.default_rng(5))
+    plain = read_oifits(made.write(tmp_path / "plain.fits"))
+    swapped = made.triangles[order][:, columns]
+    parity = np.linalg.det(np.eye(3)[:, columns])
+    t = swapped - 1
+    uv1, uv2 = made.xy[t[:, 1]] - made.xy[t[:, 0]], made.xy[t[:, 2]] - made.xy[t[:, 1]]
+    made.put("OI_T3", "STA_INDEX", swapped)
+    made.put("OI_T3", "T3PHI", parity * made.phase_deg[order])
+    made.put("OI_T3", "T3PHIERR", made.phase_error_deg[order])
+    for name, values in (("U1COORD", uv1[:, 0]), ("V1COORD", uv1[:, 1])):
+        made.put("OI_T3", name, values)
+    for name, values in (("U2COORD", uv2[:, 0]), ("V2COORD", uv2[:, 1])):
+        made.put("OI_T3", name, values)
+    other = read_oifits(made.write(tmp_path / "other.fits"))
+    where = (np.array(order)[:, None] * 3 + np.arange(3)).ravel()
+    np.testing.assert_allclose(other.closure_phase.value, parity * plain.closure_phase.value[where])
+    # The data are the same data: chi-squared of the whole does not change.
+    np.testing.assert_allclose(
+        (plain.covariance.whiten(plain.data) ** 2).sum(),
+        (other.covariance.whiten(other.data) ** 2).sum(),
+        rtol=1e-6,
+    )
+
+
+def test_public_files(data: Path) -> None:
+    expected = {
+        "axcir_pionier.oifits": (900, 600, 1350, "assumed"),
+        "axcir_pionier_cov.oifits": (900, 600, 1350, "assumed"),
+        "niriss_f430m_amical.oifits": (21, 35, 36, "assumed"),
+        "contest2008_binary.oifits": (600, 800, 1000, "assumed"),
+        "beauty2004.fits": (240, 160, 400, "assumed"),
+        "testdata_opt.fits": (2, 1, 3, "assumed"),
+    }
+    for name, numbers in expected.items():
+        found = read_oifits(data / "oifits" / name)
+        assert (
+            found.n_vis2,
+            found.n_closure_phases,
+            found.n_independent,
+            found.covariance_kind,
+        ) == numbers, name
+    gravity = open_oifits(data / "oifits" / "gravity_singlesci.fits")
+    assert observables_of(gravity, insname="SPECTRO_SC").n_vis2 == 1408
+    assert [t.name for t in gravity.unused] == ["OI_VIS", "OI_FLUX", "OI_VIS", "OI_FLUX"]
+    with pytest.raises(DataError, match="neither squared visibilities"):
+        read_oifits(data / "oifits" / "midi_ngc5128.oifits")
+    with pytest.raises(DataError, match=r"truncated\.fits: is cut short"):
+        read_oifits(data / "oifits" / "corrupted" / "truncated.fits")
+
+
+def test_correlations_of_a_public_file_that_contradict_its_triangles(data: Path) -> None:
+    """Half of the exposures list their triangles in another order than their CPCOV assumes."""
+    path = data / "oifits" / "axcir_pionier_cov.oifits"
+    found = read_oifits(path)
+    assert any("contradict" in note and "of 50 exposures" in note for note in found.notes)
+    with fits.open(path) as hdus:
+        diagonal = np.diagonal(hdus["CPCOV"].data, axis1=1, axis2=2).ravel()
+    plain = read_oifits(path, closure_covariance="diagonal")
+    np.testing.assert_allclose(plain.errors[1] ** 2, diagonal, rtol=1e-6)
+
+
+def test_values_that_no_calibration_error_explains_are_flagged(
+    made: HandMade, tmp_path: Path
+) -> None:
+    vis2, phase = made.vis2.copy(), made.phase_deg.copy()
+    vis2[0, 0], vis2[1, 1], vis2[2, 2] = 1e8, -2e4, 9.0
+    phase[0, 0], phase[1, 1] = 1e20, 350.0
+    made.put("OI_VIS2", "VIS2DATA", vis2)
+    made.put("OI_T3", "T3PHI", phase)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert list(np.flatnonzero(data.vis2.flag)) == [0, 4]
+    assert list(np.flatnonzero(data.closure_phase.flag)) == [0]
+    assert "OI_VIS2 (extension 4): 2 value(s) without a usable value or error flagged" in data.notes
+    assert "OI_T3 (extension 5): 1 value(s) without a usable value or error flagged" in data.notes
+
+
+@pytest.mark.parametrize(
+    ("band", "read", "said"),
+    [
+        ([-5e-8, 5e-8, 5e-8], [5e-8] * 3, "EFF_BAND is negative: its size is used"),
+        ([1e8, 5e-8, np.nan], [0.0, 5e-8, 0.0], "EFF_BAND of 2 channel(s) is no width"),
+        ([np.inf, -1.0, 0.0], [0.0] * 3, "EFF_BAND of 2 channel(s) is no width"),
+    ],
+)
+def test_widths_that_are_none(band, read, said: str, made: HandMade, tmp_path: Path) -> None:
+    made.put("OI_WAVELENGTH", "EFF_BAND", band)
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_allclose(data.setups[0].band_m, read, rtol=1e-6)
+    assert sum(said in note for note in data.notes) == 1
+
+
+def test_a_file_without_widths_says_so(made: HandMade, tmp_path: Path) -> None:
+    del made.tables["OI_WAVELENGTH"]["EFF_BAND"]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    np.testing.assert_array_equal(data.setups[0].band_m, 0.0)
+    assert data.notes == (
+        "OI_WAVELENGTH (extension 3) has no EFF_BAND: channels are taken as narrow",
+    )
+
+
+SPELLINGS = {"a": "angstrom", "mum": "um", "sec": "s"}
+
+
+@pytest.mark.parametrize(("known", "si"), [(LENGTH, "m"), (ANGLE, "rad"), (TIME, "s")])
+def test_units_are_worth_what_astropy_says(known: dict[str, float], si: str) -> None:
+    for name, factor in known.items():
+        spelled = SPELLINGS.get(name, name.replace("metre", "meter"))
+        unit = units.Unit(spelled, parse_strict="silent")
+        if isinstance(unit, units.UnrecognizedUnit):
+            unit = units.Unit(spelled.removesuffix("s"))
+        assert factor == pytest.approx(unit.to(si), rel=1e-14), name

@@ -1,0 +1,176 @@
+"""Vetting finds the bad calibrator, keeps the good ones, and says why."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+from test_joint import F430M, epoch, noisy
+
+from amibayes.cli import main
+from amibayes.errors import DataError
+from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
+from amibayes.models.components import BinaryModel
+from amibayes.oifits import write_oifits
+from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, vet
+from amibayes.report.vetting import vetting_picture, vetting_table
+
+FIELD = (50.0, 400.0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Good calibrators are dropped 0.9 % of the time: this seed has none of those."""
+    return np.random.default_rng(7)
+
+
+def calibrator(rng, theta=(0.0, 0.0, 0.0), name="cal", scatter=0.0, model=None):
+    sheet = niriss()
+    noisy = add_noise(sheet, ExtraNoise(0.005 * scatter, np.radians(0.3 * scatter)))
+    data = simulated(noisy, list(theta), rng, model)
+    setups = tuple(replace(s, source=name) for s in sheet.setups)
+    return replace(data, covariance=sheet.covariance, setups=setups)
+
+
+def test_companion_of_one_among_four_is_found_and_only_that_one_is_dropped(rng) -> None:
+    data = [calibrator(rng, name=f"good{k}") for k in range(3)]
+    data.insert(2, calibrator(rng, (120.0, 60.0, 0.01), "bad"))
+    vetting = vet(data, separation_mas=FIELD, limits=False, null_draws=2000)
+    assert [v.kept for v in vetting.calibrators] == [True, True, False, True]
+    bad = vetting.calibrators[2]
+    assert "disagrees" in bad.reason
+    assert "companion of 5.0 mag" in bad.reason
+    assert bad.agreement is not None
+    assert bad.agreement < 1e-6
+    assert bad.companion is not None
+    assert bad.companion.companion.separation_mas == pytest.approx(134.0, abs=15.0)
+
+
+@pytest.mark.slow
+def test_resolved_calibrator_is_named(rng) -> None:
+    data = [calibrator(rng, name=f"good{k}") for k in range(3)]
+    model = BinaryModel(diameter_mas=30.0)
+    data.append(calibrator(rng, name="big", model=model))
+    vetting = vet(data, separation_mas=FIELD, limits=False, null_draws=2000)
+    assert [v.kept for v in vetting.calibrators] == [True, True, True, False]
+    big = vetting.calibrators[3]
+    assert big.diameter_mas == pytest.approx(30.0, abs=5.0)
+    assert big.diameter_probability is not None
+    assert big.diameter_probability < 1e-4
+
+
+@pytest.mark.slow
+def test_leave_one_out_probability_of_good_calibrators() -> None:
+    """Between-calibrator scatter of twice the errors: p < 0.05 in at most 5 % of 120 cases.
+
+    Binomial: more than 17 of 120 has a probability below 1e-4.
+    """
+    rng = np.random.default_rng(3)
+    p = []
+    for _ in range(40):
+        data = [calibrator(rng, name=f"c{k}", scatter=2.0) for k in range(3)]
+        leave_out = _LeaveOut(data)
+        p += [leave_out.agreement(k, [j for j in range(3) if j != k]) for k in range(3)]
+    low = int((np.array(p) < 0.05).sum())
+    # The three probabilities of a set share data; their counts spread by up to √3 more.
+    assert low <= stats.binom.isf(1e-4, 40, 0.05) * 3
+
+
+def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
+    data = [calibrator(rng, name="point"), calibrator(rng, (100.0, 80.0, 0.02), "double")]
+    vetting = vet(data, calibrated=True, separation_mas=FIELD, null_draws=2000)
+    point, double = vetting.calibrators
+    assert point.kept
+    assert not double.kept
+    assert point.agreement is None
+    assert point.limit is not None
+    assert np.nanmax(point.limit.delta_mag) > 5.0
+    header, first, *rest = vetting_table(vetting)
+    assert first.split()[:3] == ["point", "keep", "-"]
+    assert float(first.split()[3]) == pytest.approx(point.significance.probability, rel=0.05)
+    assert any(line.startswith("double") and "DROP" in line for line in rest)
+    assert any(double.reason in line for line in rest)
+    assert header.split()[0] == "calibrator"
+    assert len(vetting_picture(vetting).axes) == 2
+    assert len(vetting_picture(replace(vetting, calibrators=one_without_limit(vetting))).axes) == 1
+
+
+def test_legends_of_the_picture_cover_nothing_and_stay_on_the_page(rng) -> None:
+    data = [calibrator(rng, name=f"some/long_name_of_calibrator_{k}.fits") for k in range(3)]
+    vetting = vet(data, separation_mas=FIELD, null_draws=500)
+    figure = vetting_picture(vetting)
+    figure.draw_without_rendering()
+    assert len(figure.legends) == 2
+    for legend in figure.legends:
+        box = legend.get_window_extent()
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+        assert not any(box.overlaps(axes.get_tightbbox()) for axes in figure.axes)
+
+
+def one_without_limit(vetting: Vetting) -> tuple[Vetted, ...]:
+    return tuple(replace(vetted, limit=None) for vetted in vetting.calibrators)
+
+
+def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys) -> None:
+    paths = [tmp_path / "a.oifits", tmp_path / "b.oifits"]
+    write_oifits(paths[0], calibrator(rng))
+    write_oifits(paths[1], calibrator(rng, (0.0, 0.0, 0.0), scatter=20.0))
+    words = ["vet", *map(str, paths), "--out", str(tmp_path / "out"), "--no-limits", "--json"]
+    assert main([*words, "--separation", "50:400", "--charge-levels", "1000,1000,5000"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [Path(c["path"]).name for c in result["calibrators"]] == ["a.oifits", "b.oifits"]
+    said = [text for c in result["calibrators"] for text in [c["reason"], *c["doubts"]]]
+    assert any("charge level is 5 times" in text for text in said)
+    assert any("disagrees" in text or "companion" in text for text in said)
+    assert (tmp_path / "out" / "vetting.png").stat().st_size > 5000
+
+
+def test_calibrators_of_two_filters_are_judged_among_their_own(rng) -> None:
+    """As each filter by itself: no calibrator of the other one is asked."""
+    reds = [calibrator(rng, name=f"red{k}") for k in range(3)]
+    blues = [noisy(epoch(F430M, source=f"blue{k}"), [0.0, 0.0, 0.0], rng) for k in range(2)]
+    blues.append(noisy(epoch(F430M, source="bad"), [120.0, 60.0, 0.02], rng))
+    options = {"separation_mas": (90.0, 180.0), "limits": False, "null_draws": 500}
+    vetting = vet([reds[0], *blues, *reds[1:]], **options)
+    assert [v.path for v in vetting.calibrators if not v.kept] == ["bad"]
+    judged = {v.path: v.agreement for v in vetting.calibrators}
+    apart: list[float | None] = [None] * 3
+    assert _compare(_LeaveOut(reds), [0, 1, 2], apart, vetting.alpha) == set()
+    assert [judged[f"red{k}"] for k in range(3)] == pytest.approx(apart, rel=1e-9)
+    for unjudged in (vet([reds[0], blues[0], blues[2]], fewest=3), vet([reds[0], blues[2]])):
+        assert all(v.kept and v.agreement is None for v in unjudged.calibrators)
+        assert all(v.significance is None for v in unjudged.calibrators)
+
+
+def test_one_raw_calibrator_is_kept_unjudged_and_none_is_refused(rng) -> None:
+    (alone,) = vet([calibrator(rng)]).calibrators
+    assert alone.kept
+    assert alone.agreement is None
+    assert alone.significance is None
+    with pytest.raises(DataError, match="no calibrator"):
+        vet([])
+
+
+@pytest.mark.slow
+def test_search_drops_the_bad_calibrator_unless_told_not_to(rng, tmp_path: Path, capsys) -> None:
+    target = tmp_path / "target.oifits"
+    write_oifits(target, calibrator(rng, (0.0, 0.0, 0.0)))
+    paths = [tmp_path / f"cal{k}.oifits" for k in range(4)]
+    for k, path in enumerate(paths):
+        write_oifits(path, calibrator(rng, (120.0, 60.0, 0.02) if k == 1 else (0.0, 0.0, 0.0)))
+    words = ["search", str(target), "--cal", *map(str, paths), "--separation", "50:400", "--json"]
+    words += ["--null-draws", "0", "--no-posterior"]
+    kept = []
+    for k, more in enumerate([[], ["--keep-all"]]):
+        assert main([*words, *more, "--out", str(tmp_path / str(k))]) == 0
+        result = json.loads(capsys.readouterr().out)
+        kept.append([c["kept"] for c in result["calibration"]["calibrators"]])
+        dropped = [w for w in result["warnings"] if "dropped" in w]
+        assert len(dropped) == (k == 0)
+    assert kept == [[True, False, True, True], [True] * 4]

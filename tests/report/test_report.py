@@ -1,0 +1,424 @@
+"""report.html: what it says, that it says it safely, and how a real browser shows it."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import re
+import shutil
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from test_validation import PLAN, answers
+
+from amibayes.cli import common, main
+from amibayes.errors import DataError
+from amibayes.oifits import write_oifits
+from amibayes.pipeline.options import SearchOptions
+from amibayes.plots.pictures import picture_names
+from amibayes.plots.style import save
+from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
+from amibayes.report.captions import CAPTIONS
+from amibayes.report.joint_sections import RESIDUALS
+from amibayes.report.page import Sky, page_html, read_figure
+from amibayes.report.search_page import PLACED
+from amibayes.report.statement import statement_of
+from amibayes.report.validation import validation_page, validation_pictures
+from amibayes.report.words import chance, count, measured, plain
+from amibayes.validation.tally import tally
+
+HOSTILE = "<b>bold</b>&\"'<img src=x onerror=alert(1)>.oifits".replace("/", "")
+TRUTH = [110.0, -75.0, 0.02]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A search of a file with a hostile name, with calibrators."""
+    base = tmp_path_factory.mktemp("report")
+    target, cals = base / HOSTILE, [base / f"cal{k}.oifits" for k in range(2)]
+    write_oifits(target, simulated(niriss(), TRUTH, np.random.default_rng(1)))
+    for k, path in enumerate(cals):
+        write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(5 + k)))
+    words = ["search", str(target), "--cal", *map(str, cals), "--separation", "50:400"]
+    out = base / "out"
+    assert main([*words, "--null-draws", "2000", "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def content(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "result.json").read_text())
+
+
+class Reader(HTMLParser):
+    """Collects what a page links to, loads, names and says."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.tags: set[str] = set()
+        self.said = ""
+        self._silent = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.tags.add(tag)
+        self._silent = tag == "style"
+        if values.get("id"):
+            self.ids.append(str(values["id"]))
+        if tag == "a":
+            self.links.append(str(values["href"]))
+        if tag == "img":
+            self.images.append(values)
+
+    def handle_data(self, data: str) -> None:
+        self.said += "" if self._silent else data
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Reader:
+    return Reader((folder / "report.html").read_text())
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "written"),
+    [
+        (151.8588, 2.825, "151.9 ± 2.8"),
+        (0.0097167, 0.00028957, "0.00972 ± 0.00029"),
+        (1234.5, 99.6, "1234 ± 100"),
+        (-28.506, 0.0996, "−28.51 ± 0.10"),
+        (5e-9, 1.2e-10, "(5.00 ± 0.12) × 10⁻⁹"),
+        (3.0, math.nan, "3"),
+        (None, 1.0, "–"),
+        (math.nan, 1.0, "–"),
+    ],
+)
+def test_as_many_digits_as_the_error_leaves(value, error, written) -> None:
+    assert measured(value, error).replace("\u00a0", " ") == written
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [(0.0, "0"), (752.62, "753"), (9.9999e-5, "0.0001"), (3.21e-7, "3.21 × 10⁻⁷"),
+     (1e6, "1 × 10⁶"), (-2.5, "−2.5"), (math.inf, "–"), (0.99999, "1"), (100.0, "100")],
+)  # fmt: skip
+def test_plain_numbers(value, written) -> None:
+    assert plain(value).replace("\u00a0", " ") == written
+
+
+def test_chances_and_counts() -> None:
+    assert [chance(p) for p in (0.0, 1.0, 0.343, 0.0013)] == ["0", "1", "34\u00a0%", "0.0013"]
+    assert chance(8e-254) == "8\u00a0×\u00a010⁻²⁵⁴"
+    assert count(1, "mode") == "1 mode"
+    assert count(10000, "draw") == "10\u202f000 draws"
+
+
+def test_the_answer_stands_in_words(page: Reader, content) -> None:
+    fit = content["fit"]
+    said = page.said.replace("\u00a0", " ")
+    place = f"A companion at {fit['separation_mas']:.1f} ± {fit['errors']['separation_mas']:.1f}"
+    assert place in said
+    assert "Not one of 2\u202f000 data sets simulated without a companion has anything as" in said
+    assert "the chance of this by noise is estimated as 0.0005, and below 0.0018, with 95" in said
+    for entry in content["inputs"]:
+        assert entry["sha256"] in said
+        assert entry["path"] in said
+    for title in ("Data and calibration", "Search", "Significance", "Posterior", "Evidence",
+                  "Detection limits", "How to run it again"):  # fmt: skip
+        assert title in said
+    assert "--null-draws 2000" in said
+    assert "--seed 1" in said
+    for warning in content["warnings"]:
+        assert warning[1:] in page.said
+        said = said.replace(warning[1:], "")
+    assert not re.search(r"\b(nan|None|inf)\b", said)
+
+
+def test_the_page_is_whole_and_safe(page: Reader, folder: Path) -> None:
+    text = (folder / "report.html").read_text()
+    assert not page.tags & {"b", "script", "iframe", "object", "embed"}
+    assert not re.search(r"(?:src|href)=\"(?!data:|#)", text)
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "srcset" not in text
+    assert len(page.ids) == len(set(page.ids))
+    assert {link.removeprefix("#") for link in page.links} <= set(page.ids)
+    names = [p.stem for p in folder.glob("*.png")]
+    assert sorted(i.removeprefix("figure-") for i in page.ids if i.startswith("figure-")) == sorted(
+        names
+    )
+    assert all(str(i["src"]).startswith("data:image/png;base64,") for i in page.images)
+    assert all(i["alt"] and int(str(i["width"])) > 300 for i in page.images)
+
+
+def test_every_picture_has_its_words_and_its_place() -> None:
+    """A new picture of the main job needs a caption and a section."""
+    drawn = {n.removesuffix(".png") for n in picture_names(SearchOptions(), calibrated=True)
+             if n.endswith(".png")}  # fmt: skip
+    assert drawn <= set(CAPTIONS)
+    assert drawn <= set(PLACED)
+
+
+def test_no_detection_states_a_limit(content) -> None:
+    none = copy.deepcopy(content)
+    none["significance"] |= {
+        "detected": False, "false_alarm_probability": 0.34, "false_alarm_interval": [0.32, 0.36],
+    }  # fmt: skip
+    none["posterior"]["upper_limit"] = {
+        "level": 0.95, "contrast": 0.001, "delta_mag": 7.5, "prior": "uniform in area",
+        "contrast_uniform_prior": 0.002, "method": "grid",
+    }  # fmt: skip
+    said = statement_of(none)
+    assert said.kind == "none"
+    assert said.headline.startswith("No companion is detected at 50 to 400 mas")
+    words = " ".join(said.sentences).replace("\u00a0", " ")
+    assert "34 %" in words
+    assert "more than 7.50 mag fainter" in words
+    assert "would be found 95 % of the time" in words
+    first, *excluded = search_page(none).facts
+    assert first.value == "34\u00a0%"
+    assert [fact.value for fact in excluded][1:] == ["0.001"]
+    mags = [m for m in none["limits"]["delta_mag_3sigma"] if m is not None]
+    assert excluded[0].value == f"{min(mags):.1f} to {max(mags):.1f}"
+    assert "Separation" not in " ".join(fact.name for fact in search_page(none).facts)
+    none |= {"posterior": None, "limits": None}
+    assert [fact.value for fact in search_page(none).facts] == ["34\u00a0%"]
+
+
+def test_a_posterior_without_a_detection_is_no_measurement(content) -> None:
+    none = copy.deepcopy(content)
+    none["significance"]["detected"] = False
+    none["modes"] = [none["modes"][0]] * 12
+    none["posterior"]["position_angle_deg"] |= {
+        "median": 350.0, "lower": 283.0, "upper": 417.0, "lower_95": 187.0, "upper_95": 513.0,
+    }  # fmt: skip
+    said = Reader(page_html(search_page(none))).said
+    assert "if there is one, and not a measurement" in said
+    assert "283 to 57" in said
+    assert "to 513" not in said
+    assert "4 more in result.json" in said
+    assert "not a measurement" not in Reader(page_html(search_page(content))).said
+
+
+def test_nothing_is_claimed_without_null_draws_and_absent_stages_are_absent(content) -> None:
+    bare = copy.deepcopy(content)
+    bare["significance"] |= {
+        "detected": None, "false_alarm_probability": None, "false_alarm_interval": None,
+        "n_null_draws": 0,
+    }  # fmt: skip
+    bare |= {"posterior": None, "limits": None, "evidence": None, "calibration": None}
+    bare["warnings"] = []
+    bare["fit"]["errors"] = dict.fromkeys(bare["fit"]["errors"])
+    for mode in bare["modes"]:
+        mode.pop("probability", None)
+    reader = Reader(page_html(search_page(bare)))
+    assert "its chance is not known" in reader.said
+    assert not {"posterior", "evidence", "detection-limits"} & set(reader.ids)
+    assert not re.search(r"\b(nan|None|inf)\b", reader.said)
+    bare["fit"] |= {"contrast": 0.0, "delta_mag": None}
+    assert "improves the fit" in statement_of(bare).headline
+
+
+def test_noise_and_outliers_are_told(content) -> None:
+    noisy = copy.deepcopy(content)
+    interval = {"median": 0.01, "lower": 0.005, "upper": 0.02, "lower_95": 0.0, "upper_95": 0.03}
+    noisy["noise"] = {
+        "extra_vis2": 0.012, "extra_closure_phase_deg": 0.0,
+        "posterior": {"extra_vis2": interval | {"probability_errors_right": 0.02}},
+    }  # fmt: skip
+    outlier = {
+        "kind": "closure_phase", "stations": ["A1", "B2", "C3"], "wavelength_m": 4.3e-6,
+        "mjd": 60000.5, "source": "x/night.fits", "weight": 0.04, "residual": -7.25,
+    }  # fmt: skip
+    noisy["robust"] = {"degrees_of_freedom": 4.0, "outliers": [outlier] * 25}
+    said = Reader(page_html(search_page(noisy))).said
+    assert "noise of 0.012 in V² and 0° in closure phase was added" in said
+    assert "0.005 to 0.02" in said
+    assert "25 data lost most of it" in said
+    assert said.count("A1-B2-C3") == 20
+    assert "5 more in result.json" in said
+    assert "night.fits" in said
+    assert "−7.2" in said
+    quiet = copy.deepcopy(content) | {"robust": None}
+    assert "no noise was added" in Reader(page_html(search_page(quiet))).said
+
+
+def test_any_command_can_make_a_page() -> None:
+    table = Table("<i>t</i>", (Column("a", "text"), Column("b")), (("<u>x</u>", "1"),))
+    page = Page("amibayes validate", "Validation", "", Statement("open", "l", "<b>h</b>"),
+                sections=(Section("A & B", ("<script>",), tables=(table,)),))  # fmt: skip
+    reader = Reader(page_html(page))
+    assert not reader.tags & {"i", "u", "b", "script"}
+    assert "a-b" in reader.ids
+    assert "Warnings" not in reader.said
+    with pytest.raises(ValueError, match="one text for each column"):
+        Table("t", (Column("a"),), (("1", "2"),))
+
+
+def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "map.png").write_text("no picture")
+    with pytest.raises(DataError, match="is no PNG"):
+        captioned(tmp_path, ["map.png", "maps.fits"])
+    with pytest.raises(DataError, match="cannot be read"):
+        captioned(tmp_path, ["gone.png"])
+
+
+@pytest.mark.parametrize(("outer", "bar"), [(752.6, 200.0), (1.2, 0.5), (50.0, 20.0), (9.0, 2.0)])
+def test_scale_bar_is_a_round_number(outer: float, bar: float) -> None:
+    assert Sky(0.1, outer, (), "").bar_mas == pytest.approx(bar)
+
+
+PHONE, DESKTOP = (390, 844), (1280, 900)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A headless Chromium; skips where there is none."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    driver = shutil.which("chromedriver")
+    if not chromium or not driver:
+        pytest.skip("no chromium with chromedriver on this machine: pages not seen in a browser")
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(word)
+    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('profile')}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driven = webdriver.Chrome(options=options, service=Service(driver))
+    yield driven
+    driven.quit()
+
+
+def shown(browser: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
+    """Open a page on a screen of this size."""
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 500},
+    )
+    scheme_now = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme_now})
+    browser.get_log("browser")
+    browser.get(path.as_uri())
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_in_a_browser(browser: Any, folder: Path, size, scheme) -> None:
+    looks_right(browser, folder / "report.html", size, scheme, len(list(folder.glob("*.png"))))
+
+
+@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+def test_other_pages_in_a_browser(browser: Any, content, tmp_path: Path, size) -> None:
+    """Nothing detected, two bands in motion, and a validation."""
+    none, joint = copy.deepcopy(content), copy.deepcopy(content)
+    none["significance"]["detected"] = False
+    none["modes"] = [none["modes"][0]] * 12
+    band = {key: joint["fit"][key] for key in ("contrast", "delta_mag", "errors")}
+    bands = [band | {"band": f"NIRISS_{w}um", "wavelength_um": w} for w in (4.29, 4.82)]
+    joint["fit"] |= {"contrast_kind": "per-filter", "contrasts": bands, "reference_mjd": 6e4,
+                     "fastest_mas_yr": 9.0, "east_rate_mas_yr": 1.2,
+                     "north_rate_mas_yr": -3.0}  # fmt: skip
+    joint["residuals"] = [{"path": f"{k}/target_of_a_long_name_calints.oifits"}
+                          | dict.fromkeys(RESIDUALS, 1.0) for k in range(3)]  # fmt: skip
+    trials = tally(PLAN, 1, list(answers(PLAN)))
+    figures = {}
+    for name, drawing in validation_pictures(trials).items():
+        save(drawing, tmp_path / f"{name}.png")
+        figures[name] = read_figure(tmp_path / f"{name}.png", name, name)
+    pages = [(search_page(none), 0), (search_page(joint), 0)]
+    pages += [(validation_page(trials, figures, "out"), len(figures))]
+    for page, n_pictures in pages:
+        (tmp_path / "page.html").write_text(page_html(page), encoding="utf-8")
+        looks_right(browser, tmp_path / "page.html", size, "light", n_pictures)
+
+
+def looks_right(browser: Any, path: Path, size, scheme: str, n_pictures: int) -> None:
+    """Nothing wider than the screen, every picture there, every link leads somewhere, no errors."""
+    shown(browser, path, size, scheme)
+    wide = browser.execute_script(
+        "return [document.scrollingElement.scrollWidth, window.innerWidth]"
+    )
+    assert wide[0] <= wide[1] == size[0]
+    images = browser.execute_script(
+        "return [...document.images].map(i => [i.complete, i.naturalWidth, i.clientWidth])"
+    )
+    assert len(images) == n_pictures
+    captions = "return [...document.querySelectorAll('caption')].map(c => c.clientWidth)"
+    assert max(browser.execute_script(captions)) <= size[0]
+    assert all(done and natural > 300 and seen > 200 for done, natural, seen in images)
+    loose = browser.execute_script(
+        "return [...document.querySelectorAll('a')].map(a => a.hash)"
+        ".filter(h => !document.getElementById(decodeURIComponent(h.slice(1))))"
+    )
+    assert loose == []
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out_from_its_ground(browser: Any, folder: Path, scheme) -> None:
+    """WCAG AA: a contrast of 4.5 for text of every colour the page uses."""
+    shown(browser, folder / "report.html", DESKTOP, scheme)
+    names = ("paper", "card", "ink", "soft", "accent", "found", "open")
+    colours = browser.execute_script(
+        "const s = getComputedStyle(document.documentElement);"
+        "return arguments[0].map(n => s.getPropertyValue('--' + n).trim())",
+        list(names),
+    )
+    light = {n: luminance(c) for n, c in zip(names, colours, strict=True)}
+    for ground in ("paper", "card"):
+        for text in names[2:]:
+            high, low = sorted((light[ground], light[text]), reverse=True)
+            assert (high + 0.05) / (low + 0.05) >= 4.5, (scheme, ground, text)
+
+
+def luminance(colour: str) -> float:
+    """Relative luminance of #rrggbb (WCAG 2)."""
+    channels = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_a_link_leads_to_its_section(browser: Any, folder: Path) -> None:
+    shown(browser, folder / "report.html", PHONE)
+    browser.find_element("link text", "Significance").click()
+    top = "return document.getElementById('significance').getBoundingClientRect().top"
+    assert 0 <= browser.execute_script(top) < 60
+
+
+def test_it_prints(browser: Any, folder: Path) -> None:
+    import base64
+
+    shown(browser, folder / "report.html", DESKTOP)
+    pdf = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {})["data"])
+    assert pdf.startswith(b"%PDF")
+    assert 3 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= 20
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    hidden = "return getComputedStyle(document.querySelector('nav')).display"
+    assert browser.execute_script(hidden) == "none"
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
+def test_the_command_line_keeps_what_decides_the_numbers() -> None:
+    words = ["search", "a b.oifits", "--out", "x", "--seed", "3", "--workers=4", "--cal", "c", "d",
+             "--json", "--no-limits", "--resume"]  # fmt: skip
+    arguments = argparse.Namespace(words=words, seed=3)
+    kept = "amibayes search 'a b.oifits' --seed 3 --cal c d --no-limits"
+    assert common.command_line(arguments) == kept
+    assert common.without(words, {"--cal": 99}) == [
+        w for w in words if w not in ("--cal", "c", "d")
+    ]
+    plain = argparse.Namespace(words=["search", "t"], seed=1)
+    assert common.command_line(plain) == "amibayes search t --seed 1"
