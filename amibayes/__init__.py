@@ -135,7 +135,7 @@ _HOME = {
     "search_second": "amibayes.companion_search.second_companion",
     "significance": "amibayes.detection.false_alarm",
     "simulate": "amibayes.simulation",
-    "weigh_models": "amibayes.posterior.evidence",
+    "compare_models": "amibayes.posterior.evidence",
     "write_cube": "amibayes.cube",
     "write_oifits": "amibayes.oifits",
 }
@@ -183,6 +183,7 @@ __all__ = [
     "analytic_limit",
     "bank_of",
     "calibrate",
+    "compare_models",
     "detection_limit",
     "expect",
     "extract",
@@ -214,7 +215,6 @@ __all__ = [
     "search_second",
     "significance",
     "simulate",
-    "weigh_models",
     "write_cube",
     "write_oifits",
 ]

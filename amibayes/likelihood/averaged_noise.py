@@ -219,8 +219,8 @@ def marginal_likelihood(
 
     Notes
     -----
-    With probability `PRIOR_STATED_ERRORS_CORRECT` the stated errors are right; else the total error has Jeffreys'
-    prior of a scale, from the stated error to `MAX_INFLATION` times that.
+    With probability `PRIOR_STATED_ERRORS_CORRECT` the stated errors are right; else the total
+    error has Jeffreys' prior of a scale, from the stated error to `MAX_INFLATION` times that.
     """
     differences = [residual_of(likelihood, theta) for likelihood, theta in fits]
     data = stated.unflagged()

@@ -347,7 +347,8 @@ def sample(
     resume : bool
         Go on from ``path`` if it holds the chain of the same data, prior and seed.
     grid : GridPosterior, optional
-        Of the same likelihood and prior: gives the modes' probabilities, and `IndependenceProposal`.
+        Of the same likelihood and prior: gives the modes' probabilities, and the
+        `IndependenceProposal`.
     max_steps : int
         Steps after which a chain that has not converged is given up (and said to be so).
     progress : callable, optional
