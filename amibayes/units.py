@@ -9,6 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 SingleArray = NDArray[np.float32]
+IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+SingleComplexArray = NDArray[np.complex64]
 
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 """One milliarcsecond in radians."""

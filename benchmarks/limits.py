@@ -28,11 +28,11 @@ from amibayes import Likelihood, TemplateBank, load_instrument, open_executor, p
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import resolution_mas, search
 from amibayes.companion_search.template_bank import make_grid
-from amibayes.data.observables import BoolArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.limits.injection import TRIALS_AT_ONCE, nearer_aliases, recover
 from amibayes.models.parameters import Box
 from amibayes.parallel import Executor
-from amibayes.units import FloatArray, offset
+from amibayes.units import BoolArray, FloatArray, offset
 
 FIELD_MAS = (50.0, 400.0)
 POSITIONS = 10_000

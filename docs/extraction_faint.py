@@ -20,8 +20,7 @@ from amibayes.extraction import ExtractOptions, extract_all
 from amibayes.extraction.fourier.sampling import OneEach
 from amibayes.extraction.low_flux import expected_covariance
 from amibayes.optics import psf
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 INSTRUMENT = load_instrument("niriss", "F430M")
 

@@ -11,10 +11,10 @@ from amibayes.calibration.freedom import calibrated_freedom
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import sparse_covariance, wrapped
 from amibayes.calibration.weighted import TransferFunction
-from amibayes.data.observables import BoolArray, CovarianceKind, Observables
+from amibayes.data.observables import CovarianceKind, Observables
 from amibayes.errors import DataError
 from amibayes.oifits.correlations import Pairs, given_covariance
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 FAINTEST = 3.0
 """A calibrator's V² below this many of its errors divides nothing: the ratio has no moments."""

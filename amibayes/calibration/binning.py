@@ -18,7 +18,6 @@ from amibayes.data.closure import canonical, canonical_uv
 from amibayes.data.observables import (
     DAY_S,
     SIMULTANEOUS_S,
-    IntArray,
     Measurements,
     Observables,
     Setup,
@@ -26,7 +25,7 @@ from amibayes.data.observables import (
 )
 from amibayes.errors import UsageError
 from amibayes.oifits.correlations import Pairs, given_covariance
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 MOVED = 0.02
 """Exposures are merged while (u, v) stays within this part of the baseline."""

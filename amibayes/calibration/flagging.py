@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from amibayes.data.observables import BoolArray, Measurements, Observables
+from amibayes.data.observables import Measurements, Observables
 from amibayes.errors import DataError, UsageError
-from amibayes.units import DEGREE, FloatArray
+from amibayes.units import DEGREE, BoolArray, FloatArray
 
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>|=)\s*(.+?)\s*$")
 _COMPARE: dict[str, Callable[[FloatArray, float], BoolArray]] = {

@@ -20,10 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import ClosureSet, Transfer, closure_sets
 from amibayes.calibration.weighted import TransferFunction
-from amibayes.data.observables import BoolArray, IntArray
 from amibayes.errors import RunError
 from amibayes.support.ensemble_moves import along_others
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 PRIOR_WIDTH = 5.0
 """Scale of the half-normal prior of τ in units of the median error of its type."""

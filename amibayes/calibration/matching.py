@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.data.closure import canonical
-from amibayes.data.observables import BoolArray, IntArray, Measurements, Observables, Setup
-from amibayes.units import FloatArray
+from amibayes.data.observables import Measurements, Observables, Setup
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 SAME_CHANNEL = 0.1
 """Channels are one where their wavelengths differ by less than this part of their width."""

@@ -11,9 +11,9 @@ from scipy.sparse import block_array, coo_array, csr_array, diags_array
 from amibayes.calibration.matching import Keys, Match, match
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import sparse_covariance
-from amibayes.data.observables import BoolArray, IntArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.scene.disc import uniform_disc
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 Diameter = tuple[float, float]
 """Uniform-disc diameter of a calibrator and its error, mas."""

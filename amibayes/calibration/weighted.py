@@ -12,8 +12,7 @@ from scipy.stats import chi2
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import Transfer, kernel_projector
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import BoolArray
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

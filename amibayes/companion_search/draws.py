@@ -12,15 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.companion_search.scan import RunningMaximum, best_positive
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.rotation_null import RotationNull
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
-Floats32 = NDArray[np.float32]
+from amibayes.units import FloatArray, IntArray, SingleArray
 
 MIN_REMAINING_VARIANCE = 1e-6
 """Share of its covariance that a drawn mean leaves; less can only be a sum of estimates."""
@@ -149,7 +145,7 @@ class _Inverse:
         shared = data - np.outer(self.common, self.common @ data / self.size)
         return np.asarray(shared + self.own * (self.weight * (self.own * data).sum(axis=0)))
 
-    def scores(self, templates: Floats32, rows: Floats32) -> Floats32:
+    def scores(self, templates: SingleArray, rows: SingleArray) -> SingleArray:
         """Root of the gain in χ² of data sets by templates (n_bands, n_data, m), (n, m).
 
         Parameters

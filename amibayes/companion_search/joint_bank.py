@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.companion_search.scan import RunningMaximum, ScanResult, best_positive, weighted_gain
-from amibayes.companion_search.template_bank import Grid, IntArray, MatchedFilter, TemplateBank
+from amibayes.companion_search.template_bank import Grid, MatchedFilter, TemplateBank
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.units import MAS, FloatArray
+from amibayes.units import MAS, FloatArray, IntArray
 
 RATE_STEPS_PER_FRINGE = 4
 """Steps in rate per λ/B_max of the place at the date farthest from the reference date."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
-from amibayes.data.observables import IntArray, Observables
-from amibayes.units import FloatArray
+from amibayes.data.observables import Observables
+from amibayes.units import FloatArray, IntArray
 
 SWEEPS = 8
 """Rounds over the bands in which the contrasts of bands that are coupled find their best."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from amibayes.companion_search.joint_bank import bank_of, rates_per_axis
@@ -18,9 +17,7 @@ from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import MAS, FloatArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import MAS, FloatArray, IntArray
 
 GRID_STEPS_PER_FRINGE = 8
 """Lattice points per λ/B_max."""

@@ -22,7 +22,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
 from amibayes.likelihood.rotation_null import rotation_null
 from amibayes.models.uv_points import UVPoints
-from amibayes.units import MAS, FloatArray
+from amibayes.units import MAS, FloatArray, IntArray
 
 WIDTH = 128
 """Most positions that are worked on at once: what fits a processor's cache."""
@@ -107,9 +107,6 @@ def _sine_of_sum(
     np.multiply(sa, cb, out=out)
     np.multiply(ca, sb, out=spare)
     out += spare
-
-
-IntArray = NDArray[np.intp]
 
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]

@@ -12,8 +12,8 @@ from amibayes.data.covariance import (
     DiagonalCovariance,
     stack_covariances,
 )
-from amibayes.data.observables import CovarianceKind, IntArray, Measurements, closure_sets
-from amibayes.units import FloatArray
+from amibayes.data.observables import CovarianceKind, Measurements, closure_sets
+from amibayes.units import FloatArray, IntArray
 
 
 def kernel_blocks(closure_phase: Measurements, sigma: FloatArray) -> list[Block]:

@@ -8,12 +8,9 @@ triangles but only (n−1)(n−2)/2 independent combinations (kernel phases, Mar
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray
 
 RIDGE = 1e-4
 """Weight of the pull towards equal baseline variances, relative to reproducing the errors."""

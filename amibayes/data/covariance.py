@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.errors import DataError
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray
 
 
 @runtime_checkable

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 from astropy.table import QTable
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from amibayes.data.covariance import Covariance, stack_covariances
@@ -17,10 +16,8 @@ from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_s
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.tables import observables_html, observables_table
 from amibayes.errors import DataError
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 CovarianceKind = Literal["diagonal", "assumed", "given", "estimated"]
 
 SIMULTANEOUS_S = 17.0

@@ -13,13 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from amibayes.units import FloatArray, read_only
-
-ComplexArray = NDArray[np.complex128]
-SmallComplexArray = NDArray[np.complex64]
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray, SingleComplexArray, read_only
 
 TAPS = 4
 """Coefficients that a value is made of, along each axis."""
@@ -47,7 +42,7 @@ class OffAxisResponse:
         Name of the extraction's method; empty where it is not known.
     """
 
-    coefficients: SmallComplexArray
+    coefficients: SingleComplexArray
     to_node: FloatArray
     pointing: FloatArray
     single: bool = True

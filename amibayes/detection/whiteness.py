@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Measurements
 from amibayes.likelihood.student import symmetric_whitening
-
-IntArray = NDArray[np.intp]
+from amibayes.units import IntArray
 
 
 def channel_correlation(result: SearchResult) -> tuple[float, int]:

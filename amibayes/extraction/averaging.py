@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.extraction.cleaning import TO_SIGMA, BoolArray
-from amibayes.extraction.fourier.sampling import IntArray
+from amibayes.extraction.cleaning import TO_SIGMA
 from amibayes.extraction.frames import Frames, look_elsewhere
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, ComplexArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

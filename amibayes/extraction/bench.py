@@ -6,12 +6,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from amibayes.errors import DataError
-from amibayes.extraction.cleaning import (
-    BoolArray,
-    Reference,
-    median_and_scatter,
-    reference_of,
-)
+from amibayes.extraction.cleaning import Reference, median_and_scatter, reference_of
 from amibayes.extraction.fourier.sampling import split
 from amibayes.extraction.fourier.transform import fourier_sampling
 from amibayes.extraction.frames import ExtractionOperator
@@ -34,7 +29,7 @@ from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View, look_at
 from amibayes.optics import FringeBasis
-from amibayes.units import FloatArray, SingleArray
+from amibayes.units import BoolArray, FloatArray, SingleArray
 
 MAX_LEFT = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from amibayes.cube import Cube
@@ -14,9 +13,7 @@ from amibayes.errors import DataError
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.noise import NoiseModel, noise_model
 from amibayes.extraction.source import Source
-from amibayes.units import FloatArray, read_only
-
-BoolArray = NDArray[np.bool_]
+from amibayes.units import BoolArray, FloatArray, read_only
 
 SAMPLE, RUN = 32, 4
 """Integrations that the reference is the median of: short runs, evenly over the cube."""

@@ -25,8 +25,7 @@ from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 NYQUIST = 0.5
 """Cycles per pixel beyond which fringes look like others."""

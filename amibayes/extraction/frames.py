@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from amibayes.cube import Cube
-from amibayes.extraction.cleaning import MAX_BAD, TO_SIGMA, BoolArray, Reference
-from amibayes.extraction.fourier.sampling import IntArray, OneEach, PixelArray, Sampling
+from amibayes.extraction.cleaning import MAX_BAD, TO_SIGMA, Reference
+from amibayes.extraction.fourier.sampling import OneEach, PixelArray, Sampling
 from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.source import Source
 from amibayes.extraction.view import View
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray, SingleArray
+from amibayes.units import BoolArray, ComplexArray, FloatArray, IntArray, SingleArray
 
 CHUNK, CHUNK_PIXELS = 64, 2**23
 """Integrations that are worked on together; fewer where they are large."""

@@ -14,11 +14,10 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from amibayes.errors import DataError
-from amibayes.extraction.fourier.sampling import BoolArray, IntArray, OneEach, PixelArray, split
+from amibayes.extraction.fourier.sampling import OneEach, PixelArray, split
 from amibayes.extraction.view import CONVERGED_PX, View
 from amibayes.optics import FringeBasis
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray, SingleArray
+from amibayes.units import BoolArray, ComplexArray, FloatArray, IntArray, SingleArray
 
 MAX_STEPS = 12
 

@@ -19,8 +19,7 @@ import numpy as np
 
 from amibayes.extraction.fourier.sampling import OneEach, Sampling, signs
 from amibayes.extraction.fourier.splodges import Splodges
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 
 def expected_covariance(

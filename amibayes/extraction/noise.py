@@ -13,8 +13,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import nnls
 
-from amibayes.extraction.fourier.sampling import BoolArray, PixelArray
-from amibayes.units import FloatArray, read_only
+from amibayes.extraction.fourier.sampling import PixelArray
+from amibayes.units import BoolArray, FloatArray, read_only
 
 _ROUNDS = 4
 

@@ -15,9 +15,8 @@ from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.fourier.sampling import Sampling
 from amibayes.extraction.view import View
-from amibayes.optics.psf import ComplexArray
 from amibayes.scene.orientation import Orientation
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 NODES_PER_FRINGE = 2.8
 """Places per fringe of the longest baseline, at least."""

@@ -17,8 +17,7 @@ from scipy.special import digamma, gammaln
 
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.errors import DataError
-from amibayes.extraction.fourier.sampling import BoolArray
-from amibayes.units import FloatArray, read_only
+from amibayes.units import BoolArray, FloatArray, read_only
 
 MAX_FREEDOM = 1e4
 """The prior never counts for more integrations than this."""

@@ -9,11 +9,11 @@ from amibayes.cube import Cube
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import CovarianceKind, IntArray, Measurements, Observables, Setup
+from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.extraction.averaging import Average
 from amibayes.extraction.view import View
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 
 def independent_basis(view: View) -> FloatArray:

@@ -12,12 +12,9 @@ from functools import cached_property
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.errors import DataError
-from amibayes.units import FloatArray, read_only
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray, read_only
 
 SHAPES = ("hexagon", "circle")
 

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
@@ -27,10 +27,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood, deviance, log_peak
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.likelihood.residuals import files_of
-from amibayes.units import FloatArray
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 MAX_INFLATION = 100.0
 """Largest total error, in units of the stated one, that the prior allows."""

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from amibayes.data.closure import closure_matrix
@@ -28,10 +27,7 @@ from amibayes.data.covariance import (
 from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
 from amibayes.data.observables import Observables, closure_sets
 from amibayes.likelihood.residuals import files_of
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
-
+from amibayes.units import FloatArray, IntArray
 
 UNLIKELY = 1e-3
 """Probability of a χ² as large as that of a kind of observable, below which noise is added."""

@@ -11,9 +11,9 @@ from scipy.special import gammaln
 
 from amibayes.data.observables import Observables
 from amibayes.models.bands import band_numbers
-from amibayes.models.components import BinaryModel, ComplexArray
+from amibayes.models.components import BinaryModel
 from amibayes.models.uv_points import UVPoints, uv_points_of
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.components import disc
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray
 
 DENSE_ENOUGH = 0.15
 """Share of non-zeros above which a dense product is the faster one."""

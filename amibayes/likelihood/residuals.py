@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.data.observables import BoolArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

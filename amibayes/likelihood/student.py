@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
 from amibayes.data.covariance import (
@@ -25,10 +24,7 @@ from amibayes.data.covariance import (
     as_blocks,
 )
 from amibayes.data.observables import Observables
-from amibayes.units import FloatArray
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 DEGREES = 4.0
 """Degrees of freedom ν of the residuals."""

@@ -18,13 +18,11 @@ from scipy import optimize, special, stats
 from amibayes.companion_search.result import SearchResult, null_likelihood
 from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.data.observables import BoolArray
 from amibayes.data.tables import UNITS, html_table, quantity_table
 from amibayes.detection.false_alarm import Significance, clopper_pearson, null_maxima
 from amibayes.limits.companion_removed import without_companion
 from amibayes.limits.injection import (
     InjectionSetup,
-    IntArray,
     Recovery,
     Trials,
     ambiguous,
@@ -37,7 +35,7 @@ from amibayes.limits.injection import (
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import FloatArray, contrast_to_delta_mag
+from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag
 
 MAX_STEPS, SETTLED = 100, 1e-10
 

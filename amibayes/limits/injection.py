@@ -15,12 +15,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.companion_search.draws import Searched, likelihood_ratio, search_many
 from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.data.observables import BoolArray
 from amibayes.detection.false_alarm import bounded, search_drawn
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.student import SymmetricWhitening
@@ -35,10 +33,7 @@ from amibayes.parallel import (
     slices,
     spawn,
 )
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
-
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 ROUNDS = 4
 

@@ -6,12 +6,10 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.data.observables import Measurements, Observables, Setup
 from amibayes.errors import DataError
-
-IntArray = NDArray[np.intp]
+from amibayes.units import IntArray
 
 GAP = 0.02
 """Setups are of one band where their channels overlap or stand nearer than this part of λ."""

@@ -20,10 +20,7 @@ from amibayes.models.off_axis import Place
 from amibayes.models.uv_points import UVPoints
 from amibayes.scene.disc import uniform_disc
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import MAS, FloatArray
-
-ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.intp]
+from amibayes.units import MAS, ComplexArray, FloatArray, IntArray
 
 
 @takes_quantities

@@ -12,9 +12,9 @@ from functools import cached_property
 
 import numpy as np
 
-from amibayes.data.observables import IntArray, Observables
-from amibayes.data.off_axis_response import ComplexArray, bspline_weights
-from amibayes.units import MAS, FloatArray, read_only
+from amibayes.data.observables import Observables
+from amibayes.data.off_axis_response import bspline_weights
+from amibayes.units import MAS, ComplexArray, FloatArray, IntArray, read_only
 
 Place = tuple[FloatArray, FloatArray]
 """East and north, mas: (n,), or (n_samples, n) where points of the (u, v) plane differ."""

@@ -13,9 +13,7 @@ from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
 from amibayes.models.off_axis import OffAxis, off_axis_of
-from amibayes.units import FloatArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray
 
 YEAR_DAYS = 365.25
 

@@ -12,17 +12,11 @@ from scipy.sparse.csgraph import connected_components
 from amibayes.data.assumed_covariance import kernel_blocks
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
-from amibayes.data.observables import (
-    BoolArray,
-    IntArray,
-    Measurements,
-    closure_sets,
-    exposure_labels,
-)
+from amibayes.data.observables import Measurements, closure_sets, exposure_labels
 from amibayes.errors import DataError
 from amibayes.oifits.setups import integers, numbers, placed, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
-from amibayes.units import DEGREE, FloatArray
+from amibayes.units import DEGREE, BoolArray, FloatArray, IntArray
 
 MAX_MISFIT = 0.5
 """Median departure of ln(variance ratio) past which a covariance is not that of the errors."""

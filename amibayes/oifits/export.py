@@ -19,12 +19,12 @@ from astropy.io import fits
 
 from amibayes.data.closure import canonical
 from amibayes.data.covariance import DiagonalCovariance
-from amibayes.data.observables import BoolArray, Measurements, Observables, Setup, join
+from amibayes.data.observables import Measurements, Observables, Setup, join
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits.setups import same
 from amibayes.oifits.writer import to_hdus
 from amibayes.support.atomic_files import atomic_path
-from amibayes.units import MAS, FloatArray
+from amibayes.units import MAS, BoolArray, FloatArray
 
 Program = Literal["irbis", "squeeze", "mira"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.data.observables import IntArray, Measurements, Observables, Setup
+from amibayes.data.observables import Measurements, Observables, Setup
 from amibayes.errors import DataError
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.rows import Rows, channel_count, read_rows
@@ -28,6 +28,7 @@ from amibayes.oifits.setups import (
 )
 from amibayes.oifits.stated import ClosureCovariance, Column, Content, stated_covariance
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, open_oifits
+from amibayes.units import IntArray
 
 
 def read_oifits(

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from amibayes.data.observables import BoolArray, IntArray, Measurements
+from amibayes.data.observables import Measurements
 from amibayes.errors import DataError
 from amibayes.oifits.dates import mjd_of_date
 from amibayes.oifits.scales import ANGLE, LENGTH, TIME, scale_of
 from amibayes.oifits.setups import integers, numbers, rest_of
 from amibayes.oifits.tables import OIFits, OITable
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 DAY_S = 86400.0
 

@@ -11,9 +11,8 @@ import numpy as np
 from astropy.io import fits
 from scipy.sparse import coo_array, csr_array, triu
 
-from amibayes.data.observables import IntArray
 from amibayes.oifits.tables import OIFits, OITable
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 SCATTER = "AMIBAYES_SCATTER"
 

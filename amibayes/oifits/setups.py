@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.data.observables import IntArray, Setup
+from amibayes.data.observables import Setup
 from amibayes.errors import DataError
 from amibayes.oifits.scales import ANGLE, LENGTH, scale_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, plain
-from amibayes.units import DEGREE, FloatArray
+from amibayes.units import DEGREE, FloatArray, IntArray
 
 DATA_TABLES = ("OI_VIS2", "OI_T3")
 

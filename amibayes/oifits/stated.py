@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from amibayes.data.covariance import Covariance, DiagonalCovariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import BoolArray, CovarianceKind, IntArray, Measurements
+from amibayes.data.observables import CovarianceKind, Measurements
 from amibayes.errors import DataError
 from amibayes.oifits.correlations import (
     REMEDY,
@@ -26,7 +26,7 @@ from amibayes.oifits.correlations import (
 from amibayes.oifits.scatter import scatter_of
 from amibayes.oifits.setups import same
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 ClosureCovariance = Literal["assumed", "diagonal"]
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amibayes import __version__
 from amibayes.data.covariance import DiagonalCovariance, as_blocks
-from amibayes.data.observables import BoolArray, IntArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.errors import UsageError
 from amibayes.oifits.correlations import pair_covariance
 from amibayes.oifits.dates import first_date
@@ -30,7 +30,7 @@ from amibayes.oifits.scatter import scatter_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
 from amibayes.support.atomic_files import atomic_path
-from amibayes.units import DEGREE, FloatArray
+from amibayes.units import DEGREE, BoolArray, FloatArray, IntArray
 
 CORRNAME = "AMIBAYES"
 ARCSEC = DEGREE / 3600.0

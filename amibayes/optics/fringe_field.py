@@ -18,9 +18,8 @@ import numpy as np
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.fringes import FringeBasis
 from amibayes.optics.holes import hole_transform
-from amibayes.optics.psf import ComplexArray
 from amibayes.optics.sampling import HALF_WIDTH, MAX_FREQUENCY, interpolator, pixel_weights
-from amibayes.units import FloatArray, SingleArray, read_only
+from amibayes.units import ComplexArray, FloatArray, SingleArray, read_only
 
 REACH_STEP_PX = 8
 """Fields come in sizes that differ by so much, so that few are made."""

@@ -18,11 +18,11 @@ from scipy.special import erfc
 
 from amibayes.errors import DataError
 from amibayes.instrument import Channels, Instrument, Mask
-from amibayes.optics.psf import ComplexArray, Wavefront, axis_nodes, intensity, psf
+from amibayes.optics.psf import Wavefront, axis_nodes, intensity, psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator, pixel_transform
 from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Scene
-from amibayes.units import MAS, FloatArray, read_only
+from amibayes.units import MAS, ComplexArray, FloatArray, read_only
 
 OVERSAMPLE = 11
 """Cells of the convolution's grid per pixel and axis."""

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.errors import UsageError
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.pupil import PupilMap
-from amibayes.units import FloatArray, read_only
-
-ComplexArray = NDArray[np.complex128]
+from amibayes.units import ComplexArray, FloatArray, read_only
 
 _TOLERANCE = 1e-9
 """Error of a pixel average, as a fraction of the peak."""

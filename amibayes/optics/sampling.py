@@ -15,11 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
-from amibayes.units import FloatArray, SingleArray
-
-IntArray = NDArray[np.intp]
+from amibayes.units import FloatArray, IntArray, SingleArray
 
 HALF_WIDTH = 8
 """Samples on either side that an interpolated value is made of."""

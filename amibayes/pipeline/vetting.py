@@ -24,13 +24,14 @@ from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolves_stars, search
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.data.observables import BoolArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, bank_statistic, significance
 from amibayes.errors import DataError
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.completeness import DetectionLimit, detection_limit
 from amibayes.models.components import BinaryModel
+from amibayes.units import BoolArray
 
 ALPHA = 0.003
 """Probability of each of the three tests below which a calibrator is dropped."""

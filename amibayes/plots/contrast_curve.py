@@ -12,7 +12,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
 from amibayes.companion_search.result import Companion
-from amibayes.data.observables import BoolArray
 from amibayes.limits.mass_table import MassTable
 from amibayes.plots.style import (
     BLACK,
@@ -24,7 +23,7 @@ from amibayes.plots.style import (
     new_figure,
     styled,
 )
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from amibayes.data.covariance import BlockCovariance
-from amibayes.data.observables import IntArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.plots.style import BLACK, BLUE, DIVERGING, VERMILLION, new_figure, styled
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 MAX_DATA = 160
 """Data of a matrix drawn whole; of larger sets the first groups of each kind are drawn."""

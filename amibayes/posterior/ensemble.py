@@ -17,11 +17,9 @@ from typing import Any
 import emcee
 import numpy as np
 from astropy.table import QTable
-from numpy.typing import NDArray
 
 from amibayes.companion_search.result import Mode, SearchResult
 from amibayes.companion_search.search import resolution_mas
-from amibayes.data.observables import BoolArray
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
@@ -30,7 +28,14 @@ from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.priors import Prior
 from amibayes.support.ensemble_moves import along_others
-from amibayes.units import FloatArray, contrast_to_delta_mag, position_angle_deg, separation
+from amibayes.units import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    contrast_to_delta_mag,
+    position_angle_deg,
+    separation,
+)
 
 STRONG = 30.0
 """Δχ² above which a mode is an island in the sea of noise."""
@@ -73,9 +78,6 @@ class Region:
         """Whether positions (n,) are in it."""
         away = np.hypot(east[:, None] - self.places[:, 0], north[:, None] - self.places[:, 1])
         return np.asarray(away.argmin(axis=1) == 0)
-
-
-IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

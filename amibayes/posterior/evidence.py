@@ -23,12 +23,11 @@ from amibayes.companion_search.result import Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.models.components import IntArray
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
 from amibayes.posterior.priors import Prior
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 Method = Literal["direct", "laplace", "nested"]
 

@@ -16,13 +16,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from amibayes.data.observables import BoolArray
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.posterior.integrand import Cells, Integrand, Nuisance
 from amibayes.posterior.priors import Prior
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 FLOOR = 10.0
 """Cells whose logarithm of the mass is this far below the largest are not cut any more."""

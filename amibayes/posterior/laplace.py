@@ -11,9 +11,9 @@ from scipy.special import logsumexp
 
 from amibayes.companion_search.result import Mode
 from amibayes.likelihood.likelihood import LOG_TWO_PI, Likelihood
-from amibayes.models.components import BinaryModel, IntArray
+from amibayes.models.components import BinaryModel
 from amibayes.posterior.priors import Prior
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 
 def log_evidence_laplace(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> float:

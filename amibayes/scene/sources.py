@@ -11,15 +11,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import j0, j1
 
 from amibayes.errors import DataError
 from amibayes.scene.spectrum import Flat, Spectrum
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import FloatArray, read_only
-
-ComplexArray = NDArray[np.complex128]
+from amibayes.units import ComplexArray, FloatArray, read_only
 
 _BLOCK = 4096
 """Frequencies of an image's transform that are computed at once, to bound the memory."""

@@ -8,12 +8,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from amibayes.errors import UsageError
-from amibayes.units import FloatArray
-
-BoolArray = NDArray[np.bool_]
+from amibayes.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

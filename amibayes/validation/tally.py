@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from amibayes.data.observables import BoolArray, IntArray
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 from amibayes.validation.plan import RANGES, ValidationPlan
 from amibayes.validation.trial import COVERED, LEVELS, RANKED
 

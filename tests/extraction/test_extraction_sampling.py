@@ -14,8 +14,7 @@ from amibayes.extraction.low_flux import expected_covariance
 from amibayes.extraction.view import View
 from amibayes.instrument import load_instrument
 from amibayes.optics import psf
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 INSTRUMENT = load_instrument("niriss", "F430M")
 TRIANGLES = INSTRUMENT.mask.triangle_baselines

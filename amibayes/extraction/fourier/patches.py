@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.view import View
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

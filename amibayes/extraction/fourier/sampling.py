@@ -16,11 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.instrument import Mask
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray, SingleArray
-
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from amibayes.units import ComplexArray, FloatArray, IntArray, SingleArray
 
 PixelArray = NDArray[Any]
 """Images in single or in double precision: they are measured in the precision they have."""

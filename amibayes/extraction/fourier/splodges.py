@@ -19,8 +19,7 @@ from scipy.signal import fftconvolve
 from amibayes.extraction.fourier.patches import Patches, waves
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.view import View
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

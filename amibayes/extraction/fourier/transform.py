@@ -17,8 +17,7 @@ from amibayes.extraction.fourier.splodges import Splodges
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.view import View
 from amibayes.optics import FringeBasis
-from amibayes.optics.psf import ComplexArray
-from amibayes.units import FloatArray
+from amibayes.units import ComplexArray, FloatArray
 
 RING = 0.8
 """The background is taken outside this fraction of the half width of the image."""

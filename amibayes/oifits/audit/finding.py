@@ -8,11 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from amibayes.data.observables import BoolArray
 from amibayes.oifits.rows import KINDS, Kind
 from amibayes.oifits.scales import ANGLE, scale_of
 from amibayes.oifits.tables import OIFits, OITable
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 Severity = Literal["error", "warning"]
 

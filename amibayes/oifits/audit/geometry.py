@@ -9,10 +9,10 @@ from itertools import combinations
 import numpy as np
 
 from amibayes.data.closure import canonical
-from amibayes.data.observables import BoolArray, IntArray, Measurements, Observables, closure_sets
+from amibayes.data.observables import Measurements, Observables, closure_sets
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
 from amibayes.oifits.tables import OIFits
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 SAME_UV = 0.02
 """(u, v) of one baseline in two tables agree to this part of its length …"""

@@ -9,12 +9,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from amibayes.data.closure import canonical, canonical_uv, closure_matrix, kernel_basis
-from amibayes.data.observables import IntArray, Measurements, Observables, closure_sets
+from amibayes.data.observables import Measurements, Observables, closure_sets
 from amibayes.errors import DataError
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, listed
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 SAME_PLACE = 0.005
 """Repeats are of one point of the (u, v) plane where they differ by less than this part."""
