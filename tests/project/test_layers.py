@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -38,6 +41,12 @@ LAYERS = [
     "__main__",
 ]
 
+MAX_LOOSE, MAX_IN_FOLDER = 8, 18
+"""Modules beside the packages, and modules in one folder, that a reader can still take in."""
+
+LARGER = {"extraction": 19}
+"""Folders that are still to be brought below."""
+
 
 def layer_of(module: str) -> int:
     return LAYERS.index(module.split(".")[1] if "." in module else "__init__")
@@ -48,41 +57,56 @@ def module_name(path: Path) -> str:
     return ".".join(part for part in parts if part != "__init__")
 
 
+PATHS = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
 def is_type_checking(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
 
 
+def running(node: ast.AST) -> Iterator[ast.AST]:
+    """Every node below one but for what only a type checker reads."""
+    for child in ast.iter_child_nodes(node):
+        if not is_type_checking(child):
+            yield child
+            yield from running(child)
+
+
 def imported(path: Path) -> set[str]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    skipped = {
-        id(n) for block in ast.walk(tree) if is_type_checking(block) for n in ast.walk(block)
-    }
+    """Modules of the package that a module imports, at its top or inside of a function."""
     names: set[str] = set()
-    for node in ast.walk(tree):
-        if id(node) in skipped:
-            continue
+    for node in running(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            names |= {
-                f"{node.module}.{a.name}" if node.module == "amibayes" else str(node.module)
-                for a in node.names
-            }
+            longer = {f"{node.module}.{a.name}" for a in node.names}
+            names |= {name if name in PATHS else str(node.module) for name in longer}
     return {name for name in names if name.split(".")[0] == "amibayes"}
 
 
-def resolve(name: str) -> str:
-    """`from amibayes import __version__` names the package, not a module of it."""
-    target = name.split(".")
-    if len(target) > 1 and target[1] in LAYERS:
-        return name
-    return "amibayes"
-
-
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=module_name)
-def test_imports_point_only_upward(path: Path) -> None:
-    module = module_name(path)
+@pytest.mark.parametrize("module", PATHS)
+def test_imports_point_only_upward(module: str) -> None:
     own = layer_of(module)
-    for name in imported(path):
-        assert layer_of(resolve(name)) <= own, f"{module} (layer {own}) imports {name}"
+    for name in imported(PATHS[module]):
+        assert layer_of(name) <= own, f"{module} (layer {own}) imports {name}"
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    graph = TopologicalSorter({name: imported(path) - {name} for name, path in PATHS.items()})
+    try:
+        graph.prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+def test_a_circle_is_found() -> None:
+    with pytest.raises(CycleError):
+        TopologicalSorter({"a": {"b"}, "b": {"c"}, "c": {"a"}}).prepare()
+
+
+def test_folders_can_be_taken_in() -> None:
+    counts = Counter(path.parent for path in PATHS.values())
+    assert counts.pop(PACKAGE) <= MAX_LOOSE
+    limit = {p: LARGER.get(str(p.relative_to(PACKAGE)), MAX_IN_FOLDER) for p in counts}
+    assert not {str(p.relative_to(PACKAGE)): n for p, n in counts.items() if n > limit[p]}
