@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -29,7 +29,7 @@ from amibayes.pipeline.warnings import search_cautions
 
 Kinds = tuple[str, ...]
 
-Method = Literal["injection"] | AnalyticMethod
+Method: TypeAlias = Literal["injection"] | AnalyticMethod
 
 KINDS: tuple[Kinds, ...] = (("vis2", "cp"), ("vis2",), ("cp",))
 """What limits are drawn for, if nothing else is asked: all data, and each kind by itself."""

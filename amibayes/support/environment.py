@@ -11,35 +11,32 @@ from importlib import metadata
 from typing import Any
 
 import numpy as np
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from amibayes import __version__
+from amibayes.errors import RunError
 
-NEEDED = {
-    "numpy": "2.0", "scipy": "1.13", "astropy": "6.1", "emcee": "3.1.4", "nlopt": "2.8",
-    "corner": "2.2.2", "matplotlib": "3.9", "h5py": "3.11", "jinja2": "3.1", "tqdm": "4.66",
-    "threadpoolctl": "3.2",
-}  # fmt: skip
-"""Packages that amibayes needs, with the oldest version of each (a test holds it to pyproject)."""
-
-EXTRAS = {"cluster": "distributed", "evidence": "dynesty", "arviz": "arviz", "mpi": "mpi4py"}
-"""Name of each extra and the package that it brings."""
+EXTRAS = ("cluster", "evidence", "arviz", "mpi")
+"""Extras that users need; the others are for work on amibayes itself. Each brings one package."""
 
 GEMM_SIZE = 1024
 
 
 @dataclass(frozen=True)
 class Package:
-    """A package: the version that is installed (empty: none) and the oldest that will do."""
+    """A package: the version that is installed (empty: none), and those that will do."""
 
     name: str
     version: str
-    oldest: str = ""
+    needed: str = ""
 
     @property
     def fit(self) -> bool:
-        """Whether it is there, and new enough."""
-        return bool(self.version) and numbers(self.version) >= numbers(self.oldest)
+        """Whether it is there, and of a version that will do."""
+        wanted = SpecifierSet(self.needed)
+        return bool(self.version) and wanted.contains(self.version, prereleases=True)
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ class Checkup:
     def faults(self) -> tuple[str, ...]:
         """What keeps amibayes from working."""
         return tuple(
-            f"{p.name} {p.version or 'is missing'}: {p.oldest} or newer is needed"
+            f"{p.name} {p.version or 'is missing'}: {p.needed or 'it'} is needed"
             for p in self.packages
             if not p.fit
         )
@@ -91,22 +88,42 @@ def checkup(seconds: float = 1.0) -> Checkup:
     seconds : float
         To spend on timing.
     """
+    needed = requirements()
     return Checkup(
         platform.python_version(),
         f"{platform.system()} {platform.release()} {platform.machine()}",
         _cores(),
         _memory_bytes(),
-        tuple(Package(name, _version(name), oldest) for name, oldest in NEEDED.items()),
-        tuple(Package(name, _version(package)) for name, package in EXTRAS.items()),
+        tuple(Package(r.name, _version(r.name), str(r.specifier)) for r in needed[""]),
+        tuple(
+            Package(extra, _version(needed[extra][0].name)) for extra in EXTRAS if extra in needed
+        ),
         tuple(_library(entry) for entry in threadpool_info()),
         (_gemm_gflops(0.5 * seconds, 1), _gemm_gflops(0.5 * seconds, None)),
     )
 
 
-def numbers(version: str) -> tuple[int, ...]:
-    """Leading numbers of a version: 2.0.1rc1 is (2, 0, 1)."""
-    found = re.match(r"\d+(?:\.\d+)*", version)
-    return tuple(int(part) for part in found.group().split(".")) if found else ()
+def requirements() -> dict[str, list[Requirement]]:
+    """Give the packages that amibayes needs, as installed, by extra (``""``: always).
+
+    Raises
+    ------
+    RunError
+        Where amibayes runs without having been installed, so that nothing states its needs.
+    """
+    try:
+        lines = metadata.requires("amibayes") or []
+    except metadata.PackageNotFoundError:
+        raise RunError(
+            "runs without being installed: what it needs is not known",
+            source="amibayes",
+            remedy="pip install amibayes",
+        ) from None
+    found: dict[str, list[Requirement]] = {"": []}
+    for requirement in map(Requirement, lines):
+        extra = re.search(r"extra == ['\"]([\w-]+)", str(requirement.marker or ""))
+        found.setdefault(extra[1] if extra else "", []).append(requirement)
+    return found
 
 
 def _version(package: str) -> str:
