@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
 from amibayes.likelihood.likelihood import single_likelihood
-from amibayes.likelihood.residuals import files_of, residual
+from amibayes.likelihood.residuals import files_of
 from amibayes.units import FloatArray
 
 
@@ -42,7 +42,7 @@ def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
     """Reduced χ² of every file and kind of observable, with the companion and without."""
     binary, single = result.likelihood, single_likelihood(result.likelihood)
     data = binary.observables
-    left = residual(binary, result.theta), residual(single, result.single_theta)
+    left = binary.difference(result.theta)[:, 0], single.difference(result.single_theta)[:, 0]
     share = result.ndof / binary.n_independent
     out = []
     for file in files_of(data):

@@ -13,7 +13,7 @@ from amibayes.companion_search.template_bank import Grid
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.student import Robustness, SymmetricWhitening, symmetric_whitening
+from amibayes.likelihood.student import Robustness, StudentNoise, SymmetricWhitening
 from amibayes.models.uv_points import YEAR_DAYS
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import (
@@ -233,12 +233,10 @@ class SearchResult:
 
 
 def null_likelihood(result: SearchResult) -> tuple[Likelihood, SymmetricWhitening | None]:
-    """Likelihood by which a search is judged, and the frame of robust residuals."""
-    if result.robustness is None:
-        return result.likelihood, None
-    # Weights were found with a companion; no companion may be judged by them.
-    base = result.robustness.base
-    return Likelihood(base, result.likelihood.model), symmetric_whitening(base)
+    """Likelihood of a test of no companion, and the symmetric whitening of robust residuals."""
+    noise = result.likelihood.noise.without_companion()
+    symmetric = noise.symmetric if isinstance(noise, StudentNoise) else None
+    return result.likelihood.with_noise(noise), symmetric
 
 
 def companion_of(theta: FloatArray, covariance: FloatArray) -> Companion:

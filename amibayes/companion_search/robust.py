@@ -15,6 +15,7 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.student import (
     DEGREES,
     Robustness,
+    StudentNoise,
     SymmetricWhitening,
     normal_moments,
     reweighted,
@@ -75,9 +76,12 @@ def search_robust(
     tried = [work.settle(white) for white in starts]
     result, weights, residuals, scale = max(tried, key=lambda t: work.log_prob(t[0].theta))
     stated = likelihood.observables
-    robustness = Robustness(reweighted(stated, scale), stated, weights, residuals)
+    base = reweighted(stated, scale)
+    robustness = Robustness(base, stated, weights, residuals)
+    student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
     noise = _as_noise(work.frame, stated.covariance.variance, scale)
-    return replace(result, robustness=robustness), noise
+    likelihood = result.likelihood.with_noise(student)
+    return replace(result, likelihood=likelihood, robustness=robustness), noise
 
 
 def _as_noise(frame: SymmetricWhitening, variance: FloatArray, scale: FloatArray) -> ExtraNoise:
@@ -114,7 +118,7 @@ class RobustFits:
 
     def log_prob(self, theta: FloatArray) -> float:
         """The t likelihood at the most likely scale of each kind."""
-        difference = self.likelihood._difference(self.likelihood.predict(theta))
+        difference = self.likelihood.difference(theta)
         nodes = [t.best(difference[:, 0]) if self.free_scale else 0.0 for t in self.terms]
         each = zip(self.terms, nodes, strict=True)
         return float(sum(t.log_likelihoods(difference, np.array([n]))[0, 0] for t, n in each))

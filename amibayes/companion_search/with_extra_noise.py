@@ -25,7 +25,7 @@ from amibayes.likelihood.extra_noise import (
     add_noise,
 )
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.residuals import files_of, residual
+from amibayes.likelihood.residuals import files_of
 from amibayes.units import FloatArray
 
 
@@ -45,7 +45,7 @@ def fit_noise(likelihood: Likelihood, theta: FloatArray, *, per_file: bool = Fal
     per_file : bool
         Judge the files apart.
     """
-    data, difference = likelihood.observables, residual(likelihood, theta)
+    data, difference = likelihood.observables, likelihood.difference(theta)[:, 0]
     vis2 = np.arange(data.covariance.size) < data.n_vis2
     share = 1.0 - len(theta) / likelihood.n_independent
     parts = files_of(data)

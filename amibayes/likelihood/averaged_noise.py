@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
@@ -24,7 +23,8 @@ from scipy.special import logsumexp
 from amibayes.data.covariance import DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
-from amibayes.likelihood.likelihood import Likelihood, deviance, log_peak
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import MAX_EXPONENT, FittedNoise, NoiseModel, deviance, log_peak
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.likelihood.residuals import files_of
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -136,29 +136,31 @@ class NoisePosterior:
         return float(mid), float(low), float(high)
 
 
-class MarginalLikelihood(Likelihood):
-    """The likelihood averaged over the unknown extra noise.
+@dataclass(frozen=True, eq=False)
+class AveragedNoise(FittedNoise):
+    """Noise of unknown amounts, averaged over; each `NoiseTerm` has one.
 
-    Everything that needs one covariance (residuals, χ², gradients, errors) takes that of the
-    search; only `log_prob` is averaged.
+    What needs one covariance (χ², gradients, errors) takes that of the fit; only `log_prob`,
+    and what a gain in it means, are of the average.
 
     Parameters
     ----------
-    profile : Likelihood
-        Of the search, the most likely noise included.
-    terms : sequence of NoiseTerm
+    fit : NoiseModel
+        The noise of the fit, the most likely amounts included.
+    terms : tuple of NoiseTerm
+        Their data make up the whole data vector.
     """
 
     terms: tuple[NoiseTerm, ...]
 
-    def __init__(self, profile: Likelihood, terms: Sequence[NoiseTerm]) -> None:
-        self.__dict__.update(profile.__dict__)
-        self.terms = tuple(terms)
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """One name for each kind of observable (and file) of every term."""
+        return tuple(_key(term, name) for term in self.terms for name in term.typical)
 
-    def log_prob(self, theta: ArrayLike) -> FloatArray:
-        """Log-likelihood of parameter sets (n, n_dim), (n,)."""
-        difference = self._difference(self.predict(theta))
-        parts = [logsumexp(term.log_parts(difference), axis=0) for term in self.terms]
+    def log_prob(self, residual: FloatArray) -> FloatArray:
+        """Log-likelihood (n,) of residuals (n_data, n), averaged over the amounts."""
+        parts = [logsumexp(term.log_parts(residual), axis=0) for term in self.terms]
         return np.asarray(np.sum(parts, axis=0))
 
     def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
@@ -168,44 +170,46 @@ class MarginalLikelihood(Likelihood):
         the fewest data.
         """
         n = min(term.n_independent for term in self.terms)
-        return np.asarray(n * np.expm1(np.minimum(2.0 * log_gain / n, 50.0)))
+        return np.asarray(n * np.expm1(np.minimum(2.0 * log_gain / n, MAX_EXPONENT)))
 
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         n = self.n_independent
         return np.asarray(0.5 * n * np.log1p(delta_chi2 / n))
 
-    def noise_posterior(self, theta: FloatArray) -> dict[str, NoisePosterior]:
-        """Posterior of the extra noise of each kind, given samples (n, n_dim) of the rest.
+    def posterior(self, residual: FloatArray) -> dict[str, NoisePosterior]:
+        """Posterior of the amounts, given residuals (n_data, n) of equal weight.
 
-        Keys are those of `ExtraNoise`, followed by a colon and the file where files are told
-        apart; V² is dimensionless, closure phases are in radians.
+        Keys are `parameters`: those of `ExtraNoise`, followed by a colon and the file where
+        files are told apart; V² is dimensionless, closure phases are in radians.
         """
-        difference = self._difference(self.predict(theta))
         out = {}
         for term in self.terms:
-            log = term.log_parts(difference)
+            log = term.log_parts(residual)
             share = np.exp(log - logsumexp(log, axis=0)).mean(axis=1)
             for name in term.typical:
                 ends = term.amounts(term.edges, name)
                 low, high = np.append(0.0, ends[:-1]), np.append(0.0, ends[1:])
-                key = f"{name}:{term.source}" if term.source else name
-                out[key] = NoisePosterior(float(share[0]), Marginal(low, high, share))
+                out[_key(term, name)] = NoisePosterior(float(share[0]), Marginal(low, high, share))
         return out
 
 
-def marginal_likelihood(
-    profile: Likelihood,
+def _key(term: NoiseTerm, name: str) -> str:
+    return f"{name}:{term.source}" if term.source else name
+
+
+def averaged_noise(
+    fit: NoiseModel,
     stated: Observables,
     fits: Sequence[tuple[Likelihood, FloatArray]],
     *,
     per_file: bool = False,
-) -> MarginalLikelihood:
-    """Average a likelihood over its extra noise.
+) -> AveragedNoise:
+    """Average over the extra noise of each kind of observable.
 
     Parameters
     ----------
-    profile : Likelihood
+    fit : NoiseModel
         Of the search.
     stated : Observables
         The same data with the stated errors.
@@ -219,22 +223,19 @@ def marginal_likelihood(
     With probability `PRIOR_STATED_ERRORS_CORRECT` the stated errors are right; else the total
     error has Jeffreys' prior of a scale, from the stated error to `MAX_INFLATION` times that.
     """
-    differences = [residual_of(likelihood, theta) for likelihood, theta in fits]
+    differences = differences_of(fits)
     data = stated.unflagged()
     everywhere = np.ones(data.covariance.size, dtype=bool)
     files = [(f.source, f.of_kind("vis2") | f.of_kind("cp")) for f in files_of(data)]
     parts = files if per_file and len(files) > 1 else [("", everywhere)]
     found = [replace(t, source=name) for name, here in parts for t in _terms(data, here)]
     terms = [with_nodes(t, differences) for t in found]
-    return MarginalLikelihood(profile, terms)
+    return AveragedNoise(fit, tuple(terms))
 
 
-def residual_of(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Data minus model (n_data,) at one parameter set (n_dim,), closure phases wrapped."""
-    difference = likelihood.observables.data - likelihood.predict(theta[None])[:, 0]
-    closure = difference[likelihood.observables.n_vis2 :]
-    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-    return np.asarray(difference)
+def differences_of(fits: Sequence[tuple[Likelihood, FloatArray]]) -> list[FloatArray]:
+    """Data minus model (n_data,) of each fit."""
+    return [likelihood.difference(theta)[:, 0] for likelihood, theta in fits]
 
 
 def files_share_errors(stated: Observables) -> bool:

@@ -3,44 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaln
 
 from amibayes.data.observables import Observables
+from amibayes.likelihood.noise import NoiseModel, noise_of
 from amibayes.models.bands import band_numbers
 from amibayes.models.components import BinaryModel
 from amibayes.models.uv_points import UVPoints, uv_points_of
 from amibayes.units import ComplexArray, FloatArray
 
-LOG_TWO_PI = float(np.log(2.0 * np.pi))
-
-
 NEVER_ZERO = 1e-30
 """Keeps the phase derivative finite at an exact null of the visibility."""
-
-
-def log_peak(n: int, degrees: float) -> float:
-    """Logarithm of the density of n data of unit covariance where they have no residuals."""
-    gaussian = -0.5 * n * LOG_TWO_PI
-    if not np.isfinite(degrees):
-        return gaussian
-    half = 0.5 * degrees
-    ratio = gammaln(half + 0.5 * n) - gammaln(half) - 0.5 * n * np.log(half - 1.0)
-    return float(gaussian + ratio)
-
-
-def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
-    """−2 ln L of χ² (any shape) of n data, 0 without residuals.
-
-    χ² where the data are Gaussian, (ν + n) ln[1 + χ²/(ν − 2)] where they follow a t
-    distribution of ν ``degrees`` of freedom.
-    """
-    if not np.isfinite(degrees):
-        return chi2
-    return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))
 
 
 def _samples(observables: Observables, model: BinaryModel) -> UVPoints:
@@ -50,15 +25,18 @@ def _samples(observables: Observables, model: BinaryModel) -> UVPoints:
 
 
 class Likelihood:
-    """Likelihood of a binary model, vectorised over parameter sets.
-
-    Gaussian; where the covariance was estimated, the t distribution of its degrees of
-    freedom ν, L ∝ [1 + χ²/(ν − 2)]^{−(ν + n)/2} of n independent data.
+    """Likelihood of a model, vectorised over parameter sets: data, model and noise.
 
     Parameters
     ----------
     observables : Observables
-    model : BinaryModel
+        Their covariance is the one that stands for the noise.
+    model : BinaryModel, optional
+    noise : NoiseModel, optional
+        By default what the observables state: Gaussian, or the t distribution of an
+        estimated covariance.
+    samples : UVPoints, optional
+        Points of the data, where they are known already.
 
     Notes
     -----
@@ -66,10 +44,17 @@ class Likelihood:
     contrast as a flux ratio, uniform-disc diameter in mas, background flux.
     """
 
-    def __init__(self, observables: Observables, model: BinaryModel | None = None) -> None:
+    def __init__(
+        self,
+        observables: Observables,
+        model: BinaryModel | None = None,
+        noise: NoiseModel | None = None,
+        samples: UVPoints | None = None,
+    ) -> None:
         self.observables = observables.unflagged()
         self.model = model or BinaryModel()
-        self.samples: UVPoints = _samples(self.observables, self.model)
+        self.noise = noise_of(self.observables) if noise is None else noise
+        self.samples = _samples(self.observables, self.model) if samples is None else samples
         self._n2 = len(self.observables.vis2)
 
     @property
@@ -80,37 +65,34 @@ class Likelihood:
     @property
     def n_independent(self) -> int:
         """Number of independent data."""
-        return self.observables.n_independent
+        return self.noise.n_independent
 
     def with_model(self, model: BinaryModel) -> Likelihood:
-        """Make the likelihood of another model on the same data."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__, model=model)
-        if (model.bands, model.moves) != (self.model.bands, self.model.moves):
-            other.samples = _samples(self.observables, model)
-        return other
+        """Make the likelihood of another model with the same data and noise."""
+        alike = (model.bands, model.moves) == (self.model.bands, self.model.moves)
+        return Likelihood(self.observables, model, self.noise, self.samples if alike else None)
+
+    def with_noise(self, noise: NoiseModel) -> Likelihood:
+        """Make the likelihood of the same data and model with other noise."""
+        data = self.observables
+        if noise.covariance is not data.covariance:
+            known = noise.covariance, noise.freedom, noise.scatter
+            data = replace(data, covariance=known[0], freedom=known[1], scatter=known[2])
+        return Likelihood(data, self.model, noise, self.samples)
 
     @property
     def degrees(self) -> float:
         """Degrees of freedom of the distribution of the data; infinite for a Gaussian."""
-        return self.observables.degrees_of_freedom
+        return self.noise.degrees
 
-    @cached_property
+    @property
     def log_norm(self) -> float:
-        """Logarithm of the likelihood of data without residuals."""
-        peak = log_peak(self.n_independent, self.degrees)
-        return peak - 0.5 * self.observables.covariance.logdet()
+        """Logarithm of the likelihood of data without residuals, with the one covariance."""
+        return self.noise.log_norm
 
     def deviance(self, chi2: ArrayLike) -> FloatArray:
         """−2 ln L of χ² (any shape), 0 without residuals: χ² itself where L is Gaussian."""
-        return deviance(np.asarray(chi2, dtype=float), self.n_independent, self.degrees)
-
-    def inflation(self, chi2: FloatArray) -> FloatArray:
-        """dχ²/d(deviance): variance of what is left, in units of the covariance's (any shape)."""
-        nu = self.degrees
-        if not np.isfinite(nu):
-            return np.ones_like(chi2)
-        return np.asarray((nu - 2.0 + chi2) / (nu + self.n_independent))
+        return self.noise.deviance(np.asarray(chi2, dtype=float))
 
     def predict(self, theta: ArrayLike) -> FloatArray:
         """Model of the data: V², then closure phases in radians, (n_data, n)."""
@@ -119,7 +101,11 @@ class Likelihood:
 
     def residuals(self, theta: ArrayLike) -> FloatArray:
         """Whitened residuals data − model, (n_independent, n)."""
-        return self.observables.covariance.whiten(self._difference(self.predict(theta)))
+        return self.noise.whiten(self.difference(theta))
+
+    def difference(self, theta: ArrayLike) -> FloatArray:
+        """Data − model, closure phases the short way round, (n_data, n)."""
+        return self._difference(self.predict(theta))
 
     def chi2(self, theta: ArrayLike) -> FloatArray:
         """χ² of parameter sets (n, n_dim), (n,)."""
@@ -127,36 +113,19 @@ class Likelihood:
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
-        return self.log_norm - 0.5 * self.deviance(self.chi2(theta))
-
-    def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
-        """Δχ² that goes with a gain in ln L over no companion, (n,).
-
-        In units of the variance that is left with the companion, if data follow a t.
-        """
-        count = self.degrees + self.n_independent
-        if not np.isfinite(count):
-            return np.asarray(2.0 * log_gain)
-        return np.asarray(count * np.expm1(np.minimum(2.0 * log_gain / count, 50.0)))
-
-    def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
-        """What a Δχ² from the best fit costs in ln L, (n,)."""
-        count = self.degrees + self.n_independent
-        if not np.isfinite(count):
-            return np.asarray(0.5 * delta_chi2)
-        return np.asarray(0.5 * count * np.log1p(delta_chi2 / count))
+        return self.noise.log_prob(self.difference(theta))
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Log-likelihood (n,) and its gradient (n, n_dim)."""
+        """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""
         value, slopes = self.model.gradient(self.samples, self._sets(theta))
         difference = self._difference(self._observe(value))
-        weighted = self.observables.covariance.solve(difference)
+        weighted = self.noise.solve(difference)
         chi2 = (difference * weighted).sum(axis=0)
         # Reverse mode: fold the data's weights back onto the samples once, so that the
         # gradient costs one product per parameter and no Jacobian of the data.
         pull = 2.0 * (self.samples.from_squares @ weighted[: self._n2]) * value.conj()
         pull -= 1j * (self.samples.from_legs @ weighted[self._n2 :]) / (value + NEVER_ZERO)
-        gradient = np.einsum("sn,psn->np", pull, slopes).real / self.inflation(chi2)[:, None]
+        gradient = np.einsum("sn,psn->np", pull, slopes).real / self.noise.inflation(chi2)[:, None]
         return self.log_norm - 0.5 * self.deviance(chi2), np.asarray(gradient)
 
     def jacobian(self, theta: ArrayLike) -> FloatArray:
@@ -165,7 +134,7 @@ class Likelihood:
         by_phase = (slopes[:, :, 0] / (value[:, 0] + NEVER_ZERO)).imag.T
         by_vis2 = 2.0 * (slopes[:, :, 0] * value[:, 0].conj()).real.T
         rows = np.concatenate([self.samples.squares @ by_vis2, self.samples.legs @ by_phase])
-        return self.observables.covariance.whiten(rows)
+        return self.noise.whiten(rows)
 
     def errors(self, theta: ArrayLike) -> FloatArray:
         """Covariance (n_dim, n_dim) of the parameters from the inverse of the Fisher matrix.

@@ -1,4 +1,4 @@
-"""The data of each file of a joint fit, and what the fit leaves of them."""
+"""Which data of a joint fit come from which file."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.data.observables import Observables
-from amibayes.likelihood.likelihood import Likelihood
-from amibayes.units import BoolArray, FloatArray
+from amibayes.units import BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +32,3 @@ def files_of(observables: Observables) -> tuple[FileData, ...]:
     vis2, closure = sources[data.vis2.setup], sources[data.closure_phase.setup]
     names = sorted(set(vis2.tolist()) | set(closure.tolist()))
     return tuple(FileData(name, vis2 == name, closure == name) for name in names)
-
-
-def residual(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Data less model, closure phases the short way round, (n_data,)."""
-    data = likelihood.observables
-    difference = data.data - likelihood.predict(np.atleast_2d(theta))[:, 0]
-    closure = difference[data.n_vis2 :]
-    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-    return np.asarray(difference)

@@ -24,6 +24,7 @@ from amibayes.data.covariance import (
     as_blocks,
 )
 from amibayes.data.observables import Observables
+from amibayes.likelihood.noise import FittedNoise, GaussianNoise
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 DEGREES = 4.0
@@ -126,6 +127,32 @@ def _symmetric(whitening: csr_array, block: Block) -> tuple[IntArray, IntArray, 
     standard = colour / np.sqrt(np.diag(block.matrix))[:, None]
     left, _, right = np.linalg.svd(standard, full_matrices=False)
     return block.index, used, left @ right
+
+
+@dataclass(frozen=True, eq=False)
+class StudentNoise(FittedNoise):
+    """Residuals with Student's t distribution, as a fit with weights sees them.
+
+    Parameters
+    ----------
+    fit : NoiseModel
+        Gaussian; the errors of data that fit nothing are stretched.
+    base : Covariance
+        Without the weights, which were found with a companion.
+    symmetric : SymmetricWhitening
+        Of ``base``.
+    """
+
+    base: Covariance
+    symmetric: SymmetricWhitening
+
+    def scores(self, white: FloatArray) -> FloatArray:
+        """Bounded scores of data (n_independent, n), whitened by ``base``."""
+        return scores(self.symmetric, white)
+
+    def without_companion(self) -> StudentNoise:
+        """All data at full weight: no companion may be tested by weights found with one."""
+        return StudentNoise(GaussianNoise(self.base), self.base, self.symmetric)
 
 
 def weights_of(standard: FloatArray) -> FloatArray:

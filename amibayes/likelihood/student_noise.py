@@ -10,15 +10,15 @@ from scipy.sparse import csr_array, diags_array
 
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import (
-    BOTH,
-    MarginalLikelihood,
+    AveragedNoise,
     NoiseTerm,
+    differences_of,
     kinds_of,
-    residual_of,
     with_nodes,
 )
-from amibayes.likelihood.likelihood import LOG_TWO_PI, Likelihood
-from amibayes.likelihood.student import DEGREES, Robustness, normal_moments, symmetric_whitening
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import LOG_TWO_PI, NoiseModel
+from amibayes.likelihood.student import DEGREES, normal_moments, symmetric_whitening
 from amibayes.units import FloatArray
 
 
@@ -58,30 +58,28 @@ def student_terms(stated: Observables) -> list[StudentTerm]:
     return terms
 
 
-def student_likelihood(
-    profile: Likelihood,
-    robustness: Robustness,
+def averaged_student_noise(
+    fit: NoiseModel,
+    stated: Observables,
     fits: Sequence[tuple[Likelihood, FloatArray]],
     *,
     free_scale: bool = True,
-) -> MarginalLikelihood:
-    """Give a robust search the likelihood of its residuals, averaged over their scale.
+) -> AveragedNoise:
+    """The t likelihood of residuals, averaged over their scale.
 
     Parameters
     ----------
-    profile : Likelihood
+    fit : NoiseModel
         Of the search, outliers stretched.
-    robustness : Robustness
+    stated : Observables
+        With the stated errors.
     fits : sequence of (Likelihood, (n_dim,) float array)
-        As in `amibayes.likelihood.averaged_noise.marginal_likelihood`.
+        As in `amibayes.likelihood.averaged_noise.averaged_noise`.
     free_scale : bool
         Whether the scale of the errors is unknown; else it is the stated one.
     """
-    terms: list[NoiseTerm] = list(student_terms(robustness.stated))
+    terms: list[NoiseTerm] = list(student_terms(stated))
     if free_scale:
-        differences = [residual_of(likelihood, theta) for likelihood, theta in fits]
+        differences = differences_of(fits)
         terms = [with_nodes(t, differences) for t in terms]
-    return MarginalLikelihood(profile, terms)
-
-
-__all__ = ["BOTH", "StudentTerm", "student_likelihood", "student_terms"]
+    return AveragedNoise(fit, tuple(terms))

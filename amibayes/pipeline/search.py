@@ -23,16 +23,15 @@ from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.averaged_noise import (
-    MarginalLikelihood,
     NoisePosterior,
+    averaged_noise,
     files_share_errors,
-    marginal_likelihood,
 )
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.residuals import files_of
-from amibayes.likelihood.student_noise import student_likelihood
+from amibayes.likelihood.student_noise import averaged_student_noise
 from amibayes.limits.completeness import DetectionLimit, detection_limit
 from amibayes.models.components import BinaryModel
 from amibayes.parallel import Executor, Progress
@@ -258,13 +257,14 @@ def noise_averaged(
     stated = observables.only(options.observables)
     per_file = options.file_noise is not False and len(files_of(stated)) > 1
     if result.robustness is not None:
-        averaged = student_likelihood(
-            profile, result.robustness, fits, free_scale=options.extra_noise
+        noise = averaged_student_noise(
+            profile.noise, result.robustness.stated, fits, free_scale=options.extra_noise
         )
     elif per_file and files_share_errors(stated):
         return result, two
     else:
-        averaged = marginal_likelihood(profile, stated, fits, per_file=per_file)
+        noise = averaged_noise(profile.noise, stated, fits, per_file=per_file)
+    averaged = profile.with_noise(noise)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two
@@ -273,9 +273,11 @@ def noise_averaged(
 def _noise_posterior(
     averaged: SearchResult, posterior: Posterior | None
 ) -> dict[str, NoisePosterior] | None:
-    if posterior is None or not isinstance(averaged.likelihood, MarginalLikelihood):
+    likelihood = averaged.likelihood
+    if posterior is None or not likelihood.noise.parameters:
         return None
-    return averaged.likelihood.noise_posterior(posterior.samples[:MAX_NOISE_SAMPLES])
+    residual = likelihood.difference(posterior.samples[:MAX_NOISE_SAMPLES])
+    return dict(likelihood.noise.posterior(residual))
 
 
 def search_field(

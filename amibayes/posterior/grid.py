@@ -231,7 +231,9 @@ def _to_cut(
     gain = np.maximum(delta_chi2, 1.0)
     rate = np.maximum(2.0 * np.pi / work.fringe_mas, 2.0 / cells.centre[0])
     too_large = cells.size * rate * np.sqrt(gain) > step
-    missed = work.likelihood.log_loss(0.5 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max())
+    missed = work.likelihood.noise.log_loss(
+        0.5 * np.minimum((cells.size * rate) ** 2, 2.0) * gain.max()
+    )
     density = log_mass - 2.0 * np.log(cells.size)
     below = np.maximum(log_mass - log_mass.max(), density - density.max())
     return np.asarray(too_large & (below > -FLOOR - missed))

@@ -215,7 +215,7 @@ class Integrand:
         alone = single_likelihood(likelihood)
         self.best_none = float(alone.log_prob(self.single[None])[0])
         without, left = alone.chi2(self.single[None])[0], likelihood.chi2(self._best[None])[0]
-        self.most = max(float((without - left) / likelihood.inflation(left)), 0.0)
+        self.most = max(float((without - left) / likelihood.noise.inflation(left)), 0.0)
         self.n_evaluations = 0
 
     def _scan(self) -> None:
@@ -350,7 +350,7 @@ class Integrand:
 
     def delta_chi2(self, peak: FloatArray) -> FloatArray:
         """Δχ² over no companion of cells whose best log-likelihoods are given, (n,)."""
-        gain = self.likelihood.delta_chi2(peak - self.best_none)
+        gain = self.likelihood.noise.delta_chi2(peak - self.best_none)
         return np.minimum(gain, max(self.most, 2.0 * float(np.max(peak - self.best_none))))
 
     def masses(self, cells: Cells) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,7 @@ from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.point_source import point_source
 from amibayes.detection.false_alarm import bank_statistic, null_maxima, significance
 from amibayes.errors import DataError, UsageError
-from amibayes.likelihood.averaged_noise import files_share_errors, marginal_likelihood
+from amibayes.likelihood.averaged_noise import averaged_noise, files_share_errors
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, add_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -432,13 +432,17 @@ def test_unknown_noise_of_files_is_averaged_file_by_file(rng) -> None:
     thetas = np.array([truth, [110.0, -95.0, 0.04]])
     fits = [thetas[0], thetas[1]]
     joint = Likelihood(join(parts))
-    whole = marginal_likelihood(joint, join(parts), [(joint, f) for f in fits], per_file=True)
+    whole = joint.with_noise(
+        averaged_noise(joint.noise, join(parts), [(joint, f) for f in fits], per_file=True)
+    )
+    each = [Likelihood(p) for p in parts]
     alone = [
-        marginal_likelihood(Likelihood(p), p, [(Likelihood(p), f) for f in fits]) for p in parts
+        one.with_noise(averaged_noise(one.noise, p, [(one, f) for f in fits]))
+        for one, p in zip(each, parts, strict=True)
     ]
     total = sum(a.log_prob(thetas) for a in alone)
     np.testing.assert_allclose(whole.log_prob(thetas), total, rtol=1e-9)
-    found = whole.noise_posterior(thetas[:1])
+    found = whole.noise.posterior(whole.difference(thetas[:1]))
     assert set(found) == {f"{k}:{s}" for k in ("vis2", "closure_phase_rad") for s in "01"}
     assert found["vis2:0"].probability_none > 0.5
     assert found["vis2:1"].probability_none < 0.01

@@ -18,7 +18,7 @@ from amibayes.data.covariance import dense_covariance
 from amibayes.likelihood.averaged_noise import (
     MAX_INFLATION,
     PRIOR_STATED_ERRORS_CORRECT,
-    marginal_likelihood,
+    averaged_noise,
 )
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -41,7 +41,8 @@ def averaged(data):
     result, _ = search_with_noise(Likelihood(data), FIELD)
     alone = single_likelihood(result.likelihood)
     fits = [(result.likelihood, result.theta), (alone, result.single_theta)]
-    return result, marginal_likelihood(result.likelihood, data, fits)
+    noise = averaged_noise(result.likelihood.noise, data, fits)
+    return result, result.likelihood.with_noise(noise)
 
 
 @pytest.mark.parametrize("kind", ["assumed", "diagonal"])
@@ -76,7 +77,7 @@ def test_correlated_kinds_share_the_relative_noise(rng) -> None:
     matrix[0, 30] = matrix[30, 0] = 0.3 * np.sqrt(matrix[0, 0] * matrix[30, 30])
     data = replace(data, covariance=dense_covariance(matrix))
     _, marginal = averaged(data)
-    (term,) = marginal.terms
+    (term,) = marginal.noise.terms
     extra = ExtraNoise(0.005 * np.sqrt(3.0), np.radians(0.3) * np.sqrt(3.0))
     noisy = Likelihood(add_noise(data, extra))
     residual = data.data - noisy.predict([TRUTH])[:, 0]
@@ -92,7 +93,7 @@ def test_noise_of_the_posterior_is_the_noise_of_the_data() -> None:
         for _ in range(12):
             result, marginal = averaged(understated(TRUTH, factor, rng))
             scatter = rng.multivariate_normal(result.theta, result.theta_covariance, 50)
-            found = marginal.noise_posterior(scatter)
+            found = marginal.noise.posterior(marginal.difference(scatter))
             right.append(found["vis2"].probability_none)
             if factor == 3.0:
                 amounts.append([found[k].interval(0.95) for k in ("vis2", "closure_phase_rad")])
@@ -123,7 +124,7 @@ def test_intervals_cover_whatever_the_errors_say(factor) -> None:
         theta = np.array(refine(Likelihood(data), truth, box, 0.0).theta)
         profile = Likelihood(add_noise(data, fit_noise(Likelihood(data), theta)))
         theta = np.array(refine(profile, theta, box, 0.0).theta)
-        marginal = marginal_likelihood(profile, data, [(profile, theta)])
+        marginal = profile.with_noise(averaged_noise(profile.noise, data, [(profile, theta)]))
         ranks.append(ranks_of(marginal, theta, truth, rng))
     off = np.abs(np.array(ranks) - 0.5)
     report = []

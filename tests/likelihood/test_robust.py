@@ -19,12 +19,7 @@ from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.detection.false_alarm import bank_statistic, null_maxima
 from amibayes.errors import UsageError
-from amibayes.likelihood.averaged_noise import (
-    MarginalLikelihood,
-    marginal_likelihood,
-    residual_of,
-    with_nodes,
-)
+from amibayes.likelihood.averaged_noise import AveragedNoise, averaged_noise, with_nodes
 from amibayes.likelihood.extra_noise import add_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments, scales, scores, symmetric_whitening
@@ -162,7 +157,7 @@ def efficiency_and_coverage(share, n, seed):
         theta = np.array(refine(stated, truth, box, 0.0).theta)
         profile = Likelihood(add_noise(data, fit_noise(stated, theta)))
         plain = np.array(refine(profile, theta, box, 0.0).theta)
-        averaged = marginal_likelihood(profile, data, [(profile, plain)])
+        averaged = profile.with_noise(averaged_noise(profile.noise, data, [(profile, plain)]))
         errors["gaussian"].append((plain - truth) / sigma)
         ranks["gaussian"].append(ranks_of(averaged, plain, truth, rng))
         robust, averaged = weighted_fit(stated, theta, box)
@@ -176,8 +171,9 @@ def weighted_fit(stated, theta, box):
     work = RobustFits(stated, FIELD, free_scale=True)
     stretch, found = work.steps(theta, box)
     profile = work.weighted(stretch)
-    terms = [with_nodes(t, [residual_of(stated, found)]) for t in student_terms(stated.observables)]
-    return found, MarginalLikelihood(profile, terms)
+    left = stated.difference(found)[:, 0]
+    terms = tuple(with_nodes(t, [left]) for t in student_terms(stated.observables))
+    return found, profile.with_noise(AveragedNoise(profile.noise, terms))
 
 
 @pytest.mark.slow
