@@ -1,13 +1,12 @@
 """Calibration: what the instrument did to a target, learnt from calibrators and taken away."""
 
 from amibayes.calibration.binning import average_polarisations, bin_channels, merge_epochs
-from amibayes.calibration.calibrate import Calibration, CalibratorUse, Method, calibrate
+from amibayes.calibration.calibrate import Calibration, CalibratorUse, calibrate
 from amibayes.calibration.flagging import flag_by_rule
 
 __all__ = [
     "Calibration",
     "CalibratorUse",
-    "Method",
     "average_polarisations",
     "bin_channels",
     "calibrate",

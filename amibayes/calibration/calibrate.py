@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -21,10 +20,9 @@ from amibayes.calibration.transfer import (
 from amibayes.calibration.weighted import TransferFunction, clipped, weighted_response
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
+from amibayes.support.options import CLIP_CALIBRATORS, CalibrationMethod, choices
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray
-
-Method = Literal["hierarchical", "weighted"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class Calibration:
     """
 
     observables: Observables
-    method: Method
+    method: CalibrationMethod
     calibrators: tuple[CalibratorUse, ...]
     tau_vis2: float | None
     tau_closure_phase_rad: float | None
@@ -111,8 +109,8 @@ def calibrate(
     targets: Observables | Sequence[Observables],
     calibrators: Sequence[Observables],
     *,
-    method: Method | None = None,
-    clip: float | None = 3.0,
+    method: CalibrationMethod | None = None,
+    clip: float | None = CLIP_CALIBRATORS,
     diameters_mas: Sequence[float | Diameter] | None = None,
     window_days: float | None = None,
     charge_levels: Sequence[float] | None = None,
@@ -169,9 +167,11 @@ def calibrate(
     )
 
 
-def _method(method: Method | None, target: Observables, serving: list[Transfer]) -> Method:
+def _method(
+    method: CalibrationMethod | None, target: Observables, serving: list[Transfer]
+) -> CalibrationMethod:
     """The method asked for, or what the calibrators of one baseline are enough for."""
-    if method is not None and method not in (known := get_args(Method)):
+    if method is not None and method not in (known := choices(CalibrationMethod)):
         raise UsageError(
             f"{method!r} is no method of calibration", remedy=f"one of {', '.join(known)}"
         )
@@ -244,7 +244,7 @@ def _consistent(serving: list[Transfer], keys: Keys, clip: float | None) -> list
 
 
 def _response(
-    method: Method,
+    method: CalibrationMethod,
     kept: list[Transfer],
     keys: Keys,
     rng: np.random.Generator,
@@ -290,7 +290,7 @@ def _covariate(
     charge_levels: Sequence[float] | None,
     calibrators: list[Observables],
     serving: list[int],
-    method: Method,
+    method: CalibrationMethod,
 ) -> FloatArray | None:
     """Charge levels less that of the target, on the scale of the largest difference."""
     if charge_levels is None:

@@ -17,7 +17,7 @@ RESULT = "calibrated.oifits"
 
 EXAMPLES = """examples:
   amibayes calibrate target.oifits --cal cal*.oifits
-  amibayes calibrate t1.oifits t2.oifits --cal c1.oifits c2.oifits --window 0.1
+  amibayes calibrate t1.oifits t2.oifits --cal c1.oifits c2.oifits --time-window 0.1
   amibayes calibrate target.oifits --cal c1.oifits c2.oifits --calibrator-diameters 0.31:0.02,0.4
   amibayes calibrate gravity.fits --cal cal.fits --average-polarisations --flag 'vis2_error>0.1'
 """
@@ -55,7 +55,7 @@ def _add_method(group: argparse._ArgumentGroup) -> None:
         "response may depend (hierarchical)",
     )
     group.add_argument(
-        "--window",
+        "--time-window",
         type=common.positive_float,
         metavar="DAYS",
         help="use only calibrators observed within this time of each epoch (default: all)",
@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
         method=arguments.calibration,
         clip=arguments.clip,
         diameters_mas=_diameters(arguments, calibrators),
-        window_days=arguments.window,
+        window_days=arguments.time_window,
         charge_levels=arguments.charge_levels,
         rng=np.random.default_rng(arguments.seed),
     )

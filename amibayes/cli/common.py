@@ -12,16 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.errors import UsageError
+from amibayes.support.options import COMPANIONS, OBSERVABLES, SEED, ExtractionMethod, choices
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
     from amibayes.parallel import Executor, StageBars
     from amibayes.parallel import Progress as Told
     from amibayes.posterior.priors import PriorSetting
-
-
-METHODS = ("fringes", "matched", "fft", "gauss", "square", "unique")
-"""Those of `amibayes.extraction`, which would take a second to import for ``--help``."""
 
 
 def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
@@ -52,11 +49,8 @@ def add_speech_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
-def add_image_options(parser: argparse.ArgumentParser, method: str = "--method") -> None:
-    """Add what image cubes may need: what their header does not say, and the method.
-
-    ``method`` is the option's name, where ``--method`` is that of the command itself.
-    """
+def add_image_options(parser: argparse.ArgumentParser) -> None:
+    """Add what image cubes may need: what their header does not state, and the method."""
     group = parser.add_argument_group("image cubes")
     group.add_argument("--instrument", metavar="NAME", help="name or TOML file, such as niriss")
     group.add_argument("--filter", metavar="NAME", help="such as F480M")
@@ -75,10 +69,9 @@ def add_image_options(parser: argparse.ArgumentParser, method: str = "--method")
         "wavelength of the filter)",
     )
     group.add_argument(
-        method,
-        dest="extraction",
-        choices=METHODS,
-        default=METHODS[0],
+        "--method",
+        choices=choices(ExtractionMethod),
+        default=choices(ExtractionMethod)[0],
         help="fit of the images (fringes), or a way to sample their Fourier transform "
         "(default: %(default)s)",
     )
@@ -96,7 +89,7 @@ def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
         "pixel_scale_rad": arguments.pixel_scale * MAS if arguments.pixel_scale else None,
         "position_angle_deg": arguments.position_angle,
     }
-    extraction = ExtractOptions(method=arguments.extraction, temperature_k=arguments.temperature)
+    extraction = ExtractOptions(method=arguments.method, temperature_k=arguments.temperature)
     return ImageOptions(extraction, header)
 
 
@@ -116,7 +109,7 @@ def add_seed_option(parser: argparse._ActionsContainer) -> None:
     parser.add_argument(
         "--seed",
         type=non_negative_integer,
-        default=1,
+        default=SEED,
         metavar="N",
         help="seed of all random numbers (default: %(default)s)",
     )
@@ -295,7 +288,7 @@ def numbers(text: str) -> list[float]:
 def observable_kinds(text: str) -> tuple[str, ...]:
     """Parse ``vis2,cp``: one or both, once each."""
     kinds = text.split(",")
-    if not set(kinds) <= {"vis2", "cp"} or len(set(kinds)) != len(kinds):
+    if not set(kinds) <= set(OBSERVABLES) or len(set(kinds)) != len(kinds):
         raise argparse.ArgumentTypeError(f"{text!r} is not vis2, cp or vis2,cp")
     return tuple(sorted(kinds, reverse=True))
 
@@ -303,7 +296,7 @@ def observable_kinds(text: str) -> tuple[str, ...]:
 def companion_counts(text: str) -> tuple[int, ...]:
     """Parse ``0,1,2``: one or more of them, once each, in rising order."""
     counts = text.split(",")
-    if not set(counts) <= {"0", "1", "2"} or len(set(counts)) != len(counts):
+    if not set(counts) <= {str(n) for n in COMPANIONS} or len(set(counts)) != len(counts):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list out of 0,1,2")
     return tuple(sorted(int(c) for c in counts))
 

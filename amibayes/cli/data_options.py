@@ -7,22 +7,29 @@ from typing import Any
 
 from amibayes.cli import common
 from amibayes.errors import UsageError
+from amibayes.support.options import (
+    CLIP_CALIBRATORS,
+    CalibrationMethod,
+    ClosureCovariance,
+    ContrastSharing,
+    choices,
+)
 
 
 def add_calibration(group: argparse._ActionsContainer) -> None:
     """Add ``--calibration`` and ``--clip``."""
     group.add_argument(
         "--calibration",
-        choices=["weighted", "hierarchical"],
+        choices=choices(CalibrationMethod),
         help="how calibrators are combined (default: hierarchical where 3 or more "
         "share a baseline)",
     )
     group.add_argument(
         "--clip",
         type=common.positive_float,
-        default=3.0,
+        default=CLIP_CALIBRATORS,
         metavar="SIGMA",
-        help="leave out values that stand off the other calibrators (default: %(default)s)",
+        help="leave out values that are outliers among the calibrators (default: %(default)s)",
     )
 
 
@@ -30,8 +37,8 @@ def add_closure_covariance(group: argparse._ActionsContainer) -> None:
     """Add ``--closure-covariance``."""
     group.add_argument(
         "--closure-covariance",
-        choices=["assumed", "diagonal"],
-        default="assumed",
+        choices=choices(ClosureCovariance),
+        default=choices(ClosureCovariance)[0],
         help="for files with errors and no correlations: triangles correlated through shared "
         "baselines, or (the field's habit) independent (default: %(default)s)",
     )
@@ -93,7 +100,7 @@ def add_joint(group: argparse._ActionsContainer) -> None:
     """Add what several files share and what they do not."""
     group.add_argument(
         "--contrast",
-        choices=["tied", "per-filter"],
+        choices=choices(ContrastSharing),
         help="one contrast for all bands, or one for each (default: per-filter where the files "
         "are of several bands)",
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import common
+from amibayes.support.options import ImagingProgram, choices
 
 if TYPE_CHECKING:
     from amibayes.oifits.export import Export
@@ -23,9 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "files", nargs="+", metavar="FILE", help="OIFITS file(s) of one object, merged into one"
     )
-    parser.add_argument(
-        "--to", required=True, choices=["irbis", "squeeze", "mira"], help="the program"
-    )
+    parser.add_argument("--to", required=True, choices=choices(ImagingProgram), help="the program")
     parser.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
     parser.add_argument(
         "--target", metavar="NAME", help="use one target of files that hold several"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from amibayes import __version__
 from amibayes.cli import common
 from amibayes.errors import UsageError
+from amibayes.support.options import CLIP_INTEGRATIONS, ExtractionCovariance, Geometry, choices
 
 if TYPE_CHECKING:
     from amibayes.extraction import Extraction
@@ -31,14 +32,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_image_options(parser)
     group = parser.add_argument_group("extraction")
     group.add_argument(
-        "--clip",
+        "--clip-integrations",
         type=common.positive_float,
-        default=5.0,
+        default=CLIP_INTEGRATIONS,
         metavar="SIGMA",
-        help="leave out integrations that stand off the others (default: %(default)g)",
+        help="leave out integrations that are outliers (default: %(default)g)",
     )
     group.add_argument(
-        "--keep-all", action="store_true", help="leave no integration out that can be measured"
+        "--keep-integrations",
+        action="store_true",
+        help="leave no integration out that can be measured",
     )
     group.add_argument(
         "--window",
@@ -49,14 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--covariance",
-        choices=("shrunk", "scatter", "physical"),
-        default="shrunk",
-        help="scatter weighed with photon noise, or one of them alone (default: %(default)s)",
+        choices=choices(ExtractionCovariance),
+        default=choices(ExtractionCovariance)[0],
+        help="scatter combined with photon noise, or one of them alone (default: %(default)s)",
     )
     group.add_argument(
         "--geometry",
-        choices=("fitted", "stated"),
-        default="fitted",
+        choices=choices(Geometry),
+        default=choices(Geometry)[0],
         help="pixel scale and rotation of the mask (default: %(default)s, where the image tells)",
     )
     group.add_argument("--per-integration", action="store_true", help="write every integration too")
@@ -75,8 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     images = common.image_options_of(arguments)
     options = replace(
         images.extraction,
-        clip=arguments.clip,
-        keep_all=arguments.keep_all,
+        clip=arguments.clip_integrations,
+        keep_all=arguments.keep_integrations,
         window_px=arguments.window,
         covariance=arguments.covariance,
         geometry=arguments.geometry,

@@ -8,17 +8,23 @@ from typing import TYPE_CHECKING, Any
 
 from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
+from amibayes.support.options import (
+    LIMITS_NULL_DRAWS,
+    LIMITS_SEPARATIONS,
+    LIMITS_TRIALS,
+    NULL_DRAWS,
+    LimitCriterion,
+    choices,
+)
 
 if TYPE_CHECKING:
     from amibayes.pipeline.limits import LimitsOptions, LimitsReport
 
 RESULT, TABLE, MAP, JOURNAL = "limits.json", "limits.ecsv", "completeness.png", "limits.journal"
 
-METHODS = ("injection", "absil", "candid", "posterior", "closure-phase")
-
 EXAMPLES = """examples:
   amibayes limits target.oifits --cal cal*.oifits
-  amibayes limits calibrated.oifits --separation 50:400 --method candid
+  amibayes limits calibrated.oifits --separation 50:400 --criterion candid
   amibayes limits target.oifits --mass-table tracks.ecsv --primary-magnitude 3.2 --workers 4
   amibayes limits --batch targets.ecsv --workers 4
 """
@@ -36,30 +42,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         data, None, "limits from these alone (default: from both, and from each by itself)"
     )
     data_options.add_data(data)
-    common.add_image_options(parser, "--extraction")
+    common.add_image_options(parser)
     common.add_parallel_options(parser)
     common.add_output_options(parser, "limits")
 
 
 def _add_limit(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--method",
-        choices=METHODS,
-        default=METHODS[0],
+        "--criterion",
+        choices=choices(LimitCriterion),
+        default=choices(LimitCriterion)[0],
         help="injection and recovery by the search's own criterion, or a closed criterion of the "
         "literature (default: %(default)s)",
     )
     group.add_argument(
         "--separations",
         type=common.positive_integer,
-        default=24,
+        default=LIMITS_SEPARATIONS,
         metavar="N",
         help="how many, over the whole field (default: %(default)s)",
     )
     group.add_argument(
         "--trials",
         type=common.positive_integer,
-        default=240,
+        default=LIMITS_TRIALS,
         metavar="N",
         help="injections per separation and contrast, on average (default: %(default)s)",
     )
@@ -67,8 +73,9 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         "--null-draws",
         type=common.non_negative_integer,
         metavar="N",
-        help="null searches for the false-alarm probability; 0: none (default: 100000 for "
-        "injection, else 10000, which only say whether a companion is to be taken out first)",
+        help="null searches for the false-alarm probability; 0: none (default: "
+        f"{LIMITS_NULL_DRAWS} for injection, else {NULL_DRAWS}, "
+        "which only say whether a companion is to be taken out first)",
     )
     group.add_argument(
         "--mass-table",
@@ -126,7 +133,7 @@ def _names(options: LimitsOptions) -> list[str]:
     """List the files of a run."""
     from amibayes.plots.pictures import limits_picture_names
 
-    return [RESULT, TABLE, *limits_picture_names(options.method)]
+    return [RESULT, TABLE, *limits_picture_names(options.criterion)]
 
 
 def _request(arguments: argparse.Namespace, options: LimitsOptions) -> str:
@@ -221,7 +228,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
     )
     return LimitsOptions(
         search=search,
-        method=arguments.method,
+        criterion=arguments.criterion,
         observables=arguments.observables,
         n_separations=arguments.separations,
         trials_per_cell=arguments.trials,
@@ -230,11 +237,9 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
 
 
 def _null_draws(arguments: argparse.Namespace) -> int:
-    from amibayes.pipeline.limits import NULL_DRAWS
-
     if arguments.null_draws is not None:
         return int(arguments.null_draws)
-    return NULL_DRAWS if arguments.method == "injection" else NULL_DRAWS // 10
+    return LIMITS_NULL_DRAWS if arguments.criterion == "injection" else NULL_DRAWS
 
 
 def _masses(arguments: argparse.Namespace) -> Any:

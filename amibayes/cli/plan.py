@@ -13,6 +13,7 @@ from amibayes.cli.common import (
     positive_float,
 )
 from amibayes.errors import UsageError
+from amibayes.support.options import PEAK_LIMIT_E, PLAN_SEPARATION_MAS, RampPreset, choices
 
 if TYPE_CHECKING:
     from amibayes.pipeline.planning import ContrastCurve, Expectation, Plan
@@ -41,21 +42,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     depth.add_argument("--time", type=positive_float, metavar="SECONDS", help="time on the clock")
     parser.add_argument(
         "--preset",
-        choices=("default", "paper"),
-        default="default",
+        choices=choices(RampPreset),
+        default=choices(RampPreset)[0],
         help="default: the real brightest pixel; paper: the rules of Soulain et al. (2020)",
     )
     parser.add_argument(
         "--peak-limit",
         type=positive_float,
-        default=30000.0,
+        default=PEAK_LIMIT_E,
         metavar="E",
         help="electrons that the brightest pixel may reach (default: %(default)g)",
     )
     parser.add_argument(
         "--separation",
         type=number_range,
-        default=(50.0, 400.0),
+        default=PLAN_SEPARATION_MAS,
         metavar="MIN:MAX",
         help="range of the contrast curve in mas (default: 50:400)",
     )

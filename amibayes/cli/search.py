@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
 from amibayes.errors import UsageError
+from amibayes.support.options import NULL_DRAWS, OBSERVABLES, EvidenceMethod, choices
 
 if TYPE_CHECKING:
     from amibayes.pipeline.options import SearchOptions
@@ -32,11 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     data_options.add_joint(parser.add_argument_group("several files"))
     _add_weighing(parser.add_argument_group("prior and evidence"))
     data = parser.add_argument_group("data")
-    data_options.add_observables(data, ("vis2", "cp"), "which observables to fit (default: both)")
+    data_options.add_observables(data, OBSERVABLES, "which observables to fit (default: both)")
     data_options.add_data(data)
     common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
-    data_options.add_null_draws(stages, 10_000)
+    data_options.add_null_draws(stages, NULL_DRAWS)
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
     stages.add_argument(
@@ -70,8 +71,8 @@ def _add_weighing(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--evidence-method",
-        choices=["direct", "laplace", "nested"],
-        default="direct",
+        choices=choices(EvidenceMethod),
+        default=choices(EvidenceMethod)[0],
         help="integrate directly, or by Laplace's approximation, or by nested sampling with "
         "dynesty (default: %(default)s)",
     )

@@ -6,6 +6,7 @@ import argparse
 
 from amibayes.cli import common, data_options
 from amibayes.errors import UsageError
+from amibayes.support.options import VETTING_ALPHA, VETTING_NULL_DRAWS
 
 RESULT, PICTURE = "vetting.json", "vetting.png"
 
@@ -29,11 +30,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--alpha",
         type=common.probability,
-        default=0.003,
+        default=VETTING_ALPHA,
         help="probability of chance of each test below which a calibrator is dropped "
         "(default: %(default)s)",
     )
-    data_options.add_null_draws(group, 4000, least=1)
+    data_options.add_null_draws(group, VETTING_NULL_DRAWS, least=1)
     group.add_argument("--no-limits", action="store_true", help="leave the limits out")
     group.add_argument(
         "--charge-levels",

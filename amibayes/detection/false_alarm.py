@@ -35,10 +35,8 @@ from amibayes.detection.tails import (
 )
 from amibayes.likelihood.student import SymmetricWhitening, scores
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.support.options import ALPHA
 from amibayes.units import FloatArray
-
-ALPHA = 0.0013
-"""Default false-alarm probability below which a companion counts as detected (3σ, one side)."""
 
 MIN_ABOVE = 10
 """Draws that have to reach a statistic for their share to be its probability."""

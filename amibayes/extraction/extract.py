@@ -19,12 +19,13 @@ from amibayes.extraction.averaging import Average, average, standing_off
 from amibayes.extraction.bench import make_bench
 from amibayes.extraction.frames import ExtractionOperator, Frames, concatenated, measure, select
 from amibayes.extraction.low_flux import expected_covariance
-from amibayes.extraction.options import ExtractOptions, Method
+from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.source import opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
+from amibayes.support.options import ExtractionMethod
 from amibayes.units import ComplexArray, FloatArray
 
 NYQUIST = 0.5
@@ -76,7 +77,7 @@ class Extraction:
 
 def extract(
     cubes: Cube | str | Path | Sequence[Cube | str | Path],
-    method: Method = "fringes",
+    method: ExtractionMethod = "fringes",
     *,
     options: ExtractOptions | None = None,
     **header: Any,

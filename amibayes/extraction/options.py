@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 from amibayes.errors import UsageError
+from amibayes.support.options import (
+    CLIP_INTEGRATIONS,
+    ExtractionCovariance,
+    ExtractionMethod,
+    Geometry,
+    choices,
+)
 
-Method = Literal["fringes", "matched", "fft", "gauss", "square", "unique"]
-
-METHODS: tuple[str, ...] = get_args(Method)
+METHODS: tuple[str, ...] = choices(ExtractionMethod)
 
 
 COLDEST_K = 100.0
@@ -50,13 +55,13 @@ class ExtractOptions:
         Where a value makes no sense.
     """
 
-    method: Method = "fringes"
-    clip: float = 5.0
+    method: ExtractionMethod = "fringes"
+    clip: float = CLIP_INTEGRATIONS
     outlier: float = 7.0
     window_px: float | None = None
-    covariance: Literal["shrunk", "scatter", "physical"] = "shrunk"
+    covariance: ExtractionCovariance = "shrunk"
     temperature_k: float | None = None
-    geometry: Literal["fitted", "stated"] = "fitted"
+    geometry: Geometry = "fitted"
     keep_all: bool = False
 
     def __post_init__(self) -> None:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.bands import bands_of, dates
 from amibayes.models.uv_points import YEAR_DAYS
+from amibayes.support.options import ContrastSharing
 from amibayes.units import MAS
-
-ContrastKind = Literal["tied", "per-filter"]
 
 
 def joint_likelihood(
     likelihood: Likelihood,
     *,
-    contrast: ContrastKind | None = None,
+    contrast: ContrastSharing | None = None,
     motion: bool = False,
     fastest_mas_yr: float | None = None,
 ) -> Likelihood:

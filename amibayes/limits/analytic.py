@@ -28,7 +28,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy import special, stats
@@ -37,11 +36,10 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.limits.injection import injected_signal
-from amibayes.limits.rings import N_SEPARATIONS, Rings, make_rings
+from amibayes.limits.rings import Rings, make_rings
+from amibayes.support.options import LIMITS_SEPARATIONS, AnalyticMethod
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray, contrast_to_delta_mag
-
-AnalyticMethod = Literal["absil", "candid", "posterior", "closure-phase"]
 
 SIGMAS = 3.0
 
@@ -120,7 +118,7 @@ def analytic_limit(
     result: SearchResult,
     method: AnalyticMethod,
     *,
-    n_separations: int = N_SEPARATIONS,
+    n_separations: int = LIMITS_SEPARATIONS,
     separation_mas: Sequence[float] | None = None,
     sigmas: float = SIGMAS,
     remove: bool = False,

@@ -17,7 +17,7 @@ from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.cube import Cube
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import ALPHA, Significance, bank_statistic, significance
+from amibayes.detection.false_alarm import Significance, bank_statistic, significance
 from amibayes.errors import DataError
 from amibayes.extraction.bench import make_bench
 from amibayes.extraction.frames import Frames, measure
@@ -28,6 +28,7 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.injection import Recovery, judge, recover
 from amibayes.optics import psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
+from amibayes.support.options import ALPHA
 from amibayes.units import MAS, FloatArray, read_only
 
 

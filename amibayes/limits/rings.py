@@ -10,9 +10,8 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.support.options import LIMITS_SEPARATIONS
 from amibayes.units import FloatArray, offset
-
-N_SEPARATIONS = 24
 
 MIN_ANGLES, MAX_ANGLES = 90, 720
 ANGLES_PER_FRINGE = 2.0
@@ -50,7 +49,7 @@ class Rings:
 
 def make_rings(
     result: SearchResult,
-    n_separations: int = N_SEPARATIONS,
+    n_separations: int = LIMITS_SEPARATIONS,
     separation_mas: Sequence[float] | None = None,
 ) -> Rings:
     """Lay rings over the field of a search, from its inner to its outer edge.

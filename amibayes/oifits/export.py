@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -24,9 +24,8 @@ from amibayes.errors import DataError, UsageError
 from amibayes.oifits.setups import same
 from amibayes.oifits.writer import to_hdus
 from amibayes.support.atomic_files import atomic_path
+from amibayes.support.options import ImagingProgram
 from amibayes.units import MAS, BoolArray, FloatArray
-
-Program = Literal["irbis", "squeeze", "mira"]
 
 PIXELS_PER_RESOLUTION = 4.0
 """Pixels per λ/B_max."""
@@ -55,7 +54,7 @@ class Export:
         What was left out or changed.
     """
 
-    program: Program
+    program: ImagingProgram
     target: str
     hdus: fits.HDUList
     pixel_mas: float
@@ -93,7 +92,7 @@ class Export:
         return f"{path} TARGET_CAL_INT\n"
 
 
-def export(parts: Sequence[Observables], program: Program) -> Export:
+def export(parts: Sequence[Observables], program: ImagingProgram) -> Export:
     """Merge data of one object for a program of image reconstruction.
 
     Parameters
@@ -191,7 +190,7 @@ def _row_in_use(m: Measurements) -> BoolArray:
     return np.asarray(np.bincount(row.ravel(), ~m.flag)[row.ravel()] > 0)
 
 
-def _image(whole: Observables, program: Program) -> tuple[float, float, int]:
+def _image(whole: Observables, program: ImagingProgram) -> tuple[float, float, int]:
     """Pixel and width in mas, and number of pixels."""
     m = whole.vis2.select(~whole.vis2.flag)
     frequency = np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m

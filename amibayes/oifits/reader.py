@@ -26,8 +26,9 @@ from amibayes.oifits.setups import (
     targets_of,
     wavelength_table,
 )
-from amibayes.oifits.stated import ClosureCovariance, Column, Content, stated_covariance
+from amibayes.oifits.stated import Column, Content, stated_covariance
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, open_oifits
+from amibayes.support.options import ClosureCovariance
 from amibayes.units import IntArray
 
 

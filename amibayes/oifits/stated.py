@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -26,9 +26,8 @@ from amibayes.oifits.correlations import (
 from amibayes.oifits.scatter import scatter_of
 from amibayes.oifits.setups import same
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
+from amibayes.support.options import ClosureCovariance
 from amibayes.units import BoolArray, FloatArray, IntArray
-
-ClosureCovariance = Literal["assumed", "diagonal"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeAlias
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,31 +15,29 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.limits.analytic import AnalyticLimit, AnalyticMethod, analytic_limit
+from amibayes.limits.analytic import AnalyticLimit, analytic_limit
 from amibayes.limits.completeness import DetectionLimit, detection_limit
 from amibayes.limits.mass_table import MassTable
-from amibayes.limits.rings import N_SEPARATIONS
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import weigh
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Clock, Prepared, Stage, prepare
 from amibayes.pipeline.search import search_field
 from amibayes.pipeline.warnings import search_cautions
+from amibayes.support.options import (
+    LIMITS_NULL_DRAWS,
+    LIMITS_SEPARATIONS,
+    LIMITS_TRIALS,
+    LimitCriterion,
+)
 
 Kinds = tuple[str, ...]
-
-Method: TypeAlias = Literal["injection"] | AnalyticMethod
 
 KINDS: tuple[Kinds, ...] = (("vis2", "cp"), ("vis2",), ("cp",))
 """What limits are drawn for, if nothing else is asked: all data, and each kind by itself."""
 
 NAMES: dict[Kinds, str] = {("vis2", "cp"): "V² + CP", ("vis2",): "V²", ("cp",): "CP"}
 """Choices of observables, for readers."""
-
-NULL_DRAWS = 100_000
-"""The threshold of α = 0.0013 is then known to a tenth of α."""
-
-TRIALS_PER_CELL = 240
 
 
 @dataclass(frozen=True)
@@ -51,7 +48,7 @@ class LimitsOptions:
     ----------
     search : SearchOptions
         How the data are read and searched; null draws, α and seed.
-    method : {"injection", "absil", "candid", "posterior", "closure-phase"}
+    criterion : {"injection", "absil", "candid", "posterior", "closure-phase"}
     observables : tuple of {"vis2", "cp"}, optional
         One limit from these; by default one from all data and one from each kind.
     n_separations : int
@@ -62,11 +59,13 @@ class LimitsOptions:
         For an axis of masses.
     """
 
-    search: SearchOptions = field(default_factory=lambda: SearchOptions(null_draws=NULL_DRAWS))
-    method: Method = "injection"
+    search: SearchOptions = field(
+        default_factory=lambda: SearchOptions(null_draws=LIMITS_NULL_DRAWS)
+    )
+    criterion: LimitCriterion = "injection"
     observables: Kinds | None = None
-    n_separations: int = N_SEPARATIONS
-    trials_per_cell: int = TRIALS_PER_CELL
+    n_separations: int = LIMITS_SEPARATIONS
+    trials_per_cell: int = LIMITS_TRIALS
     masses: MassTable | None = None
 
 
@@ -172,15 +171,15 @@ def measure_limits(
 
 
 def _refuse(options: LimitsOptions) -> None:
-    if options.method == "injection" and options.search.null_draws < 1.0 / options.search.alpha:
+    if options.criterion == "injection" and options.search.null_draws < 1.0 / options.search.alpha:
         raise UsageError(
             f"{options.search.null_draws} null draws cannot tell a false-alarm probability of "
             f"{options.search.alpha:g}",
             source="--null-draws",
-            remedy=f"give {round(10.0 / options.search.alpha)} or more, or another --method",
+            remedy=f"give {round(10.0 / options.search.alpha)} or more, or another --criterion",
         )
-    if options.method == "closure-phase" and options.observables not in (None, ("cp",)):
-        raise UsageError("uses closure phases alone", source="--method closure-phase")
+    if options.criterion == "closure-phase" and options.observables not in (None, ("cp",)):
+        raise UsageError("uses closure phases alone", source="--criterion closure-phase")
 
 
 def _all_limits(
@@ -212,7 +211,7 @@ def _kinds(data: Observables, options: LimitsOptions) -> list[Kinds]:
     """List the choices of observables, the main one first."""
     if options.observables is not None:
         return [options.observables]
-    if options.method == "closure-phase":
+    if options.criterion == "closure-phase":
         return [("cp",)]
     present = {"vis2": data.n_vis2 > 0, "cp": data.n_closure_phases > 0}
     if all(present.values()):
@@ -263,10 +262,10 @@ def _limit(
     journals: Journals | None,
     where: _Where,
 ) -> DetectionLimit | AnalyticLimit:
-    if options.method != "injection":
+    if options.criterion != "injection":
         remove = weight is not None and bool(weight.detected)
         return analytic_limit(
-            result, options.method, n_separations=options.n_separations, remove=remove
+            result, options.criterion, n_separations=options.n_separations, remove=remove
         )
     assert weight is not None
     return detection_limit(

@@ -6,12 +6,19 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from amibayes.calibration import Method
-from amibayes.detection.false_alarm import ALPHA
 from amibayes.extraction.reading import ImageOptions
-from amibayes.likelihood.joint import ContrastKind
-from amibayes.posterior.evidence import Method as EvidenceMethod
 from amibayes.posterior.priors import PriorSetting
+from amibayes.support.options import (
+    ALPHA,
+    CLIP_CALIBRATORS,
+    NULL_DRAWS,
+    OBSERVABLES,
+    SEED,
+    CalibrationMethod,
+    ClosureCovariance,
+    ContrastSharing,
+    EvidenceMethod,
+)
 from amibayes.support.quantities import takes_quantities
 
 
@@ -73,19 +80,19 @@ class SearchOptions:
     """
 
     separation_mas: tuple[float, float] | None = None
-    observables: tuple[str, ...] = ("vis2", "cp")
+    observables: tuple[str, ...] = OBSERVABLES
     diameter: float | Literal["free"] | None = None
     background: float | Literal["free"] = 0.0
     smearing: bool = True
-    closure_covariance: Literal["assumed", "diagonal"] = "assumed"
-    calibration: Method | None = None
-    clip: float = 3.0
+    closure_covariance: ClosureCovariance = "assumed"
+    calibration: CalibrationMethod | None = None
+    clip: float = CLIP_CALIBRATORS
     keep_all: bool = False
     insname: str | None = None
     target: str | None = None
-    null_draws: int = 10_000
+    null_draws: int = NULL_DRAWS
     alpha: float = ALPHA
-    contrast: ContrastKind | None = None
+    contrast: ContrastSharing | None = None
     motion: bool = False
     fastest_mas_yr: float | None = None
     extra_noise: bool = True
@@ -96,7 +103,7 @@ class SearchOptions:
     companions: tuple[int, ...] | None = None
     evidence_method: EvidenceMethod = "direct"
     prior: tuple[PriorSetting, ...] = ()
-    seed: int = 1
+    seed: int = SEED
     images: ImageOptions | None = None
 
     def to_json(self) -> dict[str, Any]:

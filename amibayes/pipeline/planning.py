@@ -25,6 +25,7 @@ from amibayes.optics import fringe_basis
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels
 from amibayes.simulation.slopes import electron_variance, slope_weights
+from amibayes.support.options import PLAN_SEPARATION_MAS
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
 __all__ = ["PAPER", "ContrastCurve", "Expectation", "Plan", "PlanOptions", "expect", "make_plan"]
@@ -82,7 +83,7 @@ class Expectation:
 
 def expect(
     plan: Plan,
-    separation_mas: tuple[float, float] = (50.0, 400.0),
+    separation_mas: tuple[float, float] = PLAN_SEPARATION_MAS,
     detector: Detector | None = None,
 ) -> Expectation:
     """Predict the errors and the contrast curve of a plan.

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 from scipy.sparse.csgraph import connected_components
 
-from amibayes.calibration import Method, calibrate
+from amibayes.calibration import calibrate
 from amibayes.calibration.matching import keys_of, match, sharing
 from amibayes.companion_search.draws import profiled
 from amibayes.companion_search.optimise import fit_single
@@ -31,12 +31,8 @@ from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.completeness import DetectionLimit, detection_limit
 from amibayes.models.components import BinaryModel
+from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
 from amibayes.units import BoolArray
-
-ALPHA = 0.003
-"""Probability of each of the three tests below which a calibrator is dropped."""
-
-NULL_DRAWS = 4000
 
 CHARGE_FACTOR = 2.0
 """Charge levels further apart than this factor are pointed out."""
@@ -98,12 +94,12 @@ def vet(
     *,
     calibrated: bool = False,
     separation_mas: tuple[float, float] | None = None,
-    alpha: float = ALPHA,
-    null_draws: int = NULL_DRAWS,
+    alpha: float = VETTING_ALPHA,
+    null_draws: int = VETTING_NULL_DRAWS,
     limits: bool = True,
     charge_levels: Sequence[float] | None = None,
     fewest: int = 2,
-    seed: int = 1,
+    seed: int = SEED,
 ) -> Vetting:
     """Judge every calibrator, against the others that share baselines with it and by itself.
 
@@ -164,7 +160,7 @@ def _against(one: Observables, others: Sequence[Observables]) -> Observables:
     # The scatter between calibrators is pooled over all baselines: two others can tell it.
     keys = keys_of(one)
     seen = [np.bincount(match(other, keys).key, minlength=len(keys)) > 0 for other in others]
-    method: Method = "hierarchical" if np.sum(seen, axis=0).max() > 1 else "weighted"
+    method: CalibrationMethod = "hierarchical" if np.sum(seen, axis=0).max() > 1 else "weighted"
     return calibrate(one, others, method=method, clip=None).observables.unflagged()
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
@@ -27,9 +26,8 @@ from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
 from amibayes.posterior.priors import Prior
+from amibayes.support.options import EvidenceMethod
 from amibayes.units import FloatArray, IntArray
-
-Method = Literal["direct", "laplace", "nested"]
 
 MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
@@ -107,7 +105,7 @@ def compare_models(
     companions: Sequence[int] = (0, 1),
     grid: GridPosterior | None = None,
     two: TwoCompanions | None = None,
-    method: Method = "direct",
+    method: EvidenceMethod = "direct",
     model_prior: Sequence[float] | None = None,
 ) -> Evidence:
     """Weigh numbers of companions against each other and against over-resolved light.
@@ -156,7 +154,7 @@ def _weigh(
     companions: int,
     grid: GridPosterior | None,
     two: TwoCompanions | None,
-    method: Method,
+    method: EvidenceMethod,
 ) -> tuple[float, float, str]:
     """(ln Z, error, method) of one model."""
     none = single_likelihood(result.likelihood)

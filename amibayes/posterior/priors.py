@@ -9,18 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal, cast, get_args
+from typing import cast
 
 import numpy as np
 
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import nuisance_bounds
+from amibayes.support.options import ContrastForm, PositionForm, choices
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray, offset
-
-ContrastForm = Literal["log-uniform", "uniform"]
-PositionForm = Literal["area", "separation"]
 
 SYNTAX = "contrast=[FORM:]LOW:HIGH, contrast=FORM, position=area|separation or NAME=LOW:HIGH"
 
@@ -64,9 +62,9 @@ class Prior:
         _check("contrast", self.contrast_min, self.contrast_max, least=1e-300)
         for k, (low, high) in enumerate(self.nuisance):
             _check(f"nuisance {k}", low, high, least=-np.inf)
-        if self.contrast_form not in get_args(ContrastForm):
+        if self.contrast_form not in choices(ContrastForm):
             raise UsageError(f"{self.contrast_form!r} is no distribution of the contrast")
-        if self.position_form not in get_args(PositionForm):
+        if self.position_form not in choices(PositionForm):
             raise UsageError(f"{self.position_form!r} is no distribution of the position")
 
     @property
@@ -202,7 +200,7 @@ def parse_setting(text: str) -> PriorSetting:
     """
     name, equals, rest = text.partition("=")
     words = rest.split(":")
-    forms = {"contrast": get_args(ContrastForm), "position": get_args(PositionForm)}
+    forms = {"contrast": choices(ContrastForm), "position": choices(PositionForm)}
     form = words.pop(0) if words[0] in forms.get(name, ()) else None
     bounds = _numbers(words)
     empty = bounds is None and (form is None or words)

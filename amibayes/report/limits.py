@@ -124,7 +124,7 @@ def limits_table(report: LimitsReport) -> Table:
         _add_columns(table, measured, report)
     table.meta = {
         "amibayes": __version__,
-        "method": report.options.method,
+        "method": report.options.criterion,
         "seed": report.options.search.seed,
     }
     return table

@@ -18,6 +18,7 @@ from amibayes.optics import psf
 from amibayes.scene.spectrum import Blackbody, Spectrum, g2v
 from amibayes.simulation.detector import PRESETS, Detector
 from amibayes.simulation.exposure import MAX_INTEGRATIONS
+from amibayes.support.options import PEAK_LIMIT_E
 
 TABLE_1_RATES_E_S = {"F380M": 1999651.0, "F430M": 1279391.0, "F480M": 1137034.0}
 """Count rates of a G2V star of 6 mag behind the NIRISS mask (Soulain et al. 2020, Table 1)."""
@@ -81,7 +82,7 @@ class PlanOptions:
     """
 
     preset: str = "default"
-    peak_limit_e: float = 30000.0
+    peak_limit_e: float = PEAK_LIMIT_E
     frame_time_s: float = 0.0
 
     def __post_init__(self) -> None:

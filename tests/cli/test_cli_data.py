@@ -101,7 +101,7 @@ def test_calibrate_options(files: list[str], tmp_path: Path, capsys) -> None:  #
             "--bin-channels",
             "2",
         ]
-        words += ["--flag", "station=H5", "--merge-epochs", "1", "--window", "2"]
+        words += ["--flag", "station=H5", "--merge-epochs", "1", "--time-window", "2"]
         assert run("calibrate", files[0], "--cal", *files[1:], "--out", str(out), *words) == 0
     assert "method      weighted" in capsys.readouterr().out
     first, second = (read_oifits(tmp_path / f"out{i}" / "calibrated.oifits") for i in range(2))

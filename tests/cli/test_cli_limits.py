@@ -57,7 +57,7 @@ def test_whole_job(target: Path, tmp_path: Path, capsys) -> None:
 @pytest.mark.parametrize("method", ["absil", "candid", "posterior", "closure-phase"])
 def test_closed_criteria(target: Path, tmp_path: Path, capsys, method: str) -> None:
     out = tmp_path / "out"
-    assert run(target, "--out", out, *FAST, "--method", method, "--json") == 0
+    assert run(target, "--out", out, *FAST, "--criterion", method, "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["method"] == method
     assert content["completeness_map"] is None
@@ -82,11 +82,11 @@ def test_resume_starts_afresh_and_tells_a_finished_run_again(target, tmp_path, c
     ("words", "status", "message"),
     [
         (("--null-draws", 100), 2, "--null-draws"),
-        (("--method", "closure-phase", "--observables", "vis2"), 2, "closure phases alone"),
+        (("--criterion", "closure-phase", "--observables", "vis2"), 2, "closure phases alone"),
         (("--calibration", "weighted"), 2, "needs calibrators"),
         (("--primary-magnitude", 3), 2, "--mass-table"),
         (("--mass-table", "nowhere.ecsv"), 3, "nowhere.ecsv: cannot be read"),
-        (("--method", "magic"), 2, "invalid choice"),
+        (("--criterion", "magic"), 2, "invalid choice"),
         (("--trials", 0), 2, "not a positive number"),
     ],
 )

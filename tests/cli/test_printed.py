@@ -177,7 +177,7 @@ def test_limits_in_mass(alone: Path, tmp_path: Path, capsys) -> None:
     tracks = tmp_path / "tracks.ecsv"
     mass, magnitude = [1.0, 5.0, 50.0], [12.0, 8.0, 2.0]
     Table({"mass_mjup": mass, "delta_mag": magnitude}).write(tracks)
-    words = ("--method", "candid", "--separations", 4, "--separation", "60:400")
+    words = ("--criterion", "candid", "--separations", 4, "--separation", "60:400")
     assert run("limits", alone, *words, "--mass-table", tracks, "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "limits.json").read_text())

@@ -14,7 +14,6 @@ from astropy.io import fits
 
 from amibayes.calibration import calibrate
 from amibayes.cli import main
-from amibayes.cli.common import METHODS as CLI_METHODS
 from amibayes.companion_search.search import search
 from amibayes.cube import Cube, cube_stream, read_cube, write_cube
 from amibayes.data.observables import Observables
@@ -539,7 +538,6 @@ def test_command_writes_what_it_says(
     assert {".oifits", "_integrations.oifits", "_frame.png", "_fit.png", "_time.png"} <= names
     assert main(line) == 2  # nothing is overwritten
     assert main(["extract", str(tmp_path / "none.fits"), "--out", str(tmp_path / "o2")]) == 3
-    assert CLI_METHODS == METHODS
 
 
 def test_star_is_told_from_the_middle_of_the_image_as_given(

@@ -267,6 +267,6 @@ def test_a_kind_of_observable_that_cannot_carry_a_fit_is_left_out_and_named(tmp_
     path = tmp_path / "few.oifits"
     write_oifits(path, few)
     search = SearchOptions(separation_mas=(60.0, 200.0), null_draws=500)
-    report = measure_limits([path], [], LimitsOptions(search, method="candid", n_separations=3))
+    report = measure_limits([path], [], LimitsOptions(search, criterion="candid", n_separations=3))
     assert [limit.observables for limit in report.limits] == [("vis2", "cp"), ("cp",)]
     assert any("no limit from vis2 alone" in said for said in report.warnings)

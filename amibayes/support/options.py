@@ -1,0 +1,97 @@
+"""Choices and defaults of all options: the command line, the API and the documentation read these.
+
+The first value of a choice is its default, where none is named beside it. Nothing heavy is
+imported here, since ``--help`` needs it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeAlias, get_args
+
+ExtractionMethod = Literal["fringes", "matched", "fft", "gauss", "square", "unique"]
+"""Fit of the images, or a way to sample their Fourier transform."""
+
+ExtractionCovariance = Literal["shrunk", "scatter", "physical"]
+"""Scatter of the integrations and photon noise combined, or one of them alone."""
+
+Geometry = Literal["fitted", "stated"]
+"""Scale and rotation of the mask, where the image tells them."""
+
+CalibrationMethod = Literal["hierarchical", "weighted"]
+"""How calibrators are combined; unless given, by how many share a baseline."""
+
+ClosureCovariance = Literal["assumed", "diagonal"]
+"""Triangles of files without correlations: correlated through shared baselines, or independent."""
+
+ContrastSharing = Literal["tied", "per-filter"]
+"""One contrast for all bands, or one for each; unless given, by the number of bands."""
+
+EvidenceMethod = Literal["direct", "laplace", "nested"]
+"""Integrate directly, by Laplace's approximation, or by nested sampling."""
+
+ContrastForm = Literal["log-uniform", "uniform"]
+"""Prior of the contrast."""
+
+PositionForm = Literal["area", "separation"]
+"""Prior of the position: uniform in area, or in separation and angle."""
+
+AnalyticMethod = Literal["absil", "candid", "posterior", "closure-phase"]
+"""Closed criteria of the literature for a limit."""
+
+LimitCriterion: TypeAlias = Literal["injection", "absil", "candid", "posterior", "closure-phase"]
+"""Injection and recovery by the search's own criterion, or a closed one."""
+
+ImagingProgram = Literal["irbis", "squeeze", "mira"]
+"""Programs of image reconstruction."""
+
+RampPreset = Literal["default", "paper"]
+"""Rules for groups and integrations: the real brightest pixel, or those of Soulain et al. 2020."""
+
+Observables = tuple[Literal["vis2", "cp"], ...]
+
+OBSERVABLES: tuple[str, ...] = ("vis2", "cp")
+"""Kinds of observables; all of them are fitted."""
+
+COMPANIONS = (0, 1, 2)
+"""Numbers of companions whose evidences can be compared."""
+
+SEED = 1
+
+CLIP_CALIBRATORS = 3.0
+"""Standard deviations past which a calibrator's value is left out: one in 370 of good ones."""
+
+CLIP_INTEGRATIONS = 5.0
+"""Standard deviations past which an integration is left out. Its observables are tens of
+numbers, whose largest passes 3 often."""
+
+ALPHA = 0.0013
+"""False-alarm probability of a detection: the one-sided tail of 3 sigma."""
+
+NULL_DRAWS = 10_000
+"""Null searches: α is then known to a quarter of itself."""
+
+LIMITS_NULL_DRAWS = 100_000
+"""Null searches for limits: the threshold of α is then known to a tenth of α."""
+
+LIMITS_SEPARATIONS = 24
+"""Rings of a detection limit."""
+
+LIMITS_TRIALS = 240
+"""Injections per separation and contrast: 95 % completeness is then known to 1.4 %."""
+
+VETTING_ALPHA = 0.003
+"""Probability of each test below which a calibrator is dropped."""
+
+VETTING_NULL_DRAWS = 4000
+"""Null searches of a calibrator: `VETTING_ALPHA` is then known to a third of itself."""
+
+PLAN_SEPARATION_MAS = (50.0, 400.0)
+"""Range of a plan's contrast curve: from half of λ/B_max of NIRISS to its field."""
+
+PEAK_LIMIT_E = 30_000.0
+"""Electrons that the brightest pixel may reach."""
+
+
+def choices(literal: Any) -> tuple[str, ...]:
+    """Give the values of a ``Literal``."""
+    return tuple(get_args(literal))
