@@ -18,7 +18,6 @@ from amibayes import load_instrument
 from amibayes.cube import Cube
 from amibayes.extraction import ExtractOptions, extract_all
 from amibayes.extraction.fourier.sampling import OneEach
-from amibayes.extraction.low_flux import expected_covariance
 from amibayes.optics import psf
 from amibayes.units import ComplexArray, FloatArray
 
@@ -39,10 +38,10 @@ def optics(method: str, photons: float, read_noise: float) -> tuple[OneEach, Flo
     # The weights of a faint star are those of its noise.
     error = np.sqrt(bright + 1e7 / photons * read_noise**2 + 1.0)
     cube = Cube(bright, INSTRUMENT.pixel_scale_rad, "NIRISS", "F430M", error=error)
-    bench = extract_all(cube, ExtractOptions(method=method))[0].benches[0]  # type: ignore[arg-type]
-    sampling = bench.sampling
+    operator = extract_all(cube, ExtractOptions(method=method))[0].operators[0]  # type: ignore[arg-type]
+    sampling = operator.sampling
     assert isinstance(sampling, OneEach)
-    return sampling, photons * image[bench.view.rows, bench.view.columns].ravel()
+    return sampling, photons * image[operator.view.rows, operator.view.columns].ravel()
 
 
 def scatter_of(sampling: OneEach, flux: float, images: FloatArray) -> FloatArray:
@@ -72,7 +71,7 @@ def ratios(
     flux, samples = (a[0] for a in sampling.apply(light[None]))
     seen = scatter_of(sampling, float(flux), rng.poisson(light, read.shape) + read)
     variance = light + read_noise**2
-    full = expected_covariance(sampling, float(flux), samples, variance, light)
+    full = sampling.expected_covariance(float(flux), samples, variance, light)
     first = first_order(sampling, float(flux), samples, variance)
     return seen / np.diag(full), seen / np.diag(first)
 

@@ -93,21 +93,21 @@ def taken(shutter: PreparedExposure) -> Cube:
 
 def first_order(quiet: Extraction, cube: Cube, noisy: FloatArray) -> FloatArray:
     """What noise does to V² and closure phase (56,) of an extraction without it, linearly."""
-    bench = quiet.benches[0]
-    part = np.s_[:, bench.view.rows, bench.view.columns]
+    operator = quiet.operators[0]
+    part = np.s_[:, operator.view.rows, operator.view.columns]
     images, change = (
-        np.asarray(a, dtype=float)[part].reshape(len(noisy), -1) @ bench.sampling.matrix
+        np.asarray(a, dtype=float)[part].reshape(len(noisy), -1) @ operator.sampling.matrix
         for a in (cube.images, noisy - cube.images)
     )
-    star = star_image(bench.view)
+    star = star_image(operator.view)
     ahead, behind = (_observables(quiet, star, images + s * change) for s in (STEP, -STEP))
     return (ahead - behind) / (2.0 * STEP)
 
 
 def _observables(quiet: Extraction, star: FineImage, numbers: FloatArray) -> FloatArray:
     """V² and closure phase of the mean of some integrations' numbers, pointing included."""
-    bench = quiet.benches[0]
-    sampling, view = bench.sampling, bench.view
+    operator = quiet.operators[0]
+    sampling, view = operator.sampling, operator.view
     flux, samples = split(numbers)
     frames = replace(
         quiet.frames,
@@ -116,7 +116,7 @@ def _observables(quiet: Extraction, star: FineImage, numbers: FloatArray) -> Flo
         bispectrum=sampling.bispectrum(samples),
     )
     pointed = pointing_response(
-        star, sampling, shift_of(view, sampling.fringes(samples), bench.weight)
+        star, sampling, shift_of(view, sampling.fringes(samples), operator.weight)
     )
     found = average(frames, pointed, view.instrument.mask.triangle_baselines)
     return np.concatenate([found.vis2, found.closure_phase])

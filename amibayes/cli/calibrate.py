@@ -105,8 +105,8 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.oifits import write_oifits
     from amibayes.support.atomic_files import output_folder
 
-    calibrators = [_prepared(path, arguments, target=None) for path in arguments.cal]
-    targets = [_prepared(path, arguments, target=arguments.target) for path in arguments.targets]
+    calibrators = _prepared(arguments.cal, arguments, target=None, one_star=False)
+    targets = _prepared(arguments.targets, arguments, target=arguments.target)
     if arguments.merge_epochs:
         from amibayes.calibration import merge_epochs
 
@@ -128,25 +128,32 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _prepared(path: str, arguments: argparse.Namespace, target: str | None) -> Observables:
-    """Read a file, flag, average."""
+def _prepared(
+    paths: list[str],
+    arguments: argparse.Namespace,
+    target: str | None,
+    *,
+    one_star: bool = True,
+) -> list[Observables]:
+    """Read files, flag, average."""
     from amibayes.calibration import average_polarisations, bin_channels, flag_by_rule
     from amibayes.extraction.reading import read_observations
 
-    observables = read_observations(
-        path,
+    found = read_observations(
+        paths,
         common.image_options_of(arguments),
+        one_star=one_star,
         insname=arguments.insname,
         target=target,
         closure_covariance=arguments.closure_covariance,
     )
     if arguments.flag:
-        observables = flag_by_rule(observables, arguments.flag)
+        found = [flag_by_rule(each, arguments.flag) for each in found]
     if arguments.average_polarisations:
-        observables = average_polarisations(observables)
+        found = [average_polarisations(each) for each in found]
     if arguments.bin_channels > 1:
-        observables = bin_channels(observables, arguments.bin_channels)
-    return observables
+        found = [bin_channels(each, arguments.bin_channels) for each in found]
+    return found
 
 
 def _diameters(

@@ -125,8 +125,8 @@ def _names(stem: str, arguments: argparse.Namespace) -> list[str]:
 def _write(
     extraction: Extraction, folder: Path, stem: str, arguments: argparse.Namespace
 ) -> dict[str, Any]:
-    from amibayes.extraction.per_integration import integrations
     from amibayes.extraction.summary import described, header_of
+    from amibayes.extraction.table import integrations
     from amibayes.oifits import write_oifits
     from amibayes.plots.extraction import PICTURES
     from amibayes.plots.style import save

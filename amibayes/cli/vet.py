@@ -66,15 +66,13 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.support.atomic_files import output_folder, write_json
 
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
-    data = [
-        read_observations(
-            path,
-            common.image_options_of(arguments),
-            insname=arguments.insname,
-            closure_covariance=arguments.closure_covariance,
-        )
-        for path in arguments.calibrators
-    ]
+    data = read_observations(
+        arguments.calibrators,
+        common.image_options_of(arguments),
+        one_star=False,
+        insname=arguments.insname,
+        closure_covariance=arguments.closure_covariance,
+    )
     vetting = vet(
         data,
         calibrated=arguments.calibrated,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from amibayes.errors import DataError
+from amibayes.instrument import header_rules
 from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
@@ -47,17 +48,19 @@ def text(header: Header, key: str) -> str | None:
 
 
 def check_mask(header: Header, source: str) -> None:
-    """Refuse NIRISS images that were not taken through the mask.
+    """Refuse images of a known instrument that were not taken through its mask.
 
     Raises
     ------
     DataError
         Naming the pupil element.
     """
-    pupil = text(header, "PUPIL")
-    niriss = (text(header, "INSTRUME") or "").upper() == "NIRISS"
-    if niriss and pupil is not None and "NRM" not in pupil.upper():
-        raise DataError(f"was not taken through the mask (PUPIL is {pupil})", source=source)
+    rules = header_rules(text(header, "INSTRUME") or "")
+    found = text(header, rules.mask_keyword) if rules.mask_keyword else None
+    if found is not None and rules.mask_value.upper() not in found.upper():
+        raise DataError(
+            f"was not taken through the mask ({rules.mask_keyword} is {found})", source=source
+        )
 
 
 def orientation_of(header: Header, source: str) -> Orientation:

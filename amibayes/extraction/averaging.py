@@ -54,8 +54,8 @@ def average(frames: Frames, pointed: ComplexArray, triangles: IntArray) -> Avera
     return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))
 
 
-def standing_off(deviation: FloatArray, expected: FloatArray, limit: float) -> BoolArray:
-    """Integrations whose observables stand off the others', on a robust scale, (n,).
+def outlying(deviation: FloatArray, expected: FloatArray, limit: float) -> BoolArray:
+    """Integrations whose observables are outliers, on a robust scale, (n,).
 
     The statistic is the largest deviation over all observables in units of its scatter,
     and the limit allows for how many there are. The scatter of a few integrations may be

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from amibayes.cube import Cube
+from amibayes.cube.source import Source
 from amibayes.errors import DataError
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.noise import NoiseModel, noise_model
-from amibayes.extraction.source import Source
 from amibayes.units import BoolArray, FloatArray, read_only
 
 SAMPLE, RUN = 32, 4
@@ -25,7 +25,7 @@ ALWAYS_BAD = 0.5
 """A pixel bad in a larger fraction of the integrations is never used."""
 
 OUTLIER = 7.0
-"""Pixels of the sample that stand off by more standard deviations are left out of it."""
+"""Pixels of the sample that are outliers by more standard deviations are left out of it."""
 
 TO_SIGMA = 1.4826
 """From the median absolute deviation to a standard deviation."""
@@ -66,7 +66,7 @@ class Reference:
         read_only(self, "image", "scatter")
 
     def outliers(self, images: PixelArray, bad: BoolArray, limit: float) -> BoolArray:
-        """Pixels (n, n_y, n_x) that stand off the reference, scaled to each image's flux."""
+        """Outliers (n, n_y, n_x) from the reference, which is scaled to each image's flux."""
         n, usable = len(images), self.good & ~bad
         image, scatter = (a.astype(images.dtype) for a in (self.image, self.scatter))
         # A single hot pixel must not decide what the flux is.
@@ -175,7 +175,7 @@ def _measured_variance(
 
 
 def _hot(image: FloatArray, good: BoolArray) -> BoolArray:
-    """Pixels that no optics could light: they stand off all that surrounds them.
+    """Pixels that no optics could light: they differ from all that surrounds them.
 
     A telescope's image is smooth on the scale of a pixel where it is sampled well; a pixel
     is called hot or dead where it differs from what its neighbours predict by more than

@@ -11,18 +11,18 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.cube import Cube
+from amibayes.cube.source import opened
 from amibayes.data.covariance import Block
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.errors import DataError
-from amibayes.extraction.averaging import Average, average, standing_off
-from amibayes.extraction.bench import make_bench
-from amibayes.extraction.frames import ExtractionOperator, Frames, concatenated, measure, select
-from amibayes.extraction.low_flux import expected_covariance
+from amibayes.extraction.averaging import Average, average, outlying
+from amibayes.extraction.frames import Frames, concatenated, measure_file, select
+from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
 from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
-from amibayes.extraction.source import opened
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.support.options import ExtractionMethod
@@ -33,6 +33,10 @@ NYQUIST = 0.5
 
 MAX_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
+
+
+SEPARATOR = ", "
+"""Between the names of files that are exposures of one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,7 @@ class Extraction:
         Of one integration.
     physical : (m, m) array
         Covariance of one integration that photon and read noise make.
-    benches : tuple of ExtractionOperator
+    operators : tuple of ExtractionOperator
         One per file: view, reference image, operators.
     options : ExtractOptions
     sources : tuple of str
@@ -61,7 +65,7 @@ class Extraction:
     average: Average
     covariance: Shrunk
     physical: FloatArray
-    benches: tuple[ExtractionOperator, ...]
+    operators: tuple[ExtractionOperator, ...]
     options: ExtractOptions
     sources: tuple[str, ...]
 
@@ -113,9 +117,14 @@ def extract(
 def extract_all(
     cubes: Cube | str | Path | Sequence[Cube | str | Path],
     options: ExtractOptions | None = None,
+    *,
+    one_star: bool = True,
     **header: Any,
 ) -> list[Extraction]:
-    """As `extract`, with everything that was found on the way, one for each exposure."""
+    """As `extract`, with everything that was found on the way, one for each exposure.
+
+    Cubes that name no star are exposures of ``one_star``, or each of another one.
+    """
     given = [cubes] if isinstance(cubes, Cube | str | Path) else list(cubes)
     if not given:
         raise DataError("no cube to extract", remedy="give at least one file")
@@ -126,7 +135,7 @@ def extract_all(
     for part in parts:
         t = part.template
         key = (
-            target_of(t).casefold(),
+            target_of(t).casefold() or (None if one_star else part.frames.file[0]),
             t.instrument.upper(),
             t.filter.upper(),
             t.orientation,
@@ -141,7 +150,7 @@ class _Part:
     """One file."""
 
     template: Cube
-    bench: ExtractionOperator
+    operator: ExtractionOperator
     frames: Frames
     physical: FloatArray
     response: OffAxisResponse
@@ -152,53 +161,55 @@ def _measured(
     cube: Cube | str | Path, index: int, options: ExtractOptions, header: dict[str, Any]
 ) -> _Part:
     with opened(cube, **header) as file:
-        bench = make_bench(file, options)
-        frames, samples, flux = measure(bench, file, index)
+        operator = make_operator(file, options)
+        frames, samples, flux = measure_file(operator, file, index)
     template = file.template
     if not options.keep_all:
         frames = replace(frames, reason=select(frames, options.clip, MAX_SHIFT_PX))
     if not frames.used.any():
         raise DataError(f"no integration can be used: {frames.reason[0]}", source=template.source)
-    star = star_image(bench.view)
+    star = star_image(operator.view)
     centre = frames.shift_px[frames.used].mean(axis=0)
-    response = off_axis_response(star, bench.sampling, template.orientation, centre, options.method)
+    response = off_axis_response(
+        star, operator.sampling, template.orientation, centre, options.method
+    )
     return _Part(
         template,
-        bench,
+        operator,
         frames,
-        expected_covariance(bench.sampling, flux, samples, bench.variance, bench.skewness),
+        operator.sampling.expected_covariance(flux, samples, operator.variance, operator.skewness),
         response,
-        pointing_response(star, bench.sampling, frames.shift_px),
+        pointing_response(star, operator.sampling, frames.shift_px),
     )
 
 
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     """One exposure out of its files: average, covariance, table."""
-    view = parts[0].bench.view
+    view = parts[0].operator.view
     frames, mean, physical = _together(parts, options)
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
     notes = _unnamed(parts) + _notes(view, frames, shrunk)
-    observables = _tabled(parts[0], frames, mean, shrunk, basis, notes)
-    benches = tuple(p.bench for p in parts)
     sources = tuple(p.template.source for p in parts)
-    return Extraction(observables, frames, mean, shrunk, physical, benches, options, sources)
+    observables = _tabled(parts[0], frames, mean, shrunk, basis, notes, sources)
+    operators = tuple(p.operator for p in parts)
+    return Extraction(observables, frames, mean, shrunk, physical, operators, options, sources)
 
 
 def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Average, FloatArray]:
-    """Integrations of all files, those that stand off marked, their mean, and their noise."""
+    """Integrations of all files, outliers marked, their mean, and their noise."""
     frames = concatenated([p.frames for p in parts])
     pointed = np.concatenate([p.pointed for p in parts])
     count = np.array([p.frames.used.sum() for p in parts], dtype=float)
     physical = np.einsum("k,kij->ij", count / count.sum(), np.stack([p.physical for p in parts]))
-    triangles = parts[0].bench.view.instrument.mask.triangle_baselines
+    triangles = parts[0].operator.view.instrument.mask.triangle_baselines
     mean = average(frames.select(frames.used), pointed[frames.used], triangles)
     if not options.keep_all:
         off = np.zeros(len(frames), dtype=bool)
-        off[frames.used] = standing_off(mean.deviation, np.sqrt(np.diag(physical)), options.clip)
+        off[frames.used] = outlying(mean.deviation, np.sqrt(np.diag(physical)), options.clip)
         if off.any():
-            reason = np.where(off, "observables stand off the others'", frames.reason)
+            reason = np.where(off, "observables are outliers", frames.reason)
             frames = replace(frames, reason=reason)
             mean = average(frames.select(frames.used), pointed[frames.used], triangles)
     return frames, mean, np.asarray(physical)
@@ -211,12 +222,13 @@ def _tabled(
     shrunk: Shrunk,
     basis: FloatArray,
     notes: tuple[str, ...],
+    sources: tuple[str, ...],
 ) -> Observables:
     n = int(frames.used.sum())
     scatter = None if shrunk.carried is None else csr_array(shrunk.scatter / n)
     return observables_of(
-        part.bench.view,
-        part.template,
+        part.operator.view,
+        replace(part.template, source=SEPARATOR.join(sources)),
         mean,
         Block(np.arange(len(basis)), shrunk.matrix / n, basis),
         n_integrations=n if n > 1 else None,
@@ -255,8 +267,8 @@ def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
     if coarse:
         notes.append(
             f"the pixels are too large for the fringes of {coarse} of {len(view.frequency_px)} "
-            "baselines: what is measured of light off the axis hangs on where in a pixel the star "
-            "stands, by some percent of a faint companion's light and more of a bright one's"
+            "baselines: what is measured of light off the axis depends on the star's place in a "
+            "pixel, by some percent of a faint companion's light and more of a bright one's"
         )
     lost = int((~frames.used).sum())
     if lost:

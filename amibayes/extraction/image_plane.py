@@ -183,7 +183,7 @@ def centre_on(
     Raises
     ------
     DataError
-        Where it does not settle: another mask, filter or pixel scale made the image.
+        Where it does not converge: another mask, filter or pixel scale made the image.
     """
     pixels = np.where(good, image, 0.0)
     even = np.ones(view.shape)

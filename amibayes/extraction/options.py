@@ -32,14 +32,14 @@ class ExtractOptions:
     method : {"fringes", "matched", "fft", "gauss", "square", "unique"}
         ``fringes`` fits the images; the others sample their Fourier transform.
     clip : float
-        Integrations whose observables stand off by more standard deviations are left out.
+        Integrations whose observables are outliers by more standard deviations are left out.
     outlier : float
-        Pixels that stand off their own in other integrations by more are left out.
+        Pixels that differ from their own in other integrations by more are left out.
     window_px : float, optional
         Radius at which the window of the Fourier methods has fallen to a half; 0 for no
         window. By default 0.45 of the image's side. ``fringes`` takes none.
     covariance : {"shrunk", "scatter", "physical"}
-        Scatter and photon noise weighed against each other, or one of them alone.
+        Scatter shrunk towards photon and read noise, or one of them alone.
     temperature_k : float, optional
         Blackbody that stands for the star's spectrum; as many photons at every wavelength
         unless given.

@@ -1,16 +1,17 @@
-"""One way in for every file: OIFITS as it is, images extracted first."""
+"""One way in for every file: a list of formats, each with how it is recognised and read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from astropy.io import fits
 
-from amibayes.data.observables import Observables, join
-from amibayes.extraction.extract import extract_all
+from amibayes.data.observables import Observables
+from amibayes.extraction.extract import SEPARATOR, extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.oifits import read_oifits
 from amibayes.support.fits_errors import UNREADABLE
@@ -32,40 +33,137 @@ class ImageOptions:
     header: Mapping[str, Any] = field(default_factory=dict)
 
 
-def holds_images(path: str | Path) -> bool:
-    """Tell whether a file holds images, and no OIFITS tables.
-
-    Anything that is not readable is left for the reader of OIFITS to complain about.
-    """
-    try:
-        with fits.open(path, memmap=False, lazy_load_hdus=False) as hdus:
-            if any(hdu.name.startswith("OI_") for hdu in hdus):
-                return False
-            return any(hdu.is_image and len(hdu.shape) > 1 for hdu in hdus)
-    except UNREADABLE:
-        return False
-
-
-def read_observations(
-    path: str | Path, images: ImageOptions | None = None, **options: Any
-) -> Observables:
-    """Read observables, from OIFITS or out of an image cube.
+@dataclass(frozen=True)
+class Contents:
+    """What a file holds, without its data.
 
     Parameters
     ----------
-    path : str or path
+    path : str
+    header : mapping
+        Of the primary HDU.
+    names : tuple of str
+        EXTNAME of every HDU, in capitals.
+    shapes : tuple of (int, ...)
+        Shape of every HDU that is an image; empty for others.
+    """
+
+    path: str
+    header: Mapping[str, Any]
+    names: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
+
+    @property
+    def has_oifits(self) -> bool:
+        """Whether there is a table of OIFITS."""
+        return any(name.startswith("OI_") for name in self.names)
+
+
+def contents_of(path: str | Path) -> Contents:
+    """Read the headers of a file; one that is not readable seems to hold nothing.
+
+    The reader that is then chosen, that of OIFITS, says what is wrong with it.
+    """
+    try:
+        with fits.open(path, memmap=False, lazy_load_hdus=False) as hdus:
+            names = tuple(hdu.name.upper() for hdu in hdus)
+            shapes = tuple(tuple(hdu.shape) if hdu.is_image else () for hdu in hdus)
+            return Contents(str(path), MappingProxyType(dict(hdus[0].header)), names, shapes)
+    except UNREADABLE:
+        return Contents(str(path), MappingProxyType({}), (), ())
+
+
+@dataclass(frozen=True)
+class InputFormat:
+    """A kind of file that observables can be read from.
+
+    Parameters
+    ----------
+    name : str
+        As messages call it.
+    recognise : callable
+        Whether `Contents` are of this kind.
+    read : callable
+        Read files of this kind that were given together, as ``read(paths, images, one_star,
+        **options)``: one `Observables` for each exposure.
+    """
+
+    name: str
+    recognise: Callable[[Contents], bool]
+    read: Callable[..., list[Observables]]
+
+
+def _is_cube(contents: Contents) -> bool:
+    return not contents.has_oifits and any(len(shape) > 1 for shape in contents.shapes)
+
+
+def _extracted(
+    paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
+) -> list[Observables]:
+    found = extract_all(paths, images.extraction, one_star=one_star, **images.header)
+    return [e.observables for e in found]
+
+
+def _oifits(
+    paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
+) -> list[Observables]:
+    return [read_oifits(path, **options) for path in paths]
+
+
+FORMATS: tuple[InputFormat, ...] = (
+    InputFormat("image cube", _is_cube, _extracted),
+    InputFormat("OIFITS", lambda contents: True, _oifits),
+)
+"""Every kind of input, by the order in which they are tried; the last takes what is left."""
+
+
+def format_of(path: str | Path) -> InputFormat:
+    """Find the first format that recognises a file."""
+    contents = contents_of(path)
+    return next(kind for kind in FORMATS if kind.recognise(contents))
+
+
+def read_observations(
+    paths: str | Path | Sequence[str | Path],
+    images: ImageOptions | None = None,
+    *,
+    one_star: bool = True,
+    **options: Any,
+) -> list[Observables]:
+    """Read observables, from OIFITS or out of image cubes.
+
+    Parameters
+    ----------
+    paths : path, or a sequence of them
+        Files of one kind are read together: cubes that are exposures of one star are one.
     images : ImageOptions, optional
         For image cubes.
+    one_star : bool
+        Whether files that name no star are of one, as those of a target are; calibrators
+        may be several stars.
     **options
         For OIFITS, those of `read_oifits`.
+
+    Returns
+    -------
+    list of Observables
+        One for each exposure, in the order of the first file of each.
 
     Raises
     ------
     DataError
-        Where the file cannot be read or nothing in it can be measured.
+        Where a file cannot be read or nothing in it can be measured.
     """
-    if not holds_images(path):
-        return read_oifits(path, **options)
-    chosen = images or ImageOptions()
-    found = extract_all(path, chosen.extraction, **chosen.header)
-    return join([e.observables for e in found])
+    given = [str(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
+    kinds = {path: format_of(path) for path in given}
+    found: list[Observables] = []
+    for kind in dict.fromkeys(kinds.values()):
+        ours = [path for path in given if kinds[path] is kind]
+        found += kind.read(ours, images or ImageOptions(), one_star, **options)
+    return sorted(found, key=lambda part: _first(part, given))
+
+
+def _first(part: Observables, paths: list[str]) -> int:
+    """Place among the paths of the first file that some observables come from."""
+    own = {name for s in part.setups for name in s.source.split(SEPARATOR)}
+    return next((k for k, path in enumerate(paths) if path in own), len(paths))

@@ -1,4 +1,4 @@
-"""The covariance of the mean: scatter between integrations, weighed with what physics expects.
+"""The covariance of the mean: scatter between integrations, shrunk towards what physics expects.
 
 The scatter of N integrations knows N − 1 directions of p; for few of them its inverse is
 far too sure of itself. The covariance is given an inverse-Wishart prior whose mean is the

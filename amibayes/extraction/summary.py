@@ -9,14 +9,14 @@ import numpy as np
 
 from amibayes import __version__
 from amibayes.extraction.extract import Extraction
-from amibayes.extraction.frames import ExtractionOperator
 from amibayes.extraction.geometry import Geometry
+from amibayes.extraction.operator import ExtractionOperator
 from amibayes.units import DEGREE
 
 
 def described(extraction: Extraction) -> dict[str, Any]:
     """Give everything worth telling, ready for JSON."""
-    frames, view = extraction.frames, extraction.benches[0].view
+    frames, view = extraction.frames, extraction.operators[0].view
     used, n = frames.used, view.instrument.mask.n_baselines
     count = int(used.sum())
     own = np.sqrt(np.diag(extraction.covariance.matrix) / count)
@@ -35,11 +35,11 @@ def described(extraction: Extraction) -> dict[str, Any]:
             {"path": path, "integration": number, "reason": reason}
             for path, number, reason in extraction.rejected
         ],
-        "centre_px": [_from_middle(b) for b in extraction.benches],
-        "geometry": [_geometry(b.geometry) for b in extraction.benches],
+        "centre_px": [_from_middle(b) for b in extraction.operators],
+        "geometry": [_geometry(b.geometry) for b in extraction.operators],
         "jitter_px": float(np.sqrt(frames.shift_px[used].var(axis=0).mean())),
         "flux": float(frames.flux[used].mean()),
-        "bad_pixels": [b.reference.n_bad for b in extraction.benches],
+        "bad_pixels": [b.reference.n_bad for b in extraction.operators],
         "outliers": float(frames.n_bad[used].mean()),
         "sigma_vis2": float(np.median(own[:n])),
         "sigma_vis2_physical": float(np.median(expected[:n])),
@@ -55,10 +55,10 @@ def described(extraction: Extraction) -> dict[str, Any]:
     }
 
 
-def _from_middle(bench: ExtractionOperator) -> list[float]:
+def _from_middle(operator: ExtractionOperator) -> list[float]:
     """Place (x, y) of the star from the middle of the image as given, before any cropping."""
-    view = bench.view
-    ny, nx = bench.reference.image.shape
+    view = operator.view
+    ny, nx = operator.reference.image.shape
     sides = zip((view.columns, view.rows), (nx, ny), view.centre_px, strict=True)
     return [0.5 * (part.start + part.stop - size) + at for part, size, at in sides]
 
@@ -82,12 +82,12 @@ def header_of(extraction: Extraction) -> dict[str, str | int | float | bool]:
     for name, value in extraction.options.as_mapping().items():
         if name != "method" and value is not None:
             header[f"HIERARCH AMIBAYES OPTION {name.upper()}"] = value
-    for k, (source, bench) in enumerate(
-        zip(extraction.sources, extraction.benches, strict=True), 1
+    for k, (source, operator) in enumerate(
+        zip(extraction.sources, extraction.operators, strict=True), 1
     ):
         header[f"HIERARCH AMIBAYES SOURCE{k}"] = Path(source).name
-        header[f"HIERARCH AMIBAYES PIXEL{k}"] = bench.view.instrument.pixel_scale_rad
-        header[f"HIERARCH AMIBAYES SCALE{k}"] = bench.geometry.scale
-        header[f"HIERARCH AMIBAYES ROTATION{k}"] = bench.geometry.rotation_rad / DEGREE
-    header["HIERARCH AMIBAYES CHARGE"] = float(extraction.benches[0].reference.image.max())
+        header[f"HIERARCH AMIBAYES PIXEL{k}"] = operator.view.instrument.pixel_scale_rad
+        header[f"HIERARCH AMIBAYES SCALE{k}"] = operator.geometry.scale
+        header[f"HIERARCH AMIBAYES ROTATION{k}"] = operator.geometry.rotation_rad / DEGREE
+    header["HIERARCH AMIBAYES CHARGE"] = float(extraction.operators[0].reference.image.max())
     return header

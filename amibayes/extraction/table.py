@@ -1,6 +1,9 @@
-"""Averages as `Observables`: stations are holes, baselines lie on the sky."""
+"""Averages and single integrations as `Observables`: stations are holes, baselines on the sky."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -9,11 +12,15 @@ from amibayes.cube import Cube
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup
+from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup, join
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average
 from amibayes.extraction.view import View
 from amibayes.units import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from amibayes.extraction.extract import Extraction
 
 
 def independent_basis(view: View) -> FloatArray:
@@ -116,4 +123,58 @@ def _rows(
         row=np.arange(n),
         channel=zeros,
         flag=~np.isfinite(value),
+    )
+
+
+def series(extraction: Extraction) -> tuple[FloatArray, FloatArray]:
+    """V² (n, n_baselines) and closure phase (n, n_triangles) of the integrations in use."""
+    mean = extraction.average
+    n = len(mean.vis2)
+    closure = mean.closure_phase + mean.deviation[:, n:]
+    return mean.vis2 + mean.deviation[:, :n], closure
+
+
+def integrations(extraction: Extraction) -> Observables:
+    """Every integration in use as an epoch of its own, with the covariance of one.
+
+    Raises
+    ------
+    DataError
+        Where there is only one.
+    """
+    used = np.flatnonzero(extraction.frames.used)
+    if len(used) < 2:
+        raise DataError(
+            "holds one integration only", source=extraction.sources[0], remedy="leave it as it is"
+        )
+    vis2, closure = series(extraction)
+    mean = extraction.observables
+    covariance = mean.covariance
+    assert isinstance(covariance, BlockCovariance)
+    n = len(used)
+    blocks = [replace(b, matrix=b.matrix * n) for b in covariance.blocks]
+    whole = BlockCovariance(covariance.size, blocks)
+    # The scatter is that of these very data: what it does not tell of the covariance they do
+    # not tell again, and a t likelihood of all of them would be too narrow.
+    one = replace(mean, covariance=whole, covariance_kind="given", freedom=None, scatter=None)
+    time = extraction.frames.mjd[used]
+    parts = []
+    for k in range(n):
+        mjd = time[k] if np.isfinite(time[k]) else mean.vis2.mjd[0]
+        parts.append(
+            replace(
+                one,
+                vis2=_at(mean.vis2, vis2[k], mjd, n),
+                closure_phase=_at(mean.closure_phase, closure[k], mjd, n),
+            )
+        )
+    return join(parts)
+
+
+def _at(table: Measurements, value: FloatArray, mjd: float, n: int) -> Measurements:
+    return replace(
+        table,
+        value=value,
+        mjd=np.full(len(value), mjd),
+        integration_s=table.integration_s / n,
     )

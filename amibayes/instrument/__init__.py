@@ -1,7 +1,24 @@
 """Instruments as data: masks, filters, pixel scales, zero points."""
 
 from amibayes.instrument.bandpass import Bandpass, Channels
-from amibayes.instrument.catalogue import Instrument, instrument_names, load_instrument
+from amibayes.instrument.catalogue import (
+    HeaderRules,
+    Instrument,
+    Planning,
+    header_rules,
+    instrument_names,
+    load_instrument,
+)
 from amibayes.instrument.mask import Mask
 
-__all__ = ["Bandpass", "Channels", "Instrument", "Mask", "instrument_names", "load_instrument"]
+__all__ = [
+    "Bandpass",
+    "Channels",
+    "HeaderRules",
+    "Instrument",
+    "Mask",
+    "Planning",
+    "header_rules",
+    "instrument_names",
+    "load_instrument",
+]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,6 +22,43 @@ from amibayes.units import DEGREE, MAS, FloatArray
 
 _JANSKY = 1e-26
 _PLANCK = float(constants.h.value)
+
+
+@dataclass(frozen=True)
+class HeaderRules:
+    """What headers of an instrument's images hold beside the common keywords.
+
+    Parameters
+    ----------
+    mask_keyword, mask_value : str
+        Images were taken through the mask where the keyword holds the value; nothing is
+        checked where either is empty.
+    simulated : mapping
+        Keywords that simulated images get.
+    """
+
+    mask_keyword: str = ""
+    mask_value: str = ""
+    simulated: Mapping[str, str | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Planning:
+    """Published count rates that exposures are planned with.
+
+    Parameters
+    ----------
+    magnitude : float
+        Vega magnitude of the star.
+    hole_m : float
+        Size of a hole behind the published peaks.
+    rates_e_s : mapping of str to float
+        By filter.
+    """
+
+    magnitude: float
+    hole_m: float
+    rates_e_s: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +77,8 @@ class Instrument:
         Angle of a pixel, radians.
     n_pixels : int
         Side of the usual subarray.
+    header : HeaderRules
+    planning : Planning, optional
     """
 
     name: str
@@ -45,6 +86,8 @@ class Instrument:
     bandpass: Bandpass
     pixel_scale_rad: float
     n_pixels: int = 80
+    header: HeaderRules = field(default_factory=HeaderRules)
+    planning: Planning | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.pixel_scale_rad < 1.0:
@@ -120,6 +163,14 @@ def instrument_names() -> list[str]:
     return sorted(path.stem for path in _own_folder().glob("*.toml"))
 
 
+def header_rules(name: str) -> HeaderRules:
+    """Rules for headers that name an instrument; none where the package does not know it."""
+    if name.lower() not in instrument_names():
+        return HeaderRules()
+    top = read_toml(_path(name))
+    return _header(top.section("header")) if "header" in top else HeaderRules()
+
+
 def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
     """Load an instrument that comes with the package, or from a TOML file.
 
@@ -153,6 +204,8 @@ def _loaded(path: Path, filter: str | None) -> Instrument:
         bandpass=_bandpass(chosen, filters.section(chosen)),
         pixel_scale_rad=top.number("pixel_scale_mas", above=0.0) * MAS,
         n_pixels=int(top.number("n_pixels", 80, at_least=2)),
+        header=_header(top.section("header")) if "header" in top else HeaderRules(),
+        planning=_planning(top.section("planning")) if "planning" in top else None,
     )
     top.refuse_unknown(("source", "note"))
     return instrument
@@ -189,6 +242,28 @@ def _choose(filters: Section, wanted: str | None) -> str:
         what = "needs a filter" if wanted is None else f"has no filter '{wanted}'"
         raise UsageError(what, source=filters.source, remedy=f"choose from {', '.join(names)}")
     return match[0]
+
+
+def _header(section: Section) -> HeaderRules:
+    simulated = section.section("simulated") if "simulated" in section else None
+    found = HeaderRules(
+        section.text("mask_keyword", ""),
+        section.text("mask_value", ""),
+        MappingProxyType({} if simulated is None else simulated.scalars()),
+    )
+    section.refuse_unknown(("source", "note"))
+    return found
+
+
+def _planning(section: Section) -> Planning:
+    rates = section.section("rates_e_s")
+    found = Planning(
+        section.number("magnitude"),
+        section.number("hole_m", above=0.0),
+        MappingProxyType({name: rates.number(name, above=0.0) for name in rates.keys()}),  # noqa: SIM118
+    )
+    section.refuse_unknown(("source", "note"))
+    return found
 
 
 def _mask(section: Section) -> Mask:

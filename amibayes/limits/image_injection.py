@@ -16,13 +16,13 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.cube import Cube
+from amibayes.cube.source import InMemoryCube
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, bank_statistic, significance
 from amibayes.errors import DataError
-from amibayes.extraction.bench import make_bench
-from amibayes.extraction.frames import Frames, measure
+from amibayes.extraction.frames import Frames, measure_file
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.source import InMemoryCube
+from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.view import View
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.injection import Recovery, judge, recover
@@ -146,11 +146,11 @@ def measure_star(cube: Cube, options: ExtractOptions | None = None) -> MeasuredS
         Where nothing in the cube can be measured.
     """
     held = InMemoryCube(cube)
-    bench = make_bench(held, options or ExtractOptions())
-    frames, _, _ = measure(bench, held, 0)
+    operator = make_operator(held, options or ExtractOptions())
+    frames, _, _ = measure_file(operator, held, 0)
     flux, shift = _filled(frames, cube.source)
-    place = np.array(bench.view.centre_px) + shift
-    return MeasuredStar(cube, bench.view, flux, place, bench.reference.noise.per_signal)
+    place = np.array(operator.view.centre_px) + shift
+    return MeasuredStar(cube, operator.view, flux, place, operator.reference.noise.per_signal)
 
 
 def _filled(frames: Frames, source: str) -> tuple[FloatArray, FloatArray]:

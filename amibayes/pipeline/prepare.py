@@ -84,8 +84,8 @@ def prepare(
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
     with clock.stage("read"):
-        parts = [read(path, options) for path in targets]
-        references = [read(path, options) for path in calibrators]
+        parts = read(targets, options)
+        references = read(calibrators, options, one_star=False)
     parts = in_order(parts)
     joined = (
         *refuse_twice(parts),
@@ -97,11 +97,14 @@ def prepare(
     return Prepared(observables, tuple(references), calibration, vetting, cautions)
 
 
-def read(path: str | Path, options: SearchOptions) -> Observables:
-    """Read one file, OIFITS or image cube, as the options say."""
+def read(
+    paths: Sequence[str | Path], options: SearchOptions, *, one_star: bool = True
+) -> list[Observables]:
+    """Read files of any format, one table for each exposure, as the options say."""
     return read_observations(
-        path,
+        paths,
         options.images,
+        one_star=one_star,
         insname=options.insname,
         target=options.target,
         closure_covariance=options.closure_covariance,

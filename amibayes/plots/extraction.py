@@ -11,7 +11,7 @@ from matplotlib.colors import AsinhNorm, LogNorm
 from matplotlib.figure import Figure
 
 from amibayes.extraction import Extraction
-from amibayes.extraction.per_integration import series
+from amibayes.extraction.table import series
 from amibayes.plots.residual_corr import correlation_plot
 from amibayes.plots.style import (
     BLACK,
@@ -33,14 +33,14 @@ MAX_LINES = 35
 @styled()
 def frame_plot(extraction: Extraction) -> Figure:
     """Draw the clean reference frame, with the star's place and pixels that are never used."""
-    bench = extraction.benches[0]
-    view = bench.view
-    image = bench.reference.image
+    operator = extraction.operators[0]
+    view = operator.view
+    image = operator.reference.image
     figure = new_figure(5.6)
     ax = figure.subplots()
     top = float(image.max())
     shown = ax.imshow(image, origin="lower", cmap=SEQUENTIAL, norm=AsinhNorm(1e-3 * top, vmax=top))
-    y, x = np.nonzero(~bench.reference.good)
+    y, x = np.nonzero(~operator.reference.good)
     if len(x):
         ax.plot(x, y, "x", color=VERMILLION, label=f"{len(x)} bad pixels")
     middle = [0.5 * (s.start + s.stop - 1) for s in (view.columns, view.rows)]
@@ -66,9 +66,9 @@ def frame_plot(extraction: Extraction) -> Figure:
 @styled()
 def power_plot(extraction: Extraction) -> Figure:
     """Draw the power spectrum of the reference frame, and where the splodges are looked for."""
-    bench = extraction.benches[0]
-    view = bench.view
-    image = bench.reference.image[view.rows, view.columns]
+    operator = extraction.operators[0]
+    view = operator.view
+    image = operator.reference.image[view.rows, view.columns]
     side = max(image.shape)
     power = np.abs(np.fft.fftshift(np.fft.fft2(image, (side, side)))) ** 2
     power /= power.max()
@@ -93,12 +93,12 @@ def power_plot(extraction: Extraction) -> Figure:
 @styled()
 def fit_images(extraction: Extraction) -> Figure:
     """Draw image, model and residual of the fringe fit to the reference frame."""
-    bench = extraction.benches[0]
-    view = bench.view
+    operator = extraction.operators[0]
+    view = operator.view
     part = (view.rows, view.columns)
-    image = np.where(bench.reference.good, bench.reference.image, np.nan)[part]
-    pixels = bench.reference.image[part].reshape(1, -1)
-    model = (bench.fit.solve(pixels) @ bench.fit.design.T).reshape(view.shape)
+    image = np.where(operator.reference.good, operator.reference.image, np.nan)[part]
+    pixels = operator.reference.image[part].reshape(1, -1)
+    model = (operator.fit.solve(pixels) @ operator.fit.design.T).reshape(view.shape)
     top = float(np.nanmax(image))
     rest = 100.0 * (image - model) / top
     reach = float(np.nanpercentile(np.abs(rest), 99.8))

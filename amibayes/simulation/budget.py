@@ -20,11 +20,6 @@ from amibayes.simulation.detector import PRESETS, Detector
 from amibayes.simulation.exposure import MAX_INTEGRATIONS
 from amibayes.support.options import PEAK_LIMIT_E
 
-TABLE_1_RATES_E_S = {"F380M": 1999651.0, "F430M": 1279391.0, "F480M": 1137034.0}
-"""Count rates of a G2V star of 6 mag behind the NIRISS mask (Soulain et al. 2020, Table 1)."""
-
-TABLE_1_MAGNITUDE = 6.0
-
 PAPER_TEMPERATURE_K = 5450.0
 """Temperature of the paper's G2V star."""
 
@@ -40,9 +35,6 @@ LONGEST_S = 1e7
 MIGRATION_E = PRESETS["realistic"].migration_threshold_e
 """Charge above which new electrons start to go to the neighbours."""
 
-
-PAPER_HOLE_M = 0.82
-"""Flat to flat of the paper's holes; they were built 0.80 m wide."""
 
 PAPER_FRAME_S = 0.0745
 """Frame time behind Table 1."""
@@ -267,10 +259,13 @@ def integrations_for(photons: float, rate: float, n_groups: int, frame_time_s: f
     return round(photons / (rate * n_groups * frame_time_s)) + 1
 
 
-def table_1_rate(filter: str, magnitude: float) -> float | None:
-    """Electrons per second of a G2V star behind the NIRISS mask; None for other filters."""
-    rate = TABLE_1_RATES_E_S.get(filter)
-    return None if rate is None else rate * 10.0 ** (-0.4 * (magnitude - TABLE_1_MAGNITUDE))
+def published_rate(instrument: Instrument, magnitude: float) -> float | None:
+    """Electrons per second of a G2V star; None where the instrument's file has none."""
+    known = instrument.planning
+    if known is None or instrument.bandpass.name not in known.rates_e_s:
+        return None
+    fainter = magnitude - known.magnitude
+    return known.rates_e_s[instrument.bandpass.name] * float(10.0 ** (-0.4 * fainter))
 
 
 def _rate(instrument: Instrument, magnitude: float | None, rate: float | None) -> float:
@@ -281,8 +276,8 @@ def _rate(instrument: Instrument, magnitude: float | None, rate: float | None) -
     assert magnitude is not None
     if not -30.0 < magnitude < 40.0:
         raise UsageError(f"a magnitude of {magnitude:g} is not one of a star")
-    known = table_1_rate(instrument.bandpass.name, magnitude)
-    if instrument.name == "NIRISS" and known is not None:
+    known = published_rate(instrument, magnitude)
+    if known is not None:
         return known
     return instrument.count_rate(sun_like(instrument.bandpass), magnitude)
 
@@ -307,7 +302,8 @@ def peak_fractions(instrument: Instrument) -> Peaks:
         float(psf(instrument, channels, 4, centre_px=(offset, offset)).max())
         for offset in (0.5, 0.0)
     )
-    scale = (PAPER_HOLE_M / instrument.mask.size_m) ** 2 if instrument.name == "NIRISS" else 1.0
+    known = instrument.planning
+    scale = 1.0 if known is None else (known.hole_m / instrument.mask.size_m) ** 2
     # the top of |Σ_k A_k|² / (λ² Σ_k A_k)
     top = instrument.mask.area_m2 * scale / instrument.bandpass.pivot_m**2
     return Peaks(top * instrument.pixel_scale_rad**2, middle, corner)

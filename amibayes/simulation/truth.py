@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from amibayes.simulation.exposure import Pointings
     from amibayes.simulation.observe import Observation
 
-V3I_YANG_DEG = 0.56987018
-"""Angle from V3 to the y axis of the NIRISS images (JWST's aperture file)."""
-
 
 def exposure_header(
     observation: Observation, pointings: Pointings, rate_e_s: float
@@ -45,17 +42,10 @@ def _telescope(observation: Observation) -> dict[str, Any]:
         "ORIGIN": f"amibayes {__version__}",
         "TARGPROP": observation.scene.name,
     }
-    if instrument.name == "NIRISS":
-        header |= {
-            "TELESCOP": "JWST",
-            "DETECTOR": "NIS",
-            "PUPIL": "NRM",
-            "EXP_TYPE": "NIS_AMI",
-            "READPATT": "NISRAPID",
-            "SUBARRAY": "SUB80" if exposure.n_pixels == 80 else "CUSTOM",
-            "V3I_YANG": V3I_YANG_DEG,
-        }
-    return header
+    if instrument.header.simulated:
+        usual = exposure.n_pixels == instrument.n_pixels
+        header["SUBARRAY"] = f"SUB{instrument.n_pixels}" if usual else "CUSTOM"
+    return header | dict(instrument.header.simulated)
 
 
 def _times(observation: Observation) -> dict[str, Any]:

@@ -119,6 +119,20 @@ class Section:
             raise self.fault(key, "holds a number that is not finite")
         return array
 
+    def scalars(self) -> dict[str, str | float]:
+        """Return all keys of a table of texts and numbers.
+
+        Raises
+        ------
+        DataError
+            Where one is something else.
+        """
+        found: dict[str, str | float] = {}
+        for key in self._values:
+            value = self._get(key, _MISSING)
+            found[key] = self.text(key) if isinstance(value, str) else self.number(key)
+        return found
+
     def section(self, key: str) -> Section:
         """Return the table called ``key``."""
         value = self._get(key, _MISSING)

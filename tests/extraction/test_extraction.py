@@ -16,16 +16,16 @@ from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.companion_search.search import search
 from amibayes.cube import Cube, cube_stream, read_cube, write_cube
+from amibayes.cube.source import InMemoryCube
 from amibayes.data.observables import Observables
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
-from amibayes.extraction.bench import make_bench
 from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import FringeModel, fringe_fit
-from amibayes.extraction.per_integration import integrations, series
-from amibayes.extraction.source import InMemoryCube
+from amibayes.extraction.preparation import make_operator
+from amibayes.extraction.table import integrations, series
 from amibayes.extraction.view import View
 from amibayes.instrument import Instrument, load_instrument
 from amibayes.likelihood.likelihood import Likelihood
@@ -203,7 +203,7 @@ def test_independent_psf(niriss: Instrument) -> None:
 
 def geometry_of(cube: Cube, method: str = "fringes") -> tuple[Geometry, FloatArray]:
     found = extract_all(cube, ExtractOptions(method=method))[0]  # type: ignore[arg-type]
-    return found.benches[0].geometry, found.average.vis2
+    return found.operators[0].geometry, found.average.vis2
 
 
 @pytest.mark.parametrize(
@@ -281,11 +281,11 @@ def test_errors_of_the_geometry_are_those_of_repeated_measurements(niriss: Instr
     found = []
     for seed in range(30):
         cube = cube_of(with_photons(np.stack([image] * 4), 100 + seed), niriss)
-        bench = make_bench(InMemoryCube(cube), ExtractOptions(geometry="stated"))
+        operator = make_operator(InMemoryCube(cube), ExtractOptions(geometry="stated"))
         variance = np.pi / 2.0 / 4.0 * (np.maximum(image, 0.0) + 10.0)
-        basis = bench.view.basis()
+        basis = operator.view.basis()
         fit = fringe_fit(FringeModel.of(basis), variance, np.ones(image.shape, dtype=bool))
-        solved = solve_geometry(bench.view, bench.reference.image, fit, basis)
+        solved = solve_geometry(operator.view, operator.reference.image, fit, basis)
         assert solved is not None
         found.append((solved.value - [0.002, 0.0]) / solved.error)
     off = np.array(found)
@@ -314,7 +314,7 @@ def test_bad_pixels_leave_the_rest_alone(niriss: Instrument) -> None:
     first, second = (
         extract_all(replace(cube_of(clean, niriss), images=images))[0] for images in (clean, dirty)
     )
-    assert second.benches[0].reference.n_bad == 2
+    assert second.operators[0].reference.n_bad == 2
     assert second.frames.used.all()
     change = (second.observables.data - first.observables.data) / np.sqrt(
         first.observables.covariance.variance
@@ -551,7 +551,7 @@ def test_star_is_told_from_the_middle_of_the_image_as_given(
     write_cube(path, cube_of(frame, niriss))
     assert main(["extract", str(path), "--out", str(tmp_path / "out")]) == 0
     entry = json.loads((tmp_path / "out" / "extract.json").read_text())["extractions"][0]
-    assert max(extract_all(path)[0].benches[0].view.shape) < 120
+    assert max(extract_all(path)[0].operators[0].view.shape) < 120
     expected = np.array([12.0, -9.0]) + jittered(3, 33).mean(axis=0)
     assert entry["centre_px"][0] == pytest.approx(list(expected), abs=0.1)
     x, y = entry["centre_px"][0]

@@ -7,7 +7,6 @@ import pytest
 from conftest import script
 
 from amibayes.extraction.fourier.sampling import OneEach
-from amibayes.extraction.low_flux import expected_covariance
 from amibayes.instrument import load_instrument
 
 faint = script("extraction_faint")
@@ -27,7 +26,7 @@ def test_independent_fringes_have_the_closed_form(relative: float) -> None:
     samples = np.exp(2j * np.pi * rng.random(21))
     variance = np.full(43, relative / 2.0)
     variance[0] = 0.0
-    found = expected_covariance(bare_sampling(), 1.0, samples, variance, np.zeros(43))
+    found = bare_sampling().expected_covariance(1.0, samples, variance, np.zeros(43))
     variances = np.diag(found)
     np.testing.assert_allclose(variances[:21], 2.0 * relative + relative**2, rtol=1e-12)
     np.testing.assert_allclose(variances[21:], 0.5 * ((1.0 + relative) ** 3 - 1.0), rtol=1e-12)

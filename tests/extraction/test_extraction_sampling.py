@@ -10,7 +10,6 @@ import pytest
 from amibayes.cube import Cube
 from amibayes.extraction import METHODS, ExtractOptions, extract_all
 from amibayes.extraction.fourier.splodges import Splodges
-from amibayes.extraction.low_flux import expected_covariance
 from amibayes.extraction.view import View
 from amibayes.instrument import load_instrument
 from amibayes.optics import psf
@@ -124,7 +123,7 @@ def test_expected_covariance_is_that_of_slopes_and_of_squares(splodges: Splodges
     numeric = (observables(image + step) - observables(image - step)).T / 2e-3
     np.testing.assert_allclose(slopes[:, pixels], numeric, atol=1e-6 * np.abs(numeric).max())
 
-    second = expected_covariance(splodges, float(flux), samples, variance, variance)
+    second = splodges.expected_covariance(float(flux), samples, variance, variance)
     second = (second - (slopes * variance) @ slopes.T)[:N, :N]
     operator = plain_operator(splodges).reshape(image.size, -1)
     numbers = np.column_stack([splodges.linear[:, 0], operator.real, operator.imag])

@@ -101,13 +101,13 @@ def observed(photons: float, seed: int, method: str, flat_error: float = 0.0) ->
 
 def bound(extraction: Extraction, cube: Cube) -> FloatArray:
     """Cramér–Rao bound (56,) of one integration: the fit whose weights are the true variances."""
-    bench = extraction.benches[0]
+    operator = extraction.operators[0]
     assert cube.error is not None
     variance = np.mean(np.asarray(cube.error, dtype=float) ** 2, axis=0).ravel()
-    design = bench.fit.design
+    design = operator.fit.design
     numbers = np.linalg.inv(design.T @ (design / variance[:, None]))[:-1, :-1]
     flux = float(extraction.frames.flux.mean())
-    fit = fringe_sampling(bench.fit, bench.view)
+    fit = fringe_sampling(operator.fit, operator.view)
     jacobian = fit.jacobian(flux, np.full(21, flux, dtype=complex))
     return np.asarray(np.sqrt(np.diag(jacobian @ numbers @ jacobian.T)))
 
@@ -197,7 +197,7 @@ def test_bright_companions_are_not_biased(
     target, calibrator = (
         quiet(Scene(parts)) for parts in ((Point(), Point(contrast, *companion)), (Point(),))
     )
-    assert target.benches[0].geometry.stated
+    assert target.operators[0].geometry.stated
     data = calibrate(target.observables, [calibrator.observables]).observables
     modes = search(Likelihood(data), (separation - 50.0, separation + 50.0)).modes
     # The mask's lattice has aliases that fit nearly as well.

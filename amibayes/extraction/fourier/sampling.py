@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.extraction.fourier.low_flux import observable_covariance, signs
 from amibayes.instrument import Mask
 from amibayes.units import ComplexArray, FloatArray, IntArray, SingleArray
 
@@ -54,8 +55,33 @@ class Sampling(Protocol):
     def centred(self, samples: ComplexArray, shift_px: FloatArray) -> ComplexArray:
         """Sum (n_samples,) over images, the star of each moved back by shifts (n, 2)."""
 
+    @property
+    def determines_model(self) -> bool:
+        """Whether `linear` determines every coefficient of the fringe model."""
+
     def bias(self, variance: FloatArray) -> tuple[float, FloatArray]:
         """What noise of independent pixels (n_pixels,) adds to flux² and to the power."""
+
+    def expected_covariance(
+        self, flux: float, samples: ComplexArray, variance: FloatArray, skewness: FloatArray
+    ) -> FloatArray:
+        """Covariance of V² and closure phase of one integration.
+
+        The covariance of (power − V²·flux²)/flux² and of Im(bispectrum/mean bispectrum), which
+        is what the errors of mean power and mean bispectrum rest on.
+
+        Parameters
+        ----------
+        flux : float
+        samples : (n_samples,) complex array
+            Their expectations.
+        variance, skewness : (n_pixels,) array
+            Second and third cumulant of the noise of independent pixels.
+
+        Returns
+        -------
+        (n_baselines + n_triangles, n_baselines + n_triangles) array
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +116,11 @@ class OneEach:
     def n_samples(self) -> int:
         """How many complex samples."""
         return len(self.frequency_px)
+
+    @property
+    def determines_model(self) -> bool:
+        """Flux, a real and an imaginary part per baseline, background: as many as it has."""
+        return True
 
     def completed(self, numbers: FloatArray, pixels: PixelArray) -> tuple[FloatArray, ComplexArray]:
         """Flux and samples out of the numbers alone."""
@@ -133,6 +164,13 @@ class OneEach:
         n, diagonal = self.n_samples, variance @ self.matrix**2
         return float(diagonal[0]), diagonal[1 : 1 + n] + diagonal[1 + n :]
 
+    def expected_covariance(
+        self, flux: float, samples: ComplexArray, variance: FloatArray, skewness: FloatArray
+    ) -> FloatArray:
+        """All orders that matter of a faint star; see `low_flux.observable_covariance`."""
+        # In units of the flux, so that single precision holds it.
+        return observable_covariance(self, samples / flux, variance / flux**2, skewness / flux**3)
+
     def shares(self, flux: float, samples: ComplexArray) -> FloatArray:
         """V² as a sum of squares of the numbers: their shares (n_baselines, n_numbers)."""
         each = np.eye(self.n_samples) / flux**2
@@ -164,10 +202,3 @@ def split(numbers: PixelArray) -> tuple[FloatArray, ComplexArray]:
     """Flux and samples out of real numbers (n, 1 + 2·n_samples), or more of which are ignored."""
     n, wide = (numbers.shape[1] - 1) // 2, np.asarray(numbers, dtype=float)
     return wide[:, 0], wide[:, 1 : 1 + n] + 1j * wide[:, 1 + n : 1 + 2 * n]
-
-
-def signs(triangles: IntArray, n_baselines: int) -> FloatArray:
-    """Closure phases (n_triangles, n_baselines) as sums of the baselines' phases."""
-    out = np.zeros((len(triangles), n_baselines))
-    np.put_along_axis(out, triangles, np.array([[1.0, 1.0, -1.0]]), axis=1)
-    return out

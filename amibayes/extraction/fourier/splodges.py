@@ -166,6 +166,21 @@ class Splodges:
         extra = (np.abs(self._factor) ** 2 * each).sum(axis=(1, 2))
         return float(variance @ flux**2), np.asarray(extra)
 
+    @property
+    def determines_model(self) -> bool:
+        """No: flux and background alone are linear in the image before the transform."""
+        return False
+
+    def expected_covariance(
+        self, flux: float, samples: ComplexArray, variance: FloatArray, skewness: FloatArray
+    ) -> FloatArray:
+        """First order of both observables, and second order of V²."""
+        slopes = self.slopes(flux, samples) * np.sqrt(variance)
+        total = slopes @ slopes.T
+        second = self.squares(flux, samples, variance)
+        total[: len(second), : len(second)] += second
+        return np.asarray(total)
+
     def slopes(self, flux: float, samples: ComplexArray) -> FloatArray:
         """Derivatives (n_baselines + n_triangles, n_pixels) of V² and closure phase."""
         power = self.power(samples[None])[0]

@@ -70,7 +70,7 @@ def _brightness(own: ComplexArray) -> FloatArray:
     """Share (k, k) of the splodge at every cell: 0 outside it, 1 well inside.
 
     It is the same for all baselines, and rises evenly towards the middle: what a target
-    and its calibrator are sampled with does not hang on a cell that just is or is not
+    and its calibrator are sampled with does not depend on a cell that just is or is not
     bright enough.
     """
     mean = np.abs(own).mean(axis=0)

@@ -1,15 +1,15 @@
-"""What all integrations of a cube go through, prepared by one look at it."""
+"""What all integrations of a cube go through, prepared once."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
+from amibayes.cube.source import Source
 from amibayes.errors import DataError
 from amibayes.extraction.cleaning import Reference, median_and_scatter, reference_of
 from amibayes.extraction.fourier.sampling import split
 from amibayes.extraction.fourier.transform import fourier_sampling
-from amibayes.extraction.frames import ExtractionOperator
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
     FringeFit,
@@ -25,13 +25,13 @@ from amibayes.extraction.noise import (
     noise_model,
     scatter_about_pointing,
 )
+from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.source import Source
 from amibayes.extraction.view import View, look_at
 from amibayes.optics import FringeBasis
 from amibayes.units import BoolArray, FloatArray, SingleArray
 
-MAX_LEFT = 0.25
+MAX_RESIDUAL = 0.25
 """An image whose fit leaves a larger share of it, rms, was made by another mask or filter."""
 
 SMOOTH_SHARE, SMOOTH_FLOOR = 0.98, 0.003
@@ -41,8 +41,8 @@ JITTER_SLACK = 0.01
 """Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
 
-def make_bench(file: Source, options: ExtractOptions) -> ExtractionOperator:
-    """Look at a cube once, and prepare all that its integrations go through."""
+def make_operator(file: Source, options: ExtractOptions) -> ExtractionOperator:
+    """Prepare all that the integrations of a cube go through."""
     template = file.template
     reference = reference_of(file)
     view = look_at(reference.image, template, options)
@@ -70,12 +70,12 @@ def make_bench(file: Source, options: ExtractOptions) -> ExtractionOperator:
 def _fit_of_median(view: View, even: FringeFit, reference: Reference) -> FringeFit:
     """Fit of the median image with its own weights, out of one with ``even`` weights."""
     image, good = reference.image[view.part], reference.good[view.part]
-    left = image - (even.design @ even.solve(image.reshape(1, -1))[0]).reshape(view.shape)
+    residual = image - (even.design @ even.solve(image.reshape(1, -1))[0]).reshape(view.shape)
     noise = cropped(reference.noise, view.part)
     if not reference.has_errors and len(reference.sample) < 3:
-        noise = noise_model(image, left**2, good)
+        noise = noise_model(image, residual**2, good)
     variance = noise.variance * (np.pi / 2.0 / len(reference.sample))  # of a median
-    return fringe_fit(even.model, variance + misfit_level(left, variance, good), good)
+    return fringe_fit(even.model, variance + misfit_level(residual, variance, good), good)
 
 
 def _fit_variance(
@@ -84,11 +84,11 @@ def _fit_variance(
     """Variance that the fit's weights are made of: that of a single star of the same light.
 
     The image's own fringes have no part in it. Light off the axis is let through in a way
-    that hangs on the weights; were those of a binary to follow its fringes, and those of its
+    that depends on the weights; were those of a binary to follow its fringes, and those of its
     calibrator another pattern, a contrast of 0.4 would come out half a percent too small.
     All but a fiftieth of it is the envelope's: weights that follow the fringes have up to a
     tenth less noise, but let a companion's light through as the fringes of other baselines
-    too, by some percent that hang on where in a pixel the star stands.
+    too, by some percent that depend on where in a pixel the star stands.
     """
     envelope, star = (a.reshape(image.shape) for a in (basis.matrix[:, 0], basis.image()))
     light = float(image[good].sum() / max(float(envelope[good].sum()), 1e-300))
@@ -150,9 +150,9 @@ def _refuse_another(
         Where the fit leaves too much of the light.
     """
     expected = float(noise.variance[good].sum()) / len(reference.sample)
-    left = float((residual[good] ** 2).sum()) - expected
-    share = np.sqrt(max(left, 0.0) / max(float((image[good] ** 2).sum()), 1e-300))
-    if share > MAX_LEFT:
+    excess = float((residual[good] ** 2).sum()) - expected
+    share = np.sqrt(max(excess, 0.0) / max(float((image[good] ** 2).sum()), 1e-300))
+    if share > MAX_RESIDUAL:
         raise DataError(
             f"the fringes of this mask and filter leave {100.0 * share:.0f} % of the image",
             source=reference.source,

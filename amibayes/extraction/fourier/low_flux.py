@@ -14,57 +14,24 @@ second order, by as much as the second order itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amibayes.extraction.fourier.sampling import OneEach, Sampling, signs
-from amibayes.extraction.fourier.splodges import Splodges
-from amibayes.units import ComplexArray, FloatArray
+from amibayes.units import ComplexArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from amibayes.extraction.fourier.sampling import OneEach
 
 
-def expected_covariance(
-    sampling: Sampling,
-    flux: float,
-    samples: ComplexArray,
-    variance: FloatArray,
-    skewness: FloatArray,
-) -> FloatArray:
-    """Covariance of V² and closure phase of one integration.
-
-    The covariance of (power − V²·flux²)/flux² and of Im(bispectrum/mean bispectrum), which
-    is what the errors of mean power and mean bispectrum rest on. Exact for Gaussian noise of
-    methods with one sample per baseline, and for photons up to the second power of 1/flux; for
-    closure phases of the other methods to first order.
-
-    Parameters
-    ----------
-    sampling : Sampling
-    flux : float
-    samples : (n_samples,) complex array
-        Their expectations.
-    variance : (n_pixels,) array
-        Of independent pixels.
-    skewness : (n_pixels,) array
-        Third cumulant of their noise.
-
-    Returns
-    -------
-    (n_baselines + n_triangles, n_baselines + n_triangles) array
-    """
-    if isinstance(sampling, OneEach):  # in units of the flux, so that single precision holds it
-        relative = samples / flux, variance / flux**2, skewness / flux**3
-        return _of_one_each(sampling, *relative)
-    assert isinstance(sampling, Splodges)
-    slopes = sampling.slopes(flux, samples) * np.sqrt(variance)
-    total = slopes @ slopes.T
-    second = sampling.squares(flux, samples, variance)
-    total[: len(second), : len(second)] += second
-    return np.asarray(total)
-
-
-def _of_one_each(
+def observable_covariance(
     sampling: OneEach, samples: ComplexArray, variance: FloatArray, third: FloatArray
 ) -> FloatArray:
+    """Covariance of V² and closure phase of one sample per baseline, fluxes in units of one.
+
+    Exact for Gaussian noise, and for photons up to the second power of 1/flux. The arguments
+    are those of `Sampling.expected_covariance`, of a star of unit flux.
+    """
     noise = sampling.covariance(variance)
     share, slope = sampling.shares(1.0, samples), sampling.jacobian(1.0, samples)
     legs = _Legs.of(sampling, samples, noise)
@@ -79,6 +46,13 @@ def _of_one_each(
     total[n:, n:] += legs.second_order() + legs.third_order()
     scale = np.concatenate([np.ones(n), 1.0 / np.abs(legs.mean())])
     return np.asarray(scale[:, None] * total * scale)
+
+
+def signs(triangles: IntArray, n_baselines: int) -> FloatArray:
+    """Closure phases (n_triangles, n_baselines) as sums of the baselines' phases."""
+    out = np.zeros((len(triangles), n_baselines))
+    np.put_along_axis(out, triangles, np.array([[1.0, 1.0, -1.0]]), axis=1)
+    return out
 
 
 def _curved(
