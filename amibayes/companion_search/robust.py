@@ -9,9 +9,11 @@ import numpy as np
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolution_mas, search
-from amibayes.errors import UsageError
-from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.data.observables import Observables
+from amibayes.likelihood.combinations import combination_of, require
+from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, mean_of_files
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.residuals import files_of, groups_of
 from amibayes.likelihood.student import (
     DEGREES,
     Robustness,
@@ -25,10 +27,10 @@ from amibayes.likelihood.student import (
 )
 from amibayes.likelihood.student_noise import StudentTerm, student_terms
 from amibayes.models.parameters import Box
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 MAX_SEARCHES, MAX_STEPS = 3, 30
-SETTLED = 0.01
+CONVERGED = 0.01
 
 
 def search_robust(
@@ -36,6 +38,7 @@ def search_robust(
     separation_mas: tuple[float, float] | None = None,
     *,
     free_scale: bool = True,
+    per_file: bool = False,
 ) -> tuple[SearchResult, ExtraNoise]:
     """Search with residuals of Student's t distribution.
 
@@ -45,6 +48,8 @@ def search_robust(
         As for `amibayes.likelihood.extra_noise.search_with_noise`.
     free_scale : bool
         Fit the scale of the errors of each kind of observable (never below the stated ones).
+    per_file : bool
+        Every file has scales of its own.
 
     Returns
     -------
@@ -60,38 +65,39 @@ def search_robust(
         data and the errors of that covariance, which all data share, cannot be told apart.
     """
     data = likelihood.observables
-    if data.covariance_kind == "estimated" or data.freedom is not None:
-        raise UsageError(
-            "robust residuals need errors that are stated, not estimated from the scatter",
-            source=data.source,
-            remedy="leave --robust out: extraction has left out the integrations that stand off",
-        )
-    work = RobustFits(likelihood, separation_mas, free_scale)
+    require(combination_of(likelihood, residuals="student"), data.source)
+    work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
     plain = search(likelihood, separation_mas)
     alone = single_likelihood(likelihood)
     starts = [
         likelihood.residuals(plain.theta)[:, 0],
         alone.residuals(plain.single_theta)[:, 0],
     ]
-    tried = [work.settle(white) for white in starts]
+    tried = [work.converge(white) for white in starts]
     result, weights, residuals, scale = max(tried, key=lambda t: work.log_prob(t[0].theta))
     stated = likelihood.observables
     base = reweighted(stated, scale)
     robustness = Robustness(base, stated, weights, residuals)
     student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
-    noise = _as_noise(work.frame, stated.covariance.variance, scale)
+    noise = _as_noise(stated, scale, per_file=per_file)
     likelihood = result.likelihood.with_noise(student)
     return replace(result, likelihood=likelihood, robustness=robustness), noise
 
 
-def _as_noise(frame: SymmetricWhitening, variance: FloatArray, scale: FloatArray) -> ExtraNoise:
-    vis2, closure = (
-        float(np.sqrt(np.median(variance[m]) * max(np.median(scale[m]) ** 2 - 1.0, 0.0)))
-        if m.any()
-        else 0.0
-        for m in (frame.vis2, ~frame.vis2)
-    )
-    return ExtraNoise(vis2, closure)
+def _as_noise(stated: Observables, scale: FloatArray, *, per_file: bool) -> ExtraNoise:
+    """Fitted scales (n_data,), in quadrature to the typical error of each kind (and file)."""
+    data = stated.unflagged()
+    added = data.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
+
+    def of(which: BoolArray) -> float:
+        return float(np.sqrt(np.median(added[which]))) if which.any() else 0.0
+
+    parts = files_of(data)
+    vis2 = np.arange(len(scale)) < data.n_vis2
+    if not per_file or len(parts) < 2:
+        return ExtraNoise(of(vis2), of(~vis2))
+    files = [FileNoise(f.source, of(f.of_kind("vis2")), of(f.of_kind("cp"))) for f in parts]
+    return mean_of_files(data, files)
 
 
 class RobustFits:
@@ -102,7 +108,7 @@ class RobustFits:
     likelihood : Likelihood
         With the stated errors.
     separation_mas : (inner, outer), optional
-    free_scale : bool
+    free_scale, per_file : bool
     """
 
     def __init__(
@@ -110,11 +116,17 @@ class RobustFits:
         likelihood: Likelihood,
         separation_mas: tuple[float, float] | None,
         free_scale: bool,
+        *,
+        per_file: bool = False,
     ) -> None:
+        data = likelihood.observables
         self.likelihood, self.field = likelihood, separation_mas
-        self.frame = symmetric_whitening(likelihood.observables)
+        self.symmetric = symmetric_whitening(data)
         self.free_scale = free_scale
-        self.terms: list[StudentTerm] = student_terms(likelihood.observables)
+        self.terms: list[StudentTerm] = student_terms(data, per_file=per_file)
+        parts = groups_of(data, per_file=per_file)
+        kinds = self.symmetric.groups
+        self.groups = [here & kind for _, here in parts for kind in kinds if (here & kind).any()]
 
     def log_prob(self, theta: FloatArray) -> float:
         """The t likelihood at the most likely scale of each kind."""
@@ -123,7 +135,9 @@ class RobustFits:
         each = zip(self.terms, nodes, strict=True)
         return float(sum(t.log_likelihoods(difference, np.array([n]))[0, 0] for t, n in each))
 
-    def settle(self, white: FloatArray) -> tuple[SearchResult, FloatArray, FloatArray, FloatArray]:
+    def converge(
+        self, white: FloatArray
+    ) -> tuple[SearchResult, FloatArray, FloatArray, FloatArray]:
         """Search, and again with new weights until the place holds."""
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):
@@ -133,7 +147,7 @@ class RobustFits:
             stretch, _ = self.steps(result.theta, box)
             moved = np.hypot(*(result.theta[:2] - place))
             place = result.theta[:2]
-            if moved < SETTLED * resolution_mas(self.likelihood):
+            if moved < CONVERGED * resolution_mas(self.likelihood):
                 break
         result = search(self.weighted(stretch), self.field)
         _, weights, residuals, scale = self._stretch(self.likelihood.residuals(result.theta)[:, 0])
@@ -150,18 +164,18 @@ class RobustFits:
             before = stretch
             stretch = self._stretch(self.likelihood.residuals(theta)[:, 0])[0]
             theta = np.array(refine(self.weighted(stretch), theta, box, 0.0).theta)
-            if np.abs(np.log(stretch / before)).max() < SETTLED:
+            if np.abs(np.log(stretch / before)).max() < CONVERGED:
                 break
         return stretch, theta
 
     def _stretch(self, white: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Stretch of the errors, weights, residuals and scales (n_data,) of whitened residuals."""
-        standard = self.frame.residuals(white[:, None])
+        standard = self.symmetric.residuals(white[:, None])
         scale = np.ones(len(standard))
         share = len(self.likelihood.parameters) / self.likelihood.n_independent
-        for group in self.frame.groups if self.free_scale else ():
+        for group in self.groups if self.free_scale else ():
             part = SymmetricWhitening(
-                self.frame.rows[group], self.frame.share[group], self.frame.vis2[group]
+                self.symmetric.rows[group], self.symmetric.share[group], self.symmetric.vis2[group]
             )
             fitted = scales(part, standard[group], share * float(part.share.sum()))
             scale[group] = max(1.0, float(fitted[0]))

@@ -10,10 +10,12 @@ from scipy import optimize
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
+from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.data.covariance import (
     Covariance,
 )
 from amibayes.data.observables import Observables
+from amibayes.likelihood.averaged_noise import averaged_noise
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import (
     MAX_ROUNDS,
@@ -23,9 +25,11 @@ from amibayes.likelihood.extra_noise import (
     FileNoise,
     _with_noise,
     add_noise,
+    mean_of_files,
 )
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.residuals import files_of
+from amibayes.likelihood.student_noise import averaged_student_noise
 from amibayes.units import FloatArray
 
 
@@ -62,12 +66,7 @@ def fit_noise(likelihood: Likelihood, theta: FloatArray, *, per_file: bool = Fal
         )
         for part in parts
     )
-    vis2_mean, closure_mean = (_rms(v) for v in ExtraNoise(files=files).of(data))
-    return ExtraNoise(vis2_mean, closure_mean, files)
-
-
-def _rms(variance: FloatArray) -> float:
-    return float(np.sqrt(variance.mean())) if len(variance) else 0.0
+    return mean_of_files(data, files)
 
 
 def _one_kind(
@@ -157,3 +156,46 @@ def _same(a: ExtraNoise, b: ExtraNoise) -> bool:
         for x, y in zip(a.files, b.files, strict=True):
             pairs += [(x.vis2, y.vis2), (x.closure_phase_rad, y.closure_phase_rad)]
     return all(abs(x - y) <= SETTLED * max(x, y) for x, y in pairs)
+
+
+def noise_averaged(
+    result: SearchResult,
+    two: TwoCompanions | None,
+    stated: Observables,
+    *,
+    extra_noise: bool = True,
+    per_file: bool = False,
+) -> tuple[SearchResult, TwoCompanions | None]:
+    """Give search and second companion a likelihood averaged over the unknown extra noise.
+
+    Parameters
+    ----------
+    result : SearchResult
+    two : TwoCompanions, optional
+    stated : Observables
+        The data that were searched, with the stated errors.
+    extra_noise : bool
+        Without it the stated errors count as right; residuals of a robust search have
+        Student's t distribution all the same.
+    per_file : bool
+        The noise of every file is unknown by itself.
+    """
+    if not extra_noise and result.robustness is None:
+        return result, two
+    profile = result.likelihood
+    fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
+    fits += [(two.likelihood, two.theta)] if two else []
+    if result.robustness is not None:
+        noise = averaged_student_noise(
+            profile.noise,
+            result.robustness.stated,
+            fits,
+            free_scale=extra_noise,
+            per_file=per_file,
+        )
+    else:
+        noise = averaged_noise(profile.noise, stated, fits, per_file=per_file)
+    averaged = profile.with_noise(noise)
+    if two is not None:
+        two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
+    return replace(result, likelihood=averaged), two

@@ -26,7 +26,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise import MAX_EXPONENT, FittedNoise, NoiseModel, deviance, log_peak
 from amibayes.likelihood.quadrature import Marginal
-from amibayes.likelihood.residuals import files_of
+from amibayes.likelihood.residuals import files_of, groups_of
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 MAX_INFLATION = 100.0
@@ -216,7 +216,8 @@ def averaged_noise(
     fits : sequence of (Likelihood, (n_dim,) float array)
         Best fits of every model that will be weighed: nodes cover the noise each asks for.
     per_file : bool
-        The noise of every file is unknown by itself (files must not share errors).
+        The noise of every file is unknown by itself; files that share errors (through their
+        calibrators) are unknown together.
 
     Notes
     -----
@@ -225,12 +226,12 @@ def averaged_noise(
     """
     differences = differences_of(fits)
     data = stated.unflagged()
-    everywhere = np.ones(data.covariance.size, dtype=bool)
-    files = [(f.source, f.of_kind("vis2") | f.of_kind("cp")) for f in files_of(data)]
-    parts = files if per_file and len(files) > 1 else [("", everywhere)]
-    found = [replace(t, source=name) for name, here in parts for t in _terms(data, here)]
-    terms = [with_nodes(t, differences) for t in found]
-    return AveragedNoise(fit, tuple(terms))
+    parts = groups_of(data, per_file=per_file)
+    # Files that share errors have one relative amount: their data cannot be told apart.
+    whole = len(parts) > 1 and files_share_errors(data)
+    parts = [("", np.ones(data.covariance.size, dtype=bool))] if whole else parts
+    found = [_term(data, name, *kind) for name, here in parts for kind in kinds_of(data, here)]
+    return AveragedNoise(fit, tuple(with_nodes(t, differences) for t in found))
 
 
 def differences_of(fits: Sequence[tuple[Likelihood, FloatArray]]) -> list[FloatArray]:
@@ -247,10 +248,6 @@ def files_share_errors(stated: Observables) -> bool:
     for k, file in enumerate(files_of(data)):
         number[file.of_kind("vis2") | file.of_kind("cp")] = k
     return any(len(np.unique(number[b.index])) > 1 for b in as_blocks(data.covariance))
-
-
-def _terms(stated: Observables, here: BoolArray) -> list[NoiseTerm]:
-    return [_term(stated, *parts) for parts in kinds_of(stated, here)]
 
 
 def kinds_of(
@@ -282,7 +279,9 @@ def _separate(stated: Observables, n_vis2: int) -> bool:
     return not any(s.any() and not s.all() for s in sides)
 
 
-def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, float]) -> NoiseTerm:
+def _term(
+    stated: Observables, source: str, kind: str, which: BoolArray, typical: dict[str, float]
+) -> NoiseTerm:
     """Whiten some of the data and make their extra noise diagonal, block by block."""
     n = stated.n_vis2
     part = stated.select(which[:n], which[n:])
@@ -297,7 +296,8 @@ def _term(stated: Observables, kind: str, which: BoolArray, typical: dict[str, f
         shape=(len(columns), len(which)),
     )
     whitening, log_det = csr_array(turn @ white @ place), part.covariance.logdet()
-    return NoiseTerm(kind, whitening, share, typical, log_det, part.degrees_of_freedom)
+    degrees = part.degrees_of_freedom
+    return NoiseTerm(kind, whitening, share, typical, log_det, degrees, source=source)
 
 
 def _amount(typical: dict[str, float]) -> ExtraNoise:

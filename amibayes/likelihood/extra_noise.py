@@ -9,7 +9,7 @@ one with calibration errors of its own then does not spoil the others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,6 +83,15 @@ class ExtraNoise:
                 vis2[part.vis2] = own[part.source].vis2 ** 2
                 closure[part.closure_phase] = own[part.source].closure_phase_rad ** 2
         return vis2, closure
+
+
+def mean_of_files(data: Observables, files: Sequence[FileNoise]) -> ExtraNoise:
+    """Extra noise of files, with its root mean square over all unflagged data of each kind."""
+    vis2, closure = (
+        float(np.sqrt(variance.mean())) if len(variance) else 0.0
+        for variance in ExtraNoise(files=tuple(files)).of(data)
+    )
+    return ExtraNoise(vis2, closure, tuple(files))
 
 
 def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:

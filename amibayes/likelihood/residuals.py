@@ -32,3 +32,14 @@ def files_of(observables: Observables) -> tuple[FileData, ...]:
     vis2, closure = sources[data.vis2.setup], sources[data.closure_phase.setup]
     names = sorted(set(vis2.tolist()) | set(closure.tolist()))
     return tuple(FileData(name, vis2 == name, closure == name) for name in names)
+
+
+def groups_of(observables: Observables, *, per_file: bool) -> list[tuple[str, BoolArray]]:
+    """File and mask (n_data,) of each part of unflagged data that has noise of its own.
+
+    Where files are not told apart, or there is one, a single part without a name.
+    """
+    files = files_of(observables)
+    if not per_file or len(files) < 2:
+        return [("", np.ones(observables.covariance.size, dtype=bool))]
+    return [(f.source, f.of_kind("vis2") | f.of_kind("cp")) for f in files]

@@ -18,6 +18,7 @@ from amibayes.likelihood.averaged_noise import (
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise import LOG_TWO_PI, NoiseModel
+from amibayes.likelihood.residuals import groups_of
 from amibayes.likelihood.student import DEGREES, normal_moments, symmetric_whitening
 from amibayes.units import FloatArray
 
@@ -44,17 +45,22 @@ class StudentTerm(NoiseTerm):
         return np.asarray(-power * np.array(slopes) - norm[:, None] - 0.5 * self.log_det)
 
 
-def student_terms(stated: Observables) -> list[StudentTerm]:
-    """One term for each kind of observable, or one where the file correlates them."""
+def student_terms(stated: Observables, *, per_file: bool = False) -> list[StudentTerm]:
+    """One term for each kind of observable (and file), or one where the data correlate kinds.
+
+    Every datum has a residual of its own, whatever correlates it with others, so that files
+    which share calibrators have scales of their own all the same.
+    """
     data = stated.unflagged()
-    frame = symmetric_whitening(data)
+    symmetric = symmetric_whitening(data)
     white = data.covariance.whitening
     terms = []
-    for kind, which, typical in kinds_of(data):
-        share = frame.share[which]
-        rows = diags_array(1.0 / np.sqrt(share)) @ frame.rows[which] @ white
-        part = data.covariance.select(np.flatnonzero(which))
-        terms.append(StudentTerm(kind, csr_array(rows), share, typical, part.logdet()))
+    for source, here in groups_of(data, per_file=per_file):
+        for kind, which, typical in kinds_of(data, here):
+            share = symmetric.share[which]
+            rows = diags_array(1.0 / np.sqrt(share)) @ symmetric.rows[which] @ white
+            log_det = data.covariance.select(np.flatnonzero(which)).logdet()
+            terms.append(StudentTerm(kind, csr_array(rows), share, typical, log_det, source=source))
     return terms
 
 
@@ -64,6 +70,7 @@ def averaged_student_noise(
     fits: Sequence[tuple[Likelihood, FloatArray]],
     *,
     free_scale: bool = True,
+    per_file: bool = False,
 ) -> AveragedNoise:
     """The t likelihood of residuals, averaged over their scale.
 
@@ -77,8 +84,10 @@ def averaged_student_noise(
         As in `amibayes.likelihood.averaged_noise.averaged_noise`.
     free_scale : bool
         Whether the scale of the errors is unknown; else it is the stated one.
+    per_file : bool
+        Whether every file has a scale of its own.
     """
-    terms: list[NoiseTerm] = list(student_terms(stated))
+    terms: list[NoiseTerm] = list(student_terms(stated, per_file=per_file))
     if free_scale:
         differences = differences_of(fits)
         terms = [with_nodes(t, differences) for t in terms]

@@ -34,6 +34,7 @@ from scipy import special, stats
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.combinations import combination_of, require
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.limits.injection import injected_signal
 from amibayes.limits.rings import Rings, make_rings
@@ -143,7 +144,14 @@ def analytic_limit(
     Returns
     -------
     AnalyticLimit
+
+    Raises
+    ------
+    UsageError
+        Where bands have contrasts of their own, or the companion moves.
     """
+    likelihood = result.likelihood
+    require(combination_of(likelihood, method="closed limits"), likelihood.observables.source)
     rings = make_rings(result, n_separations, separation_mas)
     problem = _Problem.of(result, method, sigmas, remove=remove)
     contrast, sigma = rings.sensitivity(problem.bank, problem.residuals)

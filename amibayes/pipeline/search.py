@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +19,13 @@ from amibayes.companion_search.search import (
     search,
 )
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
-from amibayes.companion_search.with_extra_noise import search_with_noise
+from amibayes.companion_search.with_extra_noise import noise_averaged, search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
-from amibayes.likelihood.averaged_noise import (
-    NoisePosterior,
-    averaged_noise,
-    files_share_errors,
-)
+from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.residuals import files_of
-from amibayes.likelihood.student_noise import averaged_student_noise
 from amibayes.limits.completeness import DetectionLimit, detection_limit
 from amibayes.models.components import BinaryModel
 from amibayes.parallel import Executor, Progress
@@ -127,7 +121,13 @@ class _Run:
         limits = self.limits(result, weight)
         prior = _prior(result, options)
         two, second = self.second(result)
-        averaged, two = noise_averaged(result, two, ready.observables, options)
+        averaged, two = noise_averaged(
+            result,
+            two,
+            ready.observables.only(options.observables),
+            extra_noise=options.extra_noise,
+            per_file=options.file_noise is not False,
+        )
         grid = self.integrated(averaged, prior)
         posterior = self.sampled(averaged, prior, grid)
         evidence = self.compared(averaged, two, prior, grid)
@@ -231,45 +231,6 @@ class _Run:
             )
 
 
-def noise_averaged(
-    result: SearchResult,
-    two: TwoCompanions | None,
-    observables: Observables,
-    options: SearchOptions,
-) -> tuple[SearchResult, TwoCompanions | None]:
-    """Give search and second companion a likelihood averaged over the unknown extra noise.
-
-    Parameters
-    ----------
-    result : SearchResult
-    two : TwoCompanions, optional
-    observables : Observables
-        With the stated errors.
-    options : SearchOptions
-        Without ``extra_noise`` the stated errors are believed, and nothing changes; nor where
-        files that are judged apart share errors: then the noise of the search is taken.
-    """
-    if not (options.extra_noise or options.robust):
-        return result, two
-    profile = result.likelihood
-    fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
-    fits += [(two.likelihood, two.theta)] if two else []
-    stated = observables.only(options.observables)
-    per_file = options.file_noise is not False and len(files_of(stated)) > 1
-    if result.robustness is not None:
-        noise = averaged_student_noise(
-            profile.noise, result.robustness.stated, fits, free_scale=options.extra_noise
-        )
-    elif per_file and files_share_errors(stated):
-        return result, two
-    else:
-        noise = averaged_noise(profile.noise, stated, fits, per_file=per_file)
-    averaged = profile.with_noise(noise)
-    if two is not None:
-        two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
-    return replace(result, likelihood=averaged), two
-
-
 def _noise_posterior(
     averaged: SearchResult, posterior: Posterior | None
 ) -> dict[str, NoisePosterior] | None:
@@ -295,7 +256,9 @@ def search_field(
     field, said = options.separation_mas, []
     for _ in range(MAX_FIELDS):
         if options.robust:
-            result, noise = search_robust(likelihood, field, free_scale=options.extra_noise)
+            result, noise = search_robust(
+                likelihood, field, free_scale=options.extra_noise, per_file=apart
+            )
         elif options.extra_noise:
             result, noise = search_with_noise(likelihood, field, per_file=apart)
         else:

@@ -8,6 +8,7 @@ from pathlib import Path
 import emcee
 import h5py
 
+from amibayes import __version__
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.priors import Prior
@@ -27,12 +28,14 @@ def digest_of(
     *,
     leaps: bool,
 ) -> str:
-    """Say in short which data, model, prior, start, region and moves a chain belongs to."""
-    kind = type(likelihood).__name__
-    text = repr((kind, likelihood.model, prior, seed, leaps, emcee.__version__)).encode()
-    return sha256(
-        text + likelihood.observables.data.tobytes() + start.tobytes() + region.tobytes()
-    ).hexdigest()
+    """Say in short which data, noise, model, prior, start, region and moves a chain belongs to."""
+    noise = likelihood.noise
+    # The noise in numbers: another covariance or average is another chain.
+    kind = (type(noise).__name__, noise.parameters, noise.degrees, noise.log_norm)
+    versions = __version__, emcee.__version__
+    text = repr((kind, likelihood.model, prior, seed, leaps, versions)).encode()
+    arrays = likelihood.observables.data, noise.covariance.variance, start, region
+    return sha256(text + b"".join(a.tobytes() for a in arrays)).hexdigest()
 
 
 def save_chain(sampler: emcee.EnsembleSampler, path: str | Path, digest: str) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from amibayes.errors import DataError
+from amibayes.likelihood.combinations import combination_of, refusal
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.posterior.integrand import Cells, Integrand, Nuisance
@@ -202,8 +203,8 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
 
 
 def integrable(likelihood: Likelihood) -> bool:
-    """Whether the model has one contrast and stands still, as the grid posterior needs it."""
-    return likelihood.model.width == 3
+    """Whether the grid posterior has all of the model's dimensions."""
+    return refusal(combination_of(likelihood, method="grid posterior")) is None
 
 
 def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:

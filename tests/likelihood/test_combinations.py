@@ -1,0 +1,171 @@
+"""Every combination of noise, files, model and companions works or says why not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import product
+
+import numpy as np
+import pytest
+from helpers import NIRISS_HOLES
+
+from amibayes.companion_search.joint_bank import bank_of
+from amibayes.companion_search.robust import RobustFits
+from amibayes.companion_search.template_bank import make_grid
+from amibayes.companion_search.with_extra_noise import fit_noise
+from amibayes.data.covariance import Block, BlockCovariance
+from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.data.observables import Observables, join
+from amibayes.data.point_source import point_source
+from amibayes.errors import UsageError
+from amibayes.likelihood.averaged_noise import averaged_noise
+from amibayes.likelihood.combinations import Combination, combination_of, refusal, require
+from amibayes.likelihood.extra_noise import add_noise
+from amibayes.likelihood.joint import joint_likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.student_noise import averaged_student_noise
+from amibayes.models.parameters import Box
+
+COVARIANCES = ("known", "estimated")
+NOISES = ("stated", "extra", "averaged")
+RESIDUALS = ("gaussian", "student")
+SCOPES = ("common", "per file", "shared calibrators")
+BANKS = ("tied", "per band", "motion")
+COMPANIONS = (1, 2)
+FIELD = (80.0, 200.0)
+TRUTH = np.array([120.0, -60.0, 0.05])
+
+
+@cache
+def data_of(covariance: str, scope: str) -> Observables:
+    """Two files of two bands and dates, errors understated twofold in one of them."""
+    rng = np.random.default_rng(3)
+    parts = []
+    for k, band in enumerate([(4.3e-6, 0.2e-6), (4.8e-6, 0.3e-6)]):
+        sheet = point_source(
+            NIRISS_HOLES[:5],
+            *band,
+            vis2_error=0.005,
+            closure_error_rad=0.005,
+            insname=f"NIRISS{k}",
+            mjd=60000.0 + 200.0 * k,
+        )
+        sheet = replace(sheet, setups=(replace(sheet.setups[0], source=f"{k}.oifits"),))
+        likelihood = Likelihood(sheet)
+        noise = likelihood.noise.draw(1, rng)[:, 0] * (1.0 + k)
+        value = likelihood.predict(TRUTH)[:, 0] + noise
+        vis2, closure = np.split(value, [sheet.n_vis2])
+        parts.append(
+            replace(
+                sheet,
+                vis2=replace(sheet.vis2, value=vis2),
+                closure_phase=replace(sheet.closure_phase, value=closure),
+            )
+        )
+    data = join(parts)
+    if scope == "shared calibrators":
+        data = replace(data, covariance=shared(data))
+    if covariance == "estimated":
+        data = replace(data, covariance_kind="estimated", freedom=Freedom(80.0, 60.0))
+    return data
+
+
+def shared(data: Observables) -> BlockCovariance:
+    """The same, each V² correlated by 0.3 with that of the same baseline in the other file."""
+    blocks = [b for b in data.covariance.blocks if b.index.min() >= data.n_vis2]
+    variance, half = data.covariance.variance, data.n_vis2 // 2
+    for k in range(half):
+        at = np.array([k, k + half])
+        sigma = np.sqrt(variance[at])
+        blocks.append(Block(at, np.outer(sigma, sigma) * np.array([[1.0, 0.3], [0.3, 1.0]])))
+    return BlockCovariance(data.covariance.size, blocks)
+
+
+def likelihood_of(data: Observables, bank: str) -> Likelihood:
+    contrast = "per-filter" if bank == "per band" else "tied"
+    return joint_likelihood(Likelihood(data), contrast=contrast, motion=bank == "motion")
+
+
+def theta_of(likelihood: Likelihood, companions: int = 1) -> np.ndarray:
+    one = likelihood.model.tied(TRUTH[None])[0]
+    other = likelihood.model.tied(np.array([[-100.0, 70.0, 0.01]]))[0]
+    return np.concatenate([one, other][:companions])
+
+
+@pytest.mark.parametrize("bank", BANKS)
+@pytest.mark.parametrize("scope", SCOPES)
+@pytest.mark.parametrize("covariance", COVARIANCES)
+def test_every_combination_works_or_is_refused(covariance, scope, bank) -> None:
+    """Fit the noise, make the bank, search one data set, and evaluate the posterior."""
+    data = data_of(covariance, scope)
+    stated = likelihood_of(data, bank)
+    per_file = scope != "common"
+    for noise, residuals, companions in product(NOISES, RESIDUALS, COMPANIONS):
+        asked = combination_of(stated, residuals=residuals, noise=noise, per_file=per_file)
+        assert asked == Combination(covariance, noise, residuals, scope, bank)
+        asked = replace(asked, companions=companions)
+        if (why := refusal(asked)) is not None:
+            assert (covariance, residuals) == ("estimated", "student")
+            with pytest.raises(UsageError, match=why[0]):
+                require(asked)
+            continue
+        fitted, theta = fit(stated, asked, per_file=per_file)
+        model = replace(stated.model, companions=companions)
+        delivered = fitted.with_model(model)
+        sets = np.array([theta_of(stated, companions)] * 2)
+        sets[1, 0] += 2000.0 / (1.0 + abs(TRUTH[0]))
+        value = delivered.log_prob(sets)
+        assert np.isfinite(value).all()
+        assert value[0] > value[1], asked
+        bank_statistic_is_finite(fitted, theta, companions)
+
+
+@cache
+def profile_of(covariance, scope, bank, residuals, free) -> Likelihood:
+    """The likelihood with the noise fitted at the truth, or with outliers' errors stretched."""
+    stated, per_file = likelihood_of(data_of(covariance, scope), bank), scope != "common"
+    theta = theta_of(stated)
+    if residuals == "student":
+        work = RobustFits(stated, FIELD, free, per_file=per_file)
+        return work.weighted(work.steps(theta, Box(*FIELD, 188.0))[0])
+    if not free:
+        return stated
+    noisy = add_noise(stated.observables, fit_noise(stated, theta, per_file=per_file))
+    return Likelihood(noisy, stated.model)
+
+
+def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
+    """The likelihood that goes with a combination, at the truth."""
+    theta, free = theta_of(stated), asked.noise != "stated"
+    profile = profile_of(asked.covariance, asked.scope, asked.bank, asked.residuals, free)
+    if asked.noise != "averaged":
+        return profile, theta
+    fits = [(profile, theta), (single_likelihood(profile), np.empty(0))]
+    if asked.residuals == "student":
+        noise = averaged_student_noise(profile.noise, stated.observables, fits, per_file=per_file)
+    else:
+        noise = averaged_noise(profile.noise, stated.observables, fits, per_file=per_file)
+    n_files = (
+        2
+        if per_file and not (asked.scope == "shared calibrators" and asked.residuals == "gaussian")
+        else 1
+    )
+    assert len(noise.parameters) == 2 * n_files
+    return profile.with_noise(noise), theta
+
+
+def bank_statistic_is_finite(fitted: Likelihood, theta: np.ndarray, companions: int) -> None:
+    grid = make_grid(100.0, 160.0, 30.0)
+    beside = theta if companions == 2 else None
+    bank = bank_of(fitted, grid, np.empty(0), beside=beside)
+    left = fitted.residuals(theta) if companions == 2 else single_likelihood(fitted).residuals([[]])
+    assert np.isfinite(bank.survey(left[:, 0]).gain).all()
+
+
+@pytest.mark.parametrize("bank", BANKS)
+def test_methods_for_one_contrast_at_rest_refuse_more(bank) -> None:
+    likelihood = likelihood_of(data_of("known", "common"), bank)
+    for method in ("closed limits", "grid posterior"):
+        why = refusal(combination_of(likelihood, method=method))
+        assert (why is None) == (bank == "tied")
