@@ -48,7 +48,7 @@ from .limits.image_injection import (
     measure_star as measure_star,
 )
 from .limits.injection import Recovery as Recovery, recover as recover
-from .models.components import BinaryModel as BinaryModel
+from .models.binary import BinaryModel as BinaryModel
 from .oifits import (
     OIFits as OIFits,
     OITable as OITable,

@@ -28,7 +28,7 @@ from amibayes.companion_search.template_bank import TemplateBank, make_grid
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import null_maxima
 from amibayes.likelihood.likelihood import single_likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 FIELD = (0.7, 50.0)
 POSITIONS = 40_000

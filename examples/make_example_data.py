@@ -22,7 +22,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.instrument import load_instrument
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.oifits import write_oifits
 from amibayes.units import DEGREE, FloatArray, delta_mag_to_contrast, offset
 

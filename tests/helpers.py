@@ -10,7 +10,7 @@ import pytest
 from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 NIRISS_HOLES = np.array(
     [

@@ -31,7 +31,7 @@ def bank_of(
     likelihood: Likelihood, grid: Grid, nuisance: FloatArray, *, beside: FloatArray | None = None
 ) -> TemplateBank:
     """Make the template bank of a likelihood's model of one companion; see `TemplateBank`."""
-    joint = likelihood.model.width > 3
+    joint = likelihood.model.n_contrasts > 1 or likelihood.model.moves
     return (JointBank if joint else TemplateBank)(likelihood, grid, nuisance, beside=beside)
 
 
@@ -67,6 +67,8 @@ class JointBank(TemplateBank):
     -----
     `scan` and `templates_at` are those of a companion at rest, alike in every band.
     """
+
+    joint = True
 
     def __init__(
         self,

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import nlopt
 import numpy as np
 
-from amibayes.companion_search.result import Mode
+from amibayes.companion_search.result import Mode, mode_of
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.models.parameters import MAX_CONTRAST, Box, nuisance_bounds
-from amibayes.units import FloatArray
+from amibayes.models.parameters import Box
+from amibayes.units import FloatArray, IntArray
 
 Objective = Callable[[FloatArray, FloatArray], float]
 
@@ -38,9 +38,7 @@ EMPTY = np.empty(0)
 def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
     """Best fit without a companion: its parameters (n_nuisance,) and deviance."""
     without = single_likelihood(likelihood)
-    bounds = np.array(
-        nuisance_bounds(likelihood.parameters, likelihood.samples.frequency.min())
-    ).reshape(-1, 2)
+    bounds = np.array(without.parameters.bounds(without.parameters.nuisance)).reshape(-1, 2)
     if not len(bounds):
         return np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0])
     # A disc has lobes: the fit starts from the best of a ladder of values.
@@ -52,35 +50,30 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
 
 def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: float) -> Mode:
     """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
-    model = likelihood.model
-    n_pairs = model.width * model.companions
-    bounds = np.empty((len(seed), 2))
-    bounds[:n_pairs] = seed[:n_pairs, None] + box.fringe_mas * np.array([-1.0, 1.0])
-    bounds[model.contrast_columns] = 0.0, MAX_CONTRAST
-    bounds[model.rate_columns] = -model.fastest_mas_yr, model.fastest_mas_yr
-    bounds[n_pairs:] = np.array(
-        nuisance_bounds(likelihood.parameters, likelihood.samples.frequency.min())
-    ).reshape(-1, 2)
+    parameters = likelihood.parameters
+    bounds = np.array(parameters.bounds(parameters.columns()))
+    places = parameters.columns("position")
+    bounds[places] = seed[places, None] + box.fringe_mas * np.array([-1.0, 1.0])
     theta, deviance = seed, np.inf
     for _ in range(MAX_ROUNDS):
         scale = _natural_scale(likelihood, theta, box)
-        places = range(0, n_pairs, model.width)
-        limits = [x for k in places for x in _field_limits(seed, box, scale, k)]
+        each = [parameters.place(k + 1) for k in range(parameters.companions)]
+        limits = [x for place in each for x in _field_limits(seed, box, scale, place)]
         before = deviance
         theta, deviance = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
         if deviance > before - SETTLED:
             break
-    return Mode(tuple(float(x) for x in theta), deviance_single - deviance)
+    return mode_of(parameters, theta, deviance_single - deviance)
 
 
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
     """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
     length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
-    model = likelihood.model
+    parameters = likelihood.parameters
     widest = np.full(len(theta), 1.0)
-    widest[: model.width * model.companions] = 0.3 * box.fringe_mas
-    widest[model.contrast_columns] = 0.3
-    widest[model.rate_columns] = 0.5 * model.fastest_mas_yr
+    widest[parameters.columns("position")] = 0.3 * box.fringe_mas
+    widest[parameters.contrasts] = 0.3
+    widest[parameters.rates] = 0.5 * likelihood.model.fastest_mas_yr
     return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
 
 
@@ -113,8 +106,9 @@ def global_check(
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
     seed = np.concatenate([position, best_at(position)[0], single])
-    bright = likelihood.model.contrast_columns
-    seed[bright] = np.clip(seed[bright], 0.0, MAX_CONTRAST)
+    low, high = np.array(likelihood.parameters.bounds(likelihood.parameters.contrasts)).T
+    bright = likelihood.parameters.contrasts
+    seed[bright] = np.clip(seed[bright], low, high)
     return refine(likelihood, seed, box, deviance_single)
 
 
@@ -130,22 +124,26 @@ def _objective(likelihood: Likelihood, scale: FloatArray) -> Objective:
     return deviance
 
 
-def _field_limits(seed: FloatArray, box: Box, scale: FloatArray, at: int) -> list[Objective]:
-    """Constraints ≤ 0 that keep the companion at ``at`` inside the field, if it might leave it."""
-    rho = float(np.hypot(seed[at], seed[at + 1]))
+def _field_limits(
+    seed: FloatArray, box: Box, scale: FloatArray, place: IntArray
+) -> list[Objective]:
+    """Constraints ≤ 0 that keep a companion inside the field, if it might leave it.
+
+    ``place`` are the columns of its position.
+    """
+    rho = float(np.hypot(*seed[place]))
     reach = 1.5 * box.fringe_mas
     limits: list[Objective] = []
     if rho + reach > box.outer_mas:
-        limits.append(_separation_limit(box, scale, at, +1.0, box.outer_mas))
+        limits.append(_separation_limit(box, scale, place, +1.0, box.outer_mas))
     if rho - reach < box.inner_mas:
-        limits.append(_separation_limit(box, scale, at, -1.0, box.inner_mas))
+        limits.append(_separation_limit(box, scale, place, -1.0, box.inner_mas))
     return limits
 
 
 def _separation_limit(
-    box: Box, scale: FloatArray, at: int, sign: float, limit_mas: float
+    box: Box, scale: FloatArray, place: IntArray, sign: float, limit_mas: float
 ) -> Objective:
-    place = slice(at, at + 2)
     squared = (scale[place] / box.fringe_mas) ** 2
 
     def excess(x: FloatArray, gradient: FloatArray) -> float:

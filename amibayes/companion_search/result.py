@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import Robustness, StudentNoise, SymmetricWhitening
+from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import YEAR_DAYS
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import (
@@ -99,11 +101,17 @@ class Mode:
 
     theta: tuple[float, ...]
     delta_chi2: float
+    companions: tuple[Companion, ...]
 
     @property
     def companion(self) -> Companion:
-        """The mode's companion, without errors."""
-        return Companion(*self.theta[:3])
+        """The mode's first companion, without errors."""
+        return self.companions[0]
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """East and north of the first companion, mas."""
+        return self.companion.east_mas, self.companion.north_mas
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,20 +195,21 @@ class SearchResult:
         """Contrast and its 1σ error of every band with its own; empty where all share one."""
         model = self.likelihood.model
         sigma = np.sqrt(np.diag(self.theta_covariance))
-        columns = zip(model.bands, model.contrast_columns, strict=False)
+        columns = zip(model.bands, self.likelihood.parameters.contrasts, strict=False)
         return {band: (float(self.theta[k]), float(sigma[k])) for band, k in columns}
 
     def position_at(self, mjd: float) -> tuple[float, float]:
         """East and north of the companion, mas, predicted for a date."""
-        model, (east, north) = self.likelihood.model, self.theta[:2]
+        model, parameters = self.likelihood.model, self.likelihood.parameters
+        east, north = self.theta[parameters.place()]
         if model.moves:
-            moved = self.theta[model.rate_columns] * (mjd - model.reference_mjd) / YEAR_DAYS
+            moved = self.theta[parameters.rates] * (mjd - model.reference_mjd) / YEAR_DAYS
             east, north = east + moved[0], north + moved[1]
         return float(east), float(north)
 
     def nuisance(self, name: str) -> float:
         """Value of the diameter or background in the best fit, free or fixed."""
-        if name in self.likelihood.parameters:
+        if name in self.likelihood.parameters.names:
             return float(self.theta[self.likelihood.parameters.index(name)])
         return float(getattr(self.likelihood.model, name))
 
@@ -239,21 +248,42 @@ def null_likelihood(result: SearchResult) -> tuple[Likelihood, SymmetricWhitenin
     return result.likelihood.with_noise(noise), symmetric
 
 
-def companion_of(theta: FloatArray, covariance: FloatArray) -> Companion:
-    """First companion of a parameter vector, its errors carried over from the covariance."""
-    east, north, contrast = (float(x) for x in theta[:3])
+def mode_of(parameters: Parameters, theta: FloatArray, delta_chi2: float) -> Mode:
+    """Make a mode of a parameter vector (n_dim,)."""
+    return Mode(tuple(float(x) for x in theta), delta_chi2, companions_of(parameters, theta))
+
+
+def companions_of(
+    parameters: Parameters, theta: FloatArray, covariance: FloatArray | None = None
+) -> tuple[Companion, ...]:
+    """Companions of a parameter vector, their contrasts those of the reference band.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    theta : (n_dim,) float array
+    covariance : (n_dim, n_dim) float array, optional
+        From which the errors are carried over.
+    """
+    found = []
+    for k in range(1, parameters.companions + 1):
+        columns = np.append(parameters.place(k), parameters.columns("flux", component=k)[0])
+        values = [float(x) for x in theta[columns]]
+        errors = () if covariance is None else _errors(values, covariance[np.ix_(columns, columns)])
+        found.append(Companion(*values, *errors))
+    return tuple(found)
+
+
+def _errors(values: Sequence[float], covariance: FloatArray) -> tuple[float, ...]:
+    """Errors of a `Companion` in its order, from those of east, north, contrast (3, 3)."""
+    east, north, _ = values
     matrix = covariance[:2, :2]
     rho = max(float(np.hypot(east, north)), 1e-300)
     outward = np.array([east, north]) / rho
     around = np.array([north, -east]) / rho**2
-    sigma = np.sqrt(np.diag(covariance)[:3])
-    return Companion(
-        east,
-        north,
-        contrast,
-        float(sigma[0]),
-        float(sigma[1]),
-        float(sigma[2]),
+    sigma = np.sqrt(np.diag(covariance))
+    return (
+        *(float(s) for s in sigma),
         float(np.sqrt(outward @ matrix @ outward)),
         float(np.degrees(np.sqrt(around @ matrix @ around))),
     )

@@ -145,8 +145,8 @@ class RobustFits:
             grid = result.grid
             box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
             stretch, _ = self.steps(result.theta, box)
-            moved = np.hypot(*(result.theta[:2] - place))
-            place = result.theta[:2]
+            here = np.array([result.companion.east_mas, result.companion.north_mas])
+            moved, place = np.hypot(*(here - place)), here
             if moved < CONVERGED * resolution_mas(self.likelihood):
                 break
         result = search(self.weighted(stretch), self.field)

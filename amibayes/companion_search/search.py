@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter
 
 from amibayes.companion_search.joint_bank import bank_of, rates_per_axis
 from amibayes.companion_search.optimise import fit_single, global_check, refine
-from amibayes.companion_search.result import Mode, SearchResult, companion_of
+from amibayes.companion_search.result import Mode, SearchResult, companions_of
 from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.template_bank import Grid, make_grid
 from amibayes.errors import DataError, UsageError
@@ -166,7 +166,7 @@ def search(
     covariance = _errors(likelihood, theta)
     return SearchResult(
         likelihood=likelihood,
-        companion=companion_of(theta, covariance),
+        companion=companions_of(likelihood.parameters, theta, covariance)[0],
         theta=theta,
         theta_covariance=covariance,
         single_theta=single,
@@ -179,7 +179,7 @@ def search(
         bank_sigma=survey.sigma,
         global_check=check,
         warnings=_doubts(modes, aliases, found, check),
-        joint_gain=None if likelihood.model.width == 3 else survey.gain,
+        joint_gain=survey.gain if bank.joint else None,
     )
 
 
@@ -211,7 +211,7 @@ def _grid(likelihood: Likelihood, box: Box) -> Grid:
 
 def _errors(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     """Covariance of the parameters; NaN without a companion, whose errors nothing could tell."""
-    if not (theta[likelihood.model.contrast_columns] > 0.0).any():
+    if not (theta[likelihood.parameters.contrasts] > 0.0).any():
         return np.full((len(theta),) * 2, np.nan)
     return likelihood.errors(theta)
 
@@ -258,7 +258,7 @@ def _thetas(
     """Parameter sets (n, n_dim) of companions at rest, of one contrast in every band."""
     rest = np.broadcast_to(single, (len(at), len(single)))
     three = np.column_stack([grid.east_mas[at], grid.north_mas[at], np.clip(contrast, 0.0, 1.0)])
-    return np.hstack([likelihood.model.tied(three), rest])
+    return np.hstack([likelihood.model.at_rest(three), rest])
 
 
 def _exact_map(
@@ -308,9 +308,7 @@ def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]
     """Modes within `MODE_LIMIT` of the best, each at least λ/4B from a better one."""
     kept: list[Mode] = []
     for mode in sorted(modes, key=lambda m: -m.delta_chi2):
-        near = [
-            np.hypot(*np.subtract(mode.theta[:2], k.theta[:2])) < 0.25 * fringe_mas for k in kept
-        ]
+        near = [np.hypot(*np.subtract(mode.place, k.place)) < 0.25 * fringe_mas for k in kept]
         if not any(near) and (not kept or mode.delta_chi2 > kept[0].delta_chi2 - MODE_LIMIT):
             kept.append(mode)
     return tuple(kept)
@@ -338,7 +336,8 @@ def innermost_first(
     signal = data - likelihood.observables.covariance.whiten(none)
     apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
     alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
-    distance = np.hypot(*(thetas[:, :2] - thetas[0, :2]).T)
+    places = thetas[:, likelihood.parameters.place()]
+    distance = np.hypot(*(places - places[0]).T)
     alike &= distance > resolution_mas(likelihood)
     alike[0] = True
     group = [m for m, same in zip(modes, alike, strict=True) if same]
@@ -358,7 +357,7 @@ def _doubts(
             f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
         )
     if aliases:
-        opposite = [m for m in aliases if np.hypot(*np.add(m.theta[:2], modes[0].theta[:2])) < 1e-2]
+        opposite = [m for m in aliases if np.hypot(*np.add(m.place, modes[0].place)) < 1e-2]
         far = [f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite]
         if opposite:
             doubts.append("without closure phases a position cannot be told from its opposite")

@@ -9,12 +9,12 @@ import numpy as np
 
 from amibayes.companion_search.joint_bank import bank_of
 from amibayes.companion_search.optimise import refine
-from amibayes.companion_search.result import Companion, Mode, SearchResult, companion_of
+from amibayes.companion_search.result import Companion, Mode, SearchResult, companions_of, mode_of
 from amibayes.companion_search.search import MODE_LIMIT, peaks, resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.parameters import Box
+from amibayes.models.parameters import Box, Parameters
 from amibayes.units import FloatArray
 
 FIRST_MODES = 3
@@ -49,14 +49,9 @@ class TwoCompanions:
     modes: tuple[Mode, ...]
 
     @property
-    def companions(self) -> tuple[Companion, Companion]:
+    def companions(self) -> tuple[Companion, ...]:
         """Both, with errors from the inverse Hessian of the joint fit."""
-        second = self.likelihood.model.width + np.arange(3)
-        covariance = self.theta_covariance[np.ix_(second, second)]
-        return (
-            companion_of(self.theta, self.theta_covariance),
-            companion_of(self.theta[second], covariance),
-        )
+        return companions_of(self.likelihood.parameters, self.theta, self.theta_covariance)
 
 
 def search_second(result: SearchResult) -> TwoCompanions:
@@ -85,8 +80,8 @@ def search_second(result: SearchResult) -> TwoCompanions:
     found: list[Mode] = []
     for first in result.modes[:FIRST_MODES]:
         found += _beside(result, bank, two, np.array(first.theta))
-    found = _settled(result, bank, two, found)
-    modes = _distinct(found, 0.25 * resolution_mas(one), one.model.width)
+    found = _iterated(result, bank, two, found)
+    modes = _distinct(found, 0.25 * resolution_mas(one))
     theta = np.array(modes[0].theta)
     return TwoCompanions(two, theta, two.errors(theta), float(two.chi2(theta)[0]), modes)
 
@@ -97,29 +92,31 @@ def _beside(
     """Joint fits from the first companion (n_dim of one) and peaks of what it leaves."""
     fringe = resolution_mas(two)
     survey = bank.survey(result.likelihood.residuals(first)[:, 0])
-    gain, grid, w = survey.gain.copy(), result.grid, two.model.width
+    gain, grid, parameters = survey.gain.copy(), result.grid, result.likelihood.parameters
+    place = first[parameters.place()]
     # What stands at the first companion's own place is its error, not another one.
-    gain[np.hypot(grid.east_mas - first[0], grid.north_mas - first[1]) < 0.25 * fringe] = 0.0
+    gain[np.hypot(grid.east_mas - place[0], grid.north_mas - place[1]) < 0.25 * fringe] = 0.0
     at = peaks(grid, gain, fringe)[:SEEDS]
     second = np.column_stack([grid.east_mas[at], grid.north_mas[at], survey.bounded(at)])
     box = Box(grid.inner_mas, grid.outer_mas, fringe)
     single = float(two.deviance(result.chi2_single))
-    seeds = [np.concatenate([first[:w], place, first[w:]]) for place in second]
-    return [_bright_first(refine(two, s, box, single), w) for s in seeds]
+    one, rest = first[parameters.companion()], first[parameters.nuisance]
+    seeds = [np.concatenate([one, other, rest]) for other in second]
+    return [_bright_first(refine(two, s, box, single), two.parameters) for s in seeds]
 
 
-def _settled(
+def _iterated(
     result: SearchResult, bank: TemplateBank, two: Likelihood, found: list[Mode]
 ) -> list[Mode]:
     """Look for each companion again on what the other one leaves, until nothing is gained."""
-    w = two.model.width
+    columns = two.parameters
     for _ in range(MAX_ROUNDS):
         best = max(found, key=lambda m: m.delta_chi2)
         theta = np.array(best.theta)
         again = [
             mode
-            for kept in (theta[:w], theta[w : 2 * w])
-            for mode in _beside(result, bank, two, np.concatenate([kept, theta[2 * w :]]))
+            for kept in (theta[columns.companion(1)], theta[columns.companion(2)])
+            for mode in _beside(result, bank, two, np.concatenate([kept, theta[columns.nuisance]]))
         ]
         found = found + again
         if max(m.delta_chi2 for m in again) < best.delta_chi2 + 1e-2:
@@ -127,27 +124,25 @@ def _settled(
     return found
 
 
-def _bright_first(mode: Mode, width: int) -> Mode:
-    theta = mode.theta
-    if theta[width + 2] > theta[2]:
-        theta = (*theta[width : 2 * width], *theta[:width], *theta[2 * width :])
-    return Mode(theta, mode.delta_chi2)
+def _bright_first(mode: Mode, parameters: Parameters) -> Mode:
+    first, second = mode.companions
+    if second.contrast <= first.contrast:
+        return mode
+    return mode_of(parameters, np.array(mode.theta)[parameters.swapped], mode.delta_chi2)
 
 
-def _distinct(found: Sequence[Mode], apart_mas: float, width: int) -> tuple[Mode, ...]:
+def _distinct(found: Sequence[Mode], apart_mas: float) -> tuple[Mode, ...]:
     """Solutions of which at least one companion stands elsewhere than in any better one."""
     kept: list[Mode] = []
     for mode in sorted(found, key=lambda m: -m.delta_chi2):
         if kept and mode.delta_chi2 < kept[0].delta_chi2 - MODE_LIMIT:
             break
-        if not any(_alike(mode, other, apart_mas, width) for other in kept):
+        if not any(_alike(mode, other, apart_mas) for other in kept):
             kept.append(mode)
     return tuple(kept)
 
 
-def _alike(mode: Mode, other: Mode, apart_mas: float, width: int) -> bool:
-    a, b = np.array(mode.theta), np.array(other.theta)
-    places = [0, 1, width, width + 1]
-    orders = (b[places], b[[*places[2:], *places[:2]]])
-    moved = [np.abs(a[places] - place).max() for place in orders]
+def _alike(mode: Mode, other: Mode, apart_mas: float) -> bool:
+    places, others = ([(c.east_mas, c.north_mas) for c in m.companions] for m in (mode, other))
+    moved = [np.abs(np.subtract(places, order)).max() for order in (others, others[::-1])]
     return bool(min(moved) < apart_mas)

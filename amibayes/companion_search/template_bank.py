@@ -221,6 +221,9 @@ class TemplateBank:
         self.groups = scale_groups(likelihood.observables, self.n_nuisance)
         self.scale = np.sqrt(self.groups.variances(left))[self.groups.label]
 
+    joint = False
+    """Whether contrasts of bands, or rates, are free."""
+
     def __len__(self) -> int:
         return len(self.grid)
 

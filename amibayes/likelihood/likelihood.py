@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from amibayes.data.observables import Observables
 from amibayes.likelihood.noise import NoiseModel, noise_of
 from amibayes.models.bands import band_numbers
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
+from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import UVPoints, uv_points_of
 from amibayes.units import ComplexArray, FloatArray
 
@@ -58,9 +59,9 @@ class Likelihood:
         self._n2 = len(self.observables.vis2)
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return self.model.parameters
+    def parameters(self) -> Parameters:
+        """The free parameters, with the ranges that the data leave them."""
+        return self.model.parameters.within(float(self.samples.frequency.min(initial=np.inf)))
 
     @property
     def n_independent(self) -> int:
@@ -154,8 +155,9 @@ class Likelihood:
 
     def _sets(self, theta: ArrayLike) -> FloatArray:
         sets = np.atleast_2d(np.asarray(theta, dtype=float))
-        if sets.shape[1] != len(self.parameters):
-            raise ValueError(f"theta needs {len(self.parameters)} columns: {self.parameters}")
+        names = self.model.parameters.names
+        if sets.shape[1] != len(names):
+            raise ValueError(f"theta needs {len(names)} columns: {names}")
         return sets
 
     def _observe(self, visibility: ComplexArray) -> FloatArray:

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import disc
 from amibayes.units import FloatArray, IntArray
 
 DENSE_ENOUGH = 0.15
@@ -38,10 +37,8 @@ def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> tuple[Part,
     With V₀ = D/(1 + f) real, dV/dc = (E − V₀)/(1 + f), hence dV² = 2V₀ Re dV and
     dφ = Im dV / V₀.
     """
-    model = replace(likelihood.model, companions=0)
-    _, diameter, background = model.split(np.atleast_2d(nuisance))
-    scale = 1.0 / (1.0 + float(background[0]))
-    primary = disc(likelihood.samples, diameter)[:, 0] * scale
+    response = likelihood.model.linear_response(likelihood.samples, nuisance)
+    primary, scale = response.star, response.scale
     whitening = likelihood.observables.covariance.whitening
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
@@ -53,6 +50,6 @@ def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> tuple[Part,
 def nuisance_directions(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:
     """Orthonormal directions (n_data, k) in which the nuisance parameters move the data."""
     single = replace(likelihood.model, companions=0)
-    if not single.parameters:
+    if not len(single.parameters):
         return np.empty((likelihood.n_independent, 0))
     return np.asarray(np.linalg.qr(likelihood.with_model(single).jacobian(nuisance))[0])

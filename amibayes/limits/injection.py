@@ -497,7 +497,7 @@ def _between_lattice_points(
 
 def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
     """Whitened change of the data by companions (n, 3) on top of the fit without one."""
-    whole = likelihood.model.tied(theta)
+    whole = likelihood.model.at_rest(theta)
     full = np.hstack([whole, np.broadcast_to(single, (len(theta), len(single)))])
     alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
     change = likelihood.predict(full) - alone

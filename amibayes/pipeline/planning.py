@@ -20,7 +20,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.optics import fringe_basis
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels

@@ -27,7 +27,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.completeness import DetectionLimit, detection_limit
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.parallel import Executor, Progress
 from amibayes.pipeline.false_alarm import second_false_alarm, weigh
 from amibayes.pipeline.options import SearchOptions
@@ -303,7 +303,7 @@ def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
 def _prior(result: SearchResult, options: SearchOptions) -> Prior:
     likelihood = result.likelihood
     prior = default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas)
-    return edit_prior(prior, options.prior, single_likelihood(likelihood).parameters)
+    return edit_prior(prior, options.prior, single_likelihood(likelihood).parameters.names)
 
 
 def _counts(options: SearchOptions) -> tuple[int, ...]:

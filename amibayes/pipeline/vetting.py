@@ -30,7 +30,7 @@ from amibayes.errors import DataError
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.completeness import DetectionLimit, detection_limit
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
 from amibayes.units import BoolArray
 

@@ -153,7 +153,7 @@ def _joint_cautions(result: SearchResult) -> list[str]:
         "Laplace's approximation, one companion's evidence by importance sampling; limits are of "
         "one contrast in every band, at rest"
     ]
-    rates = result.theta[model.rate_columns]
+    rates = result.theta[result.likelihood.parameters.rates]
     if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
         found.append(
             f"the rate stands at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "

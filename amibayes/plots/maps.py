@@ -219,7 +219,7 @@ def _mark(ax: Axes, result: SearchResult) -> None:
         label="best fit",
         **plot,
     )
-    others = np.array([m.theta[:2] for m in result.modes[1:]]).reshape(-1, 2)
+    others = np.array([m.place for m in result.modes[1:]]).reshape(-1, 2)
     if len(others):
         ax.plot(
             *others.T,

@@ -67,7 +67,7 @@ class Region:
     @classmethod
     def of(cls, result: SearchResult) -> Region:
         """Region of the chain of a search's result."""
-        reported, *others = (mode.theta[:2] for mode in result.modes)
+        reported, *others = (mode.place for mode in result.modes)
         if modes_to_sample(result) == result.modes:
             others = []
         least = 0.5 * resolution_mas(result.likelihood)  # nearer ones are of the same position
@@ -110,13 +110,19 @@ class IndependenceProposal:
         low, high = (np.log(self.grid.contrast_edges[cell, box + k]) for k in (0, 1))
         size = nuisance.high[node] - nuisance.low[node]
         further = nuisance.low[node] + random.random_sample(size.shape) * size
-        first = np.stack([rho * np.sin(angle), rho * np.cos(angle), low + up * (high - low)])
-        return np.hstack([first.T, further]), self._log_density(cell, box, node)
+        parameters = self.grid.parameters
+        places = np.empty((n, len(parameters)))
+        places[:, parameters.place()] = np.stack([rho * np.sin(angle), rho * np.cos(angle)]).T
+        places[:, parameters.contrasts[0]] = low + up * (high - low)
+        places[:, parameters.nuisance] = further
+        return places, self._log_density(cell, box, node)
 
     def log_density(self, places: FloatArray) -> FloatArray:
         """Logarithm of q at (n, n_dim) places; −inf where the grid holds nothing."""
         cells, nuisance = self.grid.cells, self.grid.nuisance
-        east, north, ln_contrast = places[:, :3].T
+        parameters = self.grid.parameters
+        east, north = places[:, parameters.place()].T
+        ln_contrast = places[:, parameters.contrasts[0]]
         rho, angle = np.hypot(east, north)[:, None], np.arctan2(east, north)[:, None] % (2 * np.pi)
         across = (cells.first <= angle) & (angle < cells.last)
         in_cell = across & (cells.inner <= rho) & (rho < cells.outer)
@@ -124,7 +130,7 @@ class IndependenceProposal:
         edges = np.log(self.grid.contrast_edges[cell])
         in_box = (edges[:, :-1] <= ln_contrast[:, None]) & (ln_contrast[:, None] < edges[:, 1:])
         box = in_box.argmax(axis=1)
-        value = places[:, None, 3:]
+        value = places[:, None, parameters.nuisance]
         in_node = np.all((nuisance.low <= value) & (value < nuisance.high), axis=2)
         node = in_node.argmax(axis=1)
         inside = np.any(in_cell, axis=1) & np.any(in_box, axis=1) & np.any(in_node, axis=1)
@@ -239,13 +245,12 @@ class Posterior:
 
     def column(self, name: str) -> FloatArray:
         """Samples of a parameter, or of separation_mas, position_angle_deg or delta_mag."""
-        east, north, contrast = self.samples[:, :3].T
         if name == "separation_mas":
-            return separation(east, north)
+            return separation(self.column("east_mas"), self.column("north_mas"))
         if name == "position_angle_deg":
-            return position_angle_deg(east, north)
+            return position_angle_deg(self.column("east_mas"), self.column("north_mas"))
         if name == "delta_mag":
-            return contrast_to_delta_mag(contrast)
+            return contrast_to_delta_mag(self.column("contrast"))
         return self.samples[:, self.names.index(name)]
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
@@ -394,11 +399,14 @@ def _moves(grid: GridPosterior | None, region: Region) -> list[tuple[emcee.moves
 def _log_posterior(
     likelihood: Likelihood, prior: Prior, region: Region
 ) -> Callable[[FloatArray], FloatArray]:
+    parameters = likelihood.parameters
+    place = parameters.place()
+
     def log_posterior(x: FloatArray) -> FloatArray:
-        density = np.where(region.holds(*x[:, :2].T), prior.log_density(x), -np.inf)
+        density = np.where(region.holds(*x[:, place].T), prior.log_density(x), -np.inf)
         inside = np.isfinite(density)
         if inside.any():
-            density[inside] += likelihood.log_prob(physical(x[inside], likelihood.model))
+            density[inside] += likelihood.log_prob(physical(x[inside], parameters))
         return density
 
     return log_posterior
@@ -423,7 +431,7 @@ def mode_probabilities(
 
 def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
     """Posterior probability within λ/2B of each mode; what is missing to 1 is elsewhere."""
-    places = np.array([m.theta[:2] for m in result.modes])
+    places = np.array([m.place for m in result.modes])
     return grid.mass_near(places, 0.5 * resolution_mas(result.likelihood))
 
 
@@ -440,12 +448,13 @@ def _start(
     fits = [gaussian_of(likelihood, np.array(m.theta), prior, START_WIDTH) for m in chosen]
     log_weight = log_masses(likelihood, chosen, prior)
     weight = np.exp(log_weight - log_weight.max())
+    place = likelihood.parameters.place()
     n_dim, n_trials = len(fits[0][0]), 100 * N_WALKERS
     which = rng.choice(len(fits), size=n_trials, p=weight / weight.sum())
     centre = np.array([c for c, _ in fits])[which]
     scatter = np.array([s for _, s in fits])[which]
     trial = centre + np.einsum("nij,nj->ni", scatter, rng.standard_normal((n_trials, n_dim)))
-    inside = trial[np.isfinite(prior.log_density(trial)) & region.holds(*trial[:, :2].T)]
+    inside = trial[np.isfinite(prior.log_density(trial)) & region.holds(*trial[:, place].T)]
     if len(inside) < N_WALKERS:
         raise DataError("the best fit lies outside the prior", source=likelihood.observables.source)
     return np.asarray(inside[:N_WALKERS])
@@ -490,14 +499,14 @@ def _posterior(
     converged: bool,
 ) -> Posterior:
     times = _times(sampler)
-    time, model = _longest(times), result.likelihood.model
+    time, parameters = _longest(times), result.likelihood.parameters
     burn = sampler.iteration // 3
     thin = max(1, int(0.5 * time)) if np.isfinite(time) else 1
     return Posterior(
-        names=result.likelihood.parameters,
-        samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), model),
+        names=parameters.names,
+        samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), parameters),
         log_prob=sampler.get_log_prob(discard=burn, thin=thin, flat=True),
-        chain=physical(sampler.get_chain(), model),
+        chain=physical(sampler.get_chain(), parameters),
         chain_log_prob=sampler.get_log_prob(),
         autocorrelation_time=time,
         n_steps=sampler.iteration,

@@ -27,7 +27,7 @@ from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
 from amibayes.posterior.priors import Prior
 from amibayes.support.options import EvidenceMethod
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import FloatArray
 
 MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
@@ -143,7 +143,7 @@ def compare_models(
     log_z, error, how = zip(*found, strict=True)
     halo = log_evidence_halo(result.likelihood, prior)
     shares = tuple(float(w) for w in weights / weights.sum())
-    names = result.likelihood.parameters[result.likelihood.model.width :]
+    names = single_likelihood(result.likelihood).parameters.names
     return Evidence(tuple(companions), log_z, error, how, prior, shares, halo, two, names)
 
 
@@ -165,7 +165,7 @@ def _weigh(
         if two and companions == 2
         else (result.likelihood)
     )
-    if companions == 0 and (method != "nested" or not none.parameters):
+    if companions == 0 and (method != "nested" or not len(none.parameters)):
         return log_evidence_none(result.likelihood, prior), GRID_ERROR, "quadrature"
     modes = two.modes if two and companions == 2 else result.modes
     if method == "laplace":
@@ -182,7 +182,7 @@ def log_evidence_halo(likelihood: Likelihood, prior: Prior) -> float:
     if likelihood.model.background == "free":
         return float("nan")
     halo = likelihood.with_model(replace(likelihood.model, background="free"))
-    names = [single_likelihood(one).parameters for one in (likelihood, halo)]
+    names = [single_likelihood(one).parameters.names for one in (likelihood, halo)]
     ranges = dict(zip(names[0], prior.nuisance, strict=True))
     ranges["background"] = (0.0, HALO_BACKGROUND)
     return log_evidence_none(halo, replace(prior, nuisance=tuple(ranges[n] for n in names[1])))
@@ -218,11 +218,11 @@ def log_evidence_importance(
     n = int(np.clip(wanted, MIN_DRAWS, MAX_DRAWS))
     counts = [int(share * n)] * len(sources)
     drawn = [s.draw(rng, m) for s, m in zip(sources, counts, strict=True)]
-    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), likelihood.model))
+    drawn.append(sampled(prior.draw(rng, n - sum(counts), k), likelihood.parameters))
     x = np.concatenate(drawn)
     log_prior = prior.log_density(x)
     x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
-    log_f = log_prior + _in_batches(likelihood, physical(x, likelihood.model))
+    log_f = log_prior + _in_batches(likelihood, physical(x, likelihood.parameters))
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)
@@ -236,11 +236,6 @@ def log_evidence_importance(
 def _in_batches(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     pieces = np.array_split(theta, 1 + len(theta) * len(likelihood.samples) // 1_500_000)
     return np.concatenate([likelihood.log_prob(piece) for piece in pieces])
-
-
-def _swapped(width: int, n_dim: int) -> IntArray:
-    """Columns of two companions in the other order."""
-    return np.asarray(np.r_[width : 2 * width, 0:width, 2 * width : n_dim])
 
 
 class _Heavy:
@@ -278,11 +273,12 @@ class _Gaussians:
         self, likelihood: Likelihood, modes: Sequence[Mode], prior: Prior, n_free: int
     ) -> None:
         self.companions = likelihood.model.companions + n_free
-        self.model, self.width = likelihood.model, likelihood.model.width
+        self.one = prior.parameters(1)
+        self.all = prior.parameters(self.companions)
         self.prior, self.n_free = prior, n_free
         fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
         at_peak = [
-            likelihood.log_prob(physical(c[None], likelihood.model))[0]
+            likelihood.log_prob(physical(c[None], likelihood.parameters))[0]
             + np.log(np.abs(np.linalg.det(s)))
             for c, s in fits
         ]
@@ -296,21 +292,24 @@ class _Gaussians:
         x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
         if not self.n_free:
             return x
-        w = self.width
-        free = sampled(self.prior.draw(rng, n, 1), self.model)[:, :w]
-        return np.hstack([x[:, :w], free, x[:, w:]])
+        out = np.empty((n, len(self.all)))
+        free = sampled(self.prior.draw(rng, n, 1), self.one)
+        out[:, self.all.companion(1)] = x[:, self.one.companion()]
+        out[:, self.all.companion(2)] = free[:, self.one.companion()]
+        out[:, self.all.nuisance] = x[:, self.one.nuisance]
+        return out
 
     def log_density(self, x: FloatArray) -> FloatArray:
         if self.companions == 1:
             return self._ordered(x)
-        swapped = x[:, _swapped(self.width, x.shape[1])]
+        swapped = x[:, self.all.swapped]
         return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
 
     def _ordered(self, x: FloatArray) -> FloatArray:
         log = np.zeros(len(x))
         if self.n_free:
             bare = replace(self.prior, nuisance=())
-            free = np.s_[self.width : 2 * self.width]
+            free = self.all.companion(2)
             log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
         parts = [t.log_density(x) for t in self.mixture]
         return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
@@ -336,18 +335,19 @@ def log_evidence_nested(
         raise UsageError(
             "nested sampling needs dynesty", remedy="pip install 'amibayes[evidence]'"
         ) from error
-    k, w = likelihood.model.companions, likelihood.model.width
+    parameters, k_all = likelihood.parameters, likelihood.model.companions
 
     def theta_of(cube: FloatArray) -> FloatArray:
         theta = prior.from_cube(cube[None])[0]
         # Both orders are one solution: the brighter one first, at the same evidence.
-        swap = k == 2 and theta[w + 2] > theta[2]
-        return np.asarray(theta[_swapped(w, len(theta))] if swap else theta)
+        bright = [theta[parameters.columns("flux", component=k + 1)[0]] for k in range(k_all)]
+        swap = k_all == 2 and bright[1] > bright[0]
+        return np.asarray(theta[parameters.swapped] if swap else theta)
 
     sampler = dynesty.NestedSampler(
         lambda theta: float(likelihood.log_prob(theta[None])[0]),
         theta_of,
-        len(likelihood.parameters),
+        len(parameters),
         nlive=live_points,
         sample="rwalk",
         rstate=rng,

@@ -20,6 +20,7 @@ from amibayes.errors import DataError
 from amibayes.likelihood.combinations import combination_of, refusal
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
+from amibayes.models.parameters import Parameters
 from amibayes.posterior.integrand import Cells, Integrand, Nuisance
 from amibayes.posterior.priors import Prior
 from amibayes.units import BoolArray, FloatArray
@@ -67,6 +68,11 @@ class GridPosterior:
     nuisance: Nuisance = field(repr=False)
     nuisance_probability: FloatArray = field(repr=False)
     n_evaluations: int = 0
+
+    @property
+    def parameters(self) -> Parameters:
+        """Parameters of one companion and the nuisance."""
+        return self.prior.parameters(1)
 
     def __repr__(self) -> str:
         return (
@@ -256,7 +262,7 @@ def _finished(work: Integrand, cells: Cells, log_mass: FloatArray) -> GridPoster
     contrast = np.concatenate(shares) / sum(s.sum() for s in shares)
     return GridPosterior(
         work.prior,
-        replace(work.likelihood.model, companions=0).parameters,
+        replace(work.likelihood.model, companions=0).parameters.names,
         log_z,
         work.log_z_none,
         cells,

@@ -249,8 +249,9 @@ class Integrand:
         if not len(self.single):
             return nuisance_nodes(self.prior, np.empty((1, 0)), np.empty((0, 0)))
         best = self._best
-        errors = self.likelihood.errors(best)[3:, 3:]
-        return nuisance_nodes(self.prior, np.array([self.single, best[3:]]), errors)
+        columns = self.likelihood.parameters.nuisance
+        errors = self.likelihood.errors(best)[np.ix_(columns, columns)]
+        return nuisance_nodes(self.prior, np.array([self.single, best[columns]]), errors)
 
     @cached_property
     def _best(self) -> FloatArray:
@@ -275,9 +276,9 @@ class Integrand:
     def _thetas(self, sites: FloatArray, contrast: FloatArray) -> FloatArray:
         n, k = contrast.shape
         theta = np.empty((n, k, sites.shape[1] + 1))
-        theta[:, :, :2] = sites[:, None, :2]
-        theta[:, :, 2] = contrast
-        theta[:, :, 3:] = sites[:, None, 2:]
+        bright = self.likelihood.parameters.contrasts
+        theta[:, :, np.delete(np.arange(theta.shape[2]), bright)] = sites[:, None]
+        theta[:, :, bright[0]] = contrast
         self.n_evaluations += n * k
         return theta.reshape(n * k, -1)
 

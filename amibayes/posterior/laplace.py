@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from amibayes.companion_search.result import Mode
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise import LOG_TWO_PI
-from amibayes.models.components import BinaryModel
+from amibayes.models.parameters import Parameters
 from amibayes.posterior.priors import Prior
 from amibayes.units import FloatArray, IntArray
 
@@ -34,36 +34,35 @@ def log_masses(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> F
 
 def _log_mass(likelihood: Likelihood, theta: FloatArray, prior: Prior) -> float:
     """Mass of one mode's Gaussian, cut off at the ranges of rates and nuisance parameters."""
-    model = likelihood.model
     centre, scatter = gaussian_of(likelihood, theta, prior)
     bounded, ranges = _bounded(likelihood, prior)
     sigma = np.sqrt(np.diag(scatter @ scatter.T))[bounded]
     pull = (ranges - centre[bounded, None]) / sigma[:, None]
     inside = np.prod(stats.norm.cdf(pull[:, 1]) - stats.norm.cdf(pull[:, 0]))
     volume = np.linalg.slogdet(scatter)[1] + 0.5 * len(centre) * LOG_TWO_PI
-    at_peak = likelihood.log_prob(physical(centre[None], model))[0]
-    return float(at_peak + _log_prior(centre, prior) + volume + np.log(inside))
+    parameters = likelihood.parameters
+    at_peak = likelihood.log_prob(physical(centre[None], parameters))[0]
+    return float(at_peak + _log_prior(centre, parameters, prior) + volume + np.log(inside))
 
 
 def _bounded(likelihood: Likelihood, prior: Prior) -> tuple[IntArray, FloatArray]:
     """Columns of rates and nuisance parameters, and their ranges (n, 2)."""
-    model = likelihood.model
-    columns = [*model.rate_columns, *range(model.width * model.companions, len(model.parameters))]
-    rate = prior.fastest_mas_yr
-    ranges = [(-rate, rate)] * len(model.rate_columns) + list(prior.nuisance)
-    return np.array(columns, dtype=np.intp), np.array(ranges).reshape(-1, 2)
+    parameters, rate = likelihood.parameters, prior.fastest_mas_yr
+    columns = np.concatenate([parameters.rates, parameters.nuisance])
+    ranges = [(-rate, rate)] * len(parameters.rates) + list(prior.nuisance)
+    return columns, np.array(ranges).reshape(-1, 2)
 
 
-def _log_prior(centre: FloatArray, prior: Prior) -> float:
+def _log_prior(centre: FloatArray, parameters: Parameters, prior: Prior) -> float:
     """Density of the prior at a mode, which may stand on the edge of the field."""
     density = float(prior.log_density(centre[None])[0])
     if np.isfinite(density):
         return density
     moved = centre.copy()
-    for k in range(0, len(centre) - len(prior.nuisance), prior.width):
-        rho = max(float(np.hypot(*centre[k : k + 2])), 1e-300)
+    for place in (parameters.place(k + 1) for k in range(parameters.companions)):
+        rho = max(float(np.hypot(*centre[place])), 1e-300)
         slack = 1e-6 * (prior.outer_mas - prior.inner_mas)
-        moved[k : k + 2] *= np.clip(rho, prior.inner_mas + slack, prior.outer_mas - slack) / rho
+        moved[place] *= np.clip(rho, prior.inner_mas + slack, prior.outer_mas - slack) / rho
     return float(prior.log_density(moved[None])[0])
 
 
@@ -75,7 +74,7 @@ def gaussian_of(
     Contrasts below their error are moved up to it: there the posterior in ln contrast ends.
     No axis is longer than ``widest`` times the field.
     """
-    bright = likelihood.model.contrast_columns
+    bright = likelihood.parameters.contrasts
     sigma = np.sqrt(np.diag(likelihood.errors(theta)))
     theta = np.array(theta)
     least = np.maximum(np.minimum(sigma[bright], 0.1), 1.01 * prior.contrast_min)
@@ -90,15 +89,15 @@ def gaussian_of(
     return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
 
 
-def physical(x: FloatArray, model: BinaryModel) -> FloatArray:
+def physical(x: FloatArray, parameters: Parameters) -> FloatArray:
     """From the sampled coordinates to the model's."""
     theta = x.copy()
-    theta[..., model.contrast_columns] = np.exp(theta[..., model.contrast_columns])
+    theta[..., parameters.contrasts] = np.exp(theta[..., parameters.contrasts])
     return theta
 
 
-def sampled(theta: FloatArray, model: BinaryModel) -> FloatArray:
+def sampled(theta: FloatArray, parameters: Parameters) -> FloatArray:
     """From the model's coordinates to the sampled ones."""
     x = theta.copy()
-    x[..., model.contrast_columns] = np.log(x[..., model.contrast_columns])
+    x[..., parameters.contrasts] = np.log(x[..., parameters.contrasts])
     return x

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.parameters import nuisance_bounds
+from amibayes.models.companion import companion_parameters
+from amibayes.models.parameters import Parameter, Parameters
 from amibayes.support.options import ContrastForm, PositionForm, choices
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray, offset
@@ -77,10 +79,14 @@ class Prior:
             words += f" ({self.n_contrasts} bands, independently)"
         return words + (", uniform in rate" if self.fastest_mas_yr > 0.0 else "")
 
-    @property
-    def width(self) -> int:
-        """Number of parameters of each companion, as `BinaryModel.width`."""
-        return 2 + self.n_contrasts + 2 * (self.fastest_mas_yr > 0.0)
+    def parameters(self, companions: int) -> Parameters:
+        """Parameters of so many companions and the nuisance, in the order of a vector."""
+        return _parameters(companions, self.n_contrasts, self.fastest_mas_yr, len(self.nuisance))
+
+    def _parameters_of(self, n_dim: int) -> Parameters:
+        """Parameters of vectors of a length."""
+        one = len(self.parameters(1).companion())
+        return self.parameters((n_dim - len(self.nuisance)) // one)
 
     def contrast_cdf(self, contrast: FloatArray) -> FloatArray:
         """Probability of a fainter companion, any shape."""
@@ -105,12 +111,14 @@ class Prior:
 
         Further contrasts (ln) and rates of a companion follow its first contrast.
         """
-        n_pairs = x.shape[1] - len(self.nuisance)
+        parameters = self._parameters_of(x.shape[1])
         density = np.zeros(len(x))
-        for k in range(0, n_pairs, self.width):
-            density = density + self._log_companion(x[:, k : k + 3])
-            density = density + self._log_rest(x[:, k + 3 : k + self.width])
-        for k, (low, high) in enumerate(self.nuisance, start=n_pairs):
+        for k in range(1, parameters.companions + 1):
+            first, *others = parameters.columns("flux", component=k)
+            density = density + self._log_companion(x[:, [*parameters.place(k), first]])
+            density = density + self._log_further(x[:, others])
+            density = density + self._log_rates(x[:, parameters.columns("rate", component=k)])
+        for k, (low, high) in zip(parameters.nuisance, self.nuisance, strict=True):
             inside = (x[:, k] >= low) & (x[:, k] <= high)
             density = np.where(inside, density - np.log(high - low), -np.inf)
         return density
@@ -132,32 +140,37 @@ class Prior:
             return float(-np.log(self._log_range))
         return np.asarray(ln_c - np.log(self.contrast_max - self.contrast_min))
 
-    def _log_rest(self, x: FloatArray) -> FloatArray:
-        """Log-density of further contrasts and of rates, (n, width − 3) → (n,)."""
-        density = np.zeros(len(x))
+    def _log_further(self, ln_contrast: FloatArray) -> FloatArray:
+        """Log-density of the contrasts of further bands, (n, n_contrasts − 1) → (n,)."""
+        density = np.zeros(len(ln_contrast))
         low, high = np.log(self.contrast_min), np.log(self.contrast_max)
-        for k in range(self.n_contrasts - 1):
-            inside = (x[:, k] >= low) & (x[:, k] <= high)
-            density = np.where(inside, density + self._log_bright(x[:, k]), -np.inf)
-        for k in range(self.n_contrasts - 1, self.width - 3):
-            inside = np.abs(x[:, k]) <= self.fastest_mas_yr
+        for column in ln_contrast.T:
+            inside = (column >= low) & (column <= high)
+            density = np.where(inside, density + self._log_bright(column), -np.inf)
+        return density
+
+    def _log_rates(self, rates: FloatArray) -> FloatArray:
+        """Log-density of rates, (n, 2) or (n, 0) → (n,)."""
+        density = np.zeros(len(rates))
+        for column in rates.T:
+            inside = np.abs(column) <= self.fastest_mas_yr
             density = np.where(inside, density - np.log(2.0 * self.fastest_mas_yr), -np.inf)
         return density
 
     def from_cube(self, cube: FloatArray) -> FloatArray:
         """Turn uniform numbers (n, n_dim) into parameter sets with contrast as a flux ratio."""
         theta = np.array(cube, dtype=float)
-        n_pairs = cube.shape[1] - len(self.nuisance)
+        parameters = self._parameters_of(cube.shape[1])
         power = 2 if self.position_form == "area" else 1
         low, high = self.inner_mas**power, self.outer_mas**power
-        for k in range(0, n_pairs, self.width):
-            rho = (low + (high - low) * cube[:, k]) ** (1.0 / power)
-            theta[:, k], theta[:, k + 1] = offset(rho, 360.0 * cube[:, k + 1])
-            bright = slice(k + 2, k + 2 + self.n_contrasts)
-            theta[:, bright] = self._contrast_at(cube[:, bright])
-            rates = slice(bright.stop, k + self.width)
-            theta[:, rates] = self.fastest_mas_yr * (2.0 * cube[:, rates] - 1.0)
-        for k, (least, most) in enumerate(self.nuisance, start=n_pairs):
+        for k in range(1, parameters.companions + 1):
+            east, north = parameters.place(k)
+            rho = (low + (high - low) * cube[:, east]) ** (1.0 / power)
+            theta[:, east], theta[:, north] = offset(rho, 360.0 * cube[:, north])
+        bright, rates = parameters.contrasts, parameters.rates
+        theta[:, bright] = self._contrast_at(cube[:, bright])
+        theta[:, rates] = self.fastest_mas_yr * (2.0 * cube[:, rates] - 1.0)
+        for k, (least, most) in zip(parameters.nuisance, self.nuisance, strict=True):
             theta[:, k] = least + (most - least) * cube[:, k]
         return theta
 
@@ -168,7 +181,20 @@ class Prior:
 
     def draw(self, rng: np.random.Generator, n: int, companions: int = 1) -> FloatArray:
         """Draw parameter sets (n, n_dim), contrast as a flux ratio."""
-        return self.from_cube(rng.random((n, self.width * companions + len(self.nuisance))))
+        return self.from_cube(rng.random((n, len(self.parameters(companions)))))
+
+
+@lru_cache
+def _parameters(
+    companions: int, n_contrasts: int, fastest_mas_yr: float, n_nuisance: int
+) -> Parameters:
+    """Parameters by role; kept, since a chain asks at every step."""
+    bands = tuple(str(b) for b in range(n_contrasts))
+    found = [
+        p for k in range(companions) for p in companion_parameters(k + 1, bands, fastest_mas_yr)
+    ]
+    found += [Parameter(f"nuisance {k}", "", "nuisance", 0) for k in range(n_nuisance)]
+    return Parameters(tuple(found))
 
 
 @dataclass(frozen=True)
@@ -182,10 +208,11 @@ class PriorSetting:
 
 def default_prior(likelihood: Likelihood, inner_mas: float, outer_mas: float) -> Prior:
     """The prior of the field that was searched."""
+    parameters = likelihood.parameters
     return Prior(
         inner_mas,
         outer_mas,
-        nuisance=tuple(nuisance_bounds(likelihood.parameters, likelihood.samples.frequency.min())),
+        nuisance=tuple(parameters.bounds(parameters.nuisance)),
         n_contrasts=likelihood.model.n_contrasts,
         fastest_mas_yr=likelihood.model.fastest_mas_yr,
     )

@@ -24,7 +24,7 @@ def joint_fit_json(result: SearchResult) -> Json:
         out = {"contrast_kind": "per-filter" if free else "tied", "contrasts": _contrasts(result)}
     model = result.likelihood.model
     if model.moves:
-        east, north = (float(result.theta[k]) for k in model.rate_columns)
+        east, north = (float(result.theta[k]) for k in result.likelihood.parameters.rates)
         out |= {
             "east_rate_mas_yr": east,
             "north_rate_mas_yr": north,
@@ -123,7 +123,7 @@ def joint_lines(report: SearchReport) -> list[str]:
     elif len(bands) > 1:
         lines.append(f"per filter  one contrast for {', '.join(b.name for b in bands)}")
     if model.moves:
-        columns = model.rate_columns
+        columns = result.likelihood.parameters.rates
         rates, errors = result.theta[columns], np.sqrt(np.diag(result.theta_covariance))[columns]
         lines.append(
             f"motion      E {rates[0]:.3g} +/- {errors[0]:.2g}, N {rates[1]:.3g} +/- "

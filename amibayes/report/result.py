@@ -11,11 +11,12 @@ from amibayes import __version__
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.detection.false_alarm import Significance
+from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import HALO_BACKGROUND, Evidence
-from amibayes.posterior.grid import GridPosterior
+from amibayes.posterior.grid import GridPosterior, integrable
 from amibayes.posterior.priors import Prior
 from amibayes.report.common import (
     NOISE_KEYS,
@@ -110,8 +111,10 @@ def _fit(result: SearchResult) -> Json:
 
 def _errors(c: Companion, result: SearchResult) -> Json:
     errors = companion_errors(c)
-    for k, name in enumerate(result.likelihood.parameters[3:], start=3):
-        errors[name] = number(np.sqrt(result.theta_covariance[k, k]))
+    names = result.likelihood.parameters.names
+    for name, variance in zip(names, np.diag(result.theta_covariance), strict=True):
+        if name not in errors:
+            errors[name] = number(np.sqrt(variance))
     return errors
 
 
@@ -177,7 +180,8 @@ def _mode(mode: Mode) -> Json:
 
 
 def _posterior(report: SearchReport, posterior: Posterior) -> Json:
-    names = [*QUANTITIES, *posterior.names[3:]]
+    names = [*QUANTITIES, *(n for n in posterior.names if n not in QUANTITIES)]
+    nuisance = single_likelihood(report.result.likelihood).parameters.names
     return _intervals(posterior, names) | {
         "autocorrelation_time": number(posterior.autocorrelation_time),
         "n_effective": posterior.n_effective,
@@ -194,7 +198,7 @@ def _posterior(report: SearchReport, posterior: Posterior) -> Json:
         "mode_method": posterior.mode_method,
         "probability_elsewhere": number(posterior.elsewhere),
         "upper_limit": upper_limit(report),
-        "prior": prior_json(posterior.prior, posterior.names[posterior.prior.width :]),
+        "prior": prior_json(posterior.prior, nuisance),
     }
 
 
@@ -285,7 +289,7 @@ def _two(two: TwoCompanions, second: Significance | None) -> Json:
 def _limits(report: SearchReport) -> Json | None:
     if report.limits is None:
         return None
-    joint = report.result.likelihood.model.width > 3
+    joint = not integrable(report.result.likelihood)
     companion = {"companion": "the same contrast in every band, at rest"} if joint else {}
     return limits_json(report.limits) | companion
 

@@ -96,8 +96,9 @@ def _power(probability: float) -> str:
 
 def _nuisance_lines(result: SearchResult) -> list[str]:
     lines = []
-    first = result.likelihood.model.width
-    for k, name in enumerate(result.likelihood.parameters[first:], start=first):
+    parameters = result.likelihood.parameters
+    for k in parameters.nuisance:
+        name = parameters[k].name
         label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
         error = np.sqrt(result.theta_covariance[k, k])
         lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")

@@ -128,7 +128,9 @@ def _analysed(
     limits = detection_limit(
         result, weight, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
     )
-    place, rho = result.theta[:2], float(np.hypot(*truth[:2]))
+    found_at = result.companion
+    place = np.array([found_at.east_mas, found_at.north_mas])
+    rho = float(np.hypot(*truth[:2]))
     near = bool(at_its_place(place, truth[:2], resolution_mas(result.likelihood)))
     found = bool(weight.detected) and (near or limits.counts_anywhere(rho))
     return answer | {

@@ -17,7 +17,7 @@ from amibayes.cli import main
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.parallel import spawn
 from amibayes.pipeline.options import SearchOptions

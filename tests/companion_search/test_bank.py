@@ -11,7 +11,7 @@ from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.template_bank import TemplateBank, make_grid
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 MODELS = [
     BinaryModel(),
@@ -27,7 +27,7 @@ def test_templates_are_the_derivative_of_the_model(model, kinds, rng) -> None:
     if kinds == ("cp",):
         model = BinaryModel(smearing=model.smearing)
     likelihood = Likelihood(simulated(niriss(channels=2), [0.0, 0.0, 0.0], rng).only(kinds), model)
-    nuisance = np.array([30.0, 0.1])[: model.n_nuisance]
+    nuisance = np.array([30.0, 0.1])[: len(model.parameters.nuisance)]
     bank = TemplateBank(likelihood, make_grid(40.0, 400.0, 35.0), nuisance)
     step, free = 1e-6, np.linalg.qr(likelihood.jacobian([100.0, 0.0, 0.0, *nuisance])[:, 3:])[0]
     seen = np.zeros(len(bank), dtype=int)

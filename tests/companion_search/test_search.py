@@ -11,7 +11,7 @@ from amibayes.companion_search.search import default_separation, peaks, resolves
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.units import MAS, offset
 
 

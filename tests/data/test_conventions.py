@@ -14,7 +14,7 @@ from amibayes.companion_search.search import search
 from amibayes.data.observables import Measurements, Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 SHEET = niriss()
 DATA = simulated(SHEET, [120.0, -70.0, 0.02], np.random.default_rng(8))

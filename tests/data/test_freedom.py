@@ -30,7 +30,7 @@ from amibayes.errors import DataError
 from amibayes.extraction.shrinkage import shrunk_covariance
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.pipeline.warnings import search_cautions
 from amibayes.posterior.grid import grid_posterior

@@ -27,7 +27,7 @@ from amibayes.detection.false_alarm import (
 )
 from amibayes.extraction.shrinkage import shrunk_covariance
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 FIELD = (50.0, 400.0)
 GAINS = Recipe(gain=0.004)

@@ -20,7 +20,7 @@ from amibayes.detection.false_alarm import (
 )
 from amibayes.detection.tails import extreme_value_survival, pareto_survival
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 
 

@@ -12,7 +12,7 @@ from scipy import stats
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise import EstimatedNoise, GaussianNoise, noise_of
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 TRUTH = np.array([150.0, -80.0, 0.02])
 

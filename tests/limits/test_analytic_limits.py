@@ -12,7 +12,7 @@ from amibayes.companion_search.search import search
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.analytic import LINEAR, AnalyticLimit, analytic_limit
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 
 RINGS = (70.0, 150.0, 330.0)
 FEW = [(0, 3), (1, 40), (2, 77)]

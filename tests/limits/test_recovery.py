@@ -10,7 +10,7 @@ from amibayes.companion_search.search import resolution_mas, search
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.injection import ambiguous, injected_signal, nearer_alias, recover
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.units import MAS, offset
 
 LATTICE_MAS = 4.817e-6 / 1.14315 / MAS

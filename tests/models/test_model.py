@@ -8,7 +8,7 @@ from helpers import NIRISS_HOLES, niriss, simulated
 
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.models.uv_points import uv_points_of
 from amibayes.units import MAS
 

@@ -13,7 +13,8 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse, bspline_weights
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
+from amibayes.models.companion import point_visibility
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.optics.sampling import lattice_images, shifted_images
 from amibayes.units import MAS
@@ -73,8 +74,8 @@ def test_centre_is_where_the_phases_have_no_slope(rng: np.random.Generator) -> N
     samples = Likelihood(with_lattice(rng)).samples
     assert samples.off_axis is not None
     theta = np.array([[60.0, -30.0, 0.4], [-200.0, 90.0, 0.1]])
-    model = BinaryModel(smearing=False)
-    light = (1.0 + theta[:, 2] * model.companion(samples, *theta[:, :2].T)) / (1.0 + theta[:, 2])
+    wave = point_visibility(samples, *theta[:, :2].T, smearing=False)
+    light = (1.0 + theta[:, 2] * wave) / (1.0 + theta[:, 2])
     east, north = samples.off_axis.centre(light)
     for k in range(2):
 

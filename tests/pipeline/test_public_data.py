@@ -10,7 +10,7 @@ import pytest
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits
 
 

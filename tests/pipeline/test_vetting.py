@@ -15,7 +15,7 @@ from test_joint import F430M, epoch, noisy
 from amibayes.cli import main
 from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, vet
 from amibayes.report.vetting import vetting_picture, vetting_table

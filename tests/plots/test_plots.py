@@ -27,7 +27,7 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.errors import RunError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.mass_table import MassTable
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.plots.calibration import _keys, calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, contrast_marks, limits_plot
@@ -90,11 +90,11 @@ def by_hand(data: Observables, theta: tuple[float, ...]) -> SearchResult:
         chi2_single=500.0,
         chi2_binary=100.0,
         ndof=100,
-        modes=(Mode(theta, 400.0),),
+        modes=(Mode(theta, 400.0, (Companion(*theta),)),),
         grid=grid,
         bank_contrast=contrast,
         bank_sigma=np.full(len(grid), 0.001),
-        global_check=Mode(theta, 400.0),
+        global_check=Mode(theta, 400.0, (Companion(*theta),)),
     )
 
 

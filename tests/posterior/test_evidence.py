@@ -14,7 +14,7 @@ from amibayes.companion_search.second_companion import search_second
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.posterior.evidence import compare_models, log_evidence_importance, log_evidence_nested
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.laplace import log_evidence_laplace

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_t
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.integrand import log_evidence_none, polar_cells
 from amibayes.posterior.priors import Prior, default_prior, edit_prior, parse_setting

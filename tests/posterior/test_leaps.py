@@ -11,7 +11,7 @@ from helpers import niriss, simulated
 
 from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.models.components import BinaryModel
+from amibayes.models.binary import BinaryModel
 from amibayes.posterior.ensemble import IndependenceProposal, sample
 from amibayes.posterior.grid import GridPosterior, grid_posterior
 from amibayes.posterior.priors import default_prior

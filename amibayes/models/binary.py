@@ -1,0 +1,255 @@
+"""The binary model: a star, companions, over-resolved light, seen through channels.
+
+V = (V_A + Σ c_k E_k) / (1 + Σ c_k + f) with V_A the disc of the primary, c_k the contrast
+(companion/primary flux ratio), E_k a companion's fringes and f the over-resolved background
+(primary = 1). Everything is evaluated for many parameter sets at once: points of the (u, v)
+plane down the rows, parameter sets across the columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from amibayes.models.background import Background
+from amibayes.models.companion import PointCompanion
+from amibayes.models.off_axis import Place
+from amibayes.models.parameters import Parameters
+from amibayes.models.source import CENTRED, Component, Slope, Source
+from amibayes.models.star import Star
+from amibayes.models.uv_points import UVPoints
+from amibayes.support.quantities import takes_quantities
+from amibayes.units import ComplexArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LinearResponse:
+    """How a faint companion moves the visibility: dV/dc = scale·(ρE − ρ_F·star).
+
+    E are the fringes of a point, ρ and ρ_F the response of the extraction to its visibility
+    and flux (1 where there is none).
+
+    Parameters
+    ----------
+    star : (n_samples,) float array
+        Visibility without a companion; real, since the star stands at the origin.
+    scale : float
+    """
+
+    star: FloatArray
+    scale: float
+
+
+@takes_quantities
+@dataclass(frozen=True)
+class BinaryModel:
+    """What is fitted and what is held fixed.
+
+    Parameters
+    ----------
+    companions : int
+        Number of companions, 0 or more.
+    diameter_mas : float or "free"
+        Uniform-disc diameter of the primary.
+    background : float or "free"
+        Over-resolved flux in units of the primary's.
+    smearing : bool
+        Average over the width of each channel.
+    bands : tuple of str
+        Bands of the data (`amibayes.models.bands`) that have a contrast of their own, the
+        reference band first; empty where all share one.
+    fastest_mas_yr : float
+        Companions move linearly, at most so fast along east and along north; 0: they stand.
+    reference_mjd : float
+        Date at which a moving companion is at its east and north.
+    """
+
+    companions: int = 1
+    diameter_mas: float | Literal["free"] = 0.0
+    background: float | Literal["free"] = 0.0
+    smearing: bool = True
+    bands: tuple[str, ...] = ()
+    fastest_mas_yr: float = 0.0
+    reference_mjd: float = 0.0
+
+    @property
+    def n_contrasts(self) -> int:
+        """Number of contrasts of each companion."""
+        return max(len(self.bands), 1)
+
+    @property
+    def moves(self) -> bool:
+        """Whether companions move."""
+        return self.fastest_mas_yr > 0.0
+
+    @cached_property
+    def components(self) -> tuple[Component, ...]:
+        """Companions, star and background, in the order of a parameter vector."""
+        companions = [
+            PointCompanion(
+                k + 1, self.smearing, self.bands, self.fastest_mas_yr, self.reference_mjd
+            )
+            for k in range(self.companions)
+        ]
+        return (*companions, Star(self.diameter_mas), Background(self.background))
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        """Free parameters, in the order of a parameter vector."""
+        return Parameters(tuple(p for c in self.components for p in c.parameters))
+
+    def at_rest(self, three: FloatArray) -> FloatArray:
+        """Companions (n, width) that stand, alike in every band, from east, north, contrast."""
+        one = replace(self, companions=1).parameters
+        out = np.zeros((len(three), len(one.companion())))
+        out[:, one.place()] = three[:, :2]
+        out[:, one.contrasts] = three[:, 2:]
+        return out
+
+    def visibility(self, samples: UVPoints, theta: FloatArray) -> ComplexArray:
+        """Complex visibilities, (n_samples, n), of parameter sets theta (n, n_dim)."""
+        sources = self._sources(samples, theta, slopes=False)
+        light, total = _mixed(samples, sources, _start(samples))
+        if samples.off_axis is not None:
+            light, total = _mixed(samples, sources, samples.off_axis.centre(light))
+        return np.asarray(light / total)
+
+    def gradient(self, samples: UVPoints, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
+        sources = self._sources(samples, theta, slopes=True)
+        mixed = _Mixed.of(samples, sources, _start(samples))
+        if samples.off_axis is not None:
+            centre = samples.off_axis.centre(mixed.light)
+            moves = samples.off_axis.centre_slopes(mixed.light, mixed.light_slopes)
+            mixed = _Mixed.of(samples, sources, centre).pulled(moves)
+        value = np.asarray(mixed.light / mixed.total, dtype=complex)
+        return value, np.asarray((mixed.light_slopes - value * mixed.total_slopes) / mixed.total)
+
+    def linear_response(self, samples: UVPoints, nuisance: FloatArray) -> LinearResponse:
+        """Make the response to a faint companion from values of the nuisance parameters."""
+        alone = replace(self, companions=0)
+        sources = alone._sources(samples, np.atleast_2d(nuisance), slopes=False)
+        light, total = _mixed(samples, sources, CENTRED)
+        scale = 1.0 / float(np.ravel(total)[0])
+        return LinearResponse(np.asarray(light[:, 0].real * scale), scale)
+
+    def _sources(self, samples: UVPoints, theta: FloatArray, *, slopes: bool) -> list[Source]:
+        """Every component at parameter sets (n, n_dim)."""
+        values, first, found = theta.T, 0, []
+        for component in self.components:
+            last = first + len(component.parameters)
+            found.append(component.source(samples, values[first:last], slopes=slopes))
+            first = last
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Mixed:
+    """Light (n_samples, n) and flux of all sources, and their slopes.
+
+    ``pulls`` are those by the places as the extraction sees them, from the centre of the
+    image: east and north summed over the sources, (2, n_samples, n).
+    """
+
+    light: ComplexArray
+    total: FloatArray
+    light_slopes: ComplexArray
+    total_slopes: FloatArray
+    light_pulls: ComplexArray
+    total_pulls: FloatArray
+
+    @classmethod
+    def of(cls, samples: UVPoints, sources: Sequence[Source], centre: Place) -> _Mixed:
+        """Add the sources up, seen from a centre."""
+        through = [_through(samples, s.place, centre, slopes=True) for s in sources]
+        pairs = list(zip(sources, through, strict=True))
+        light, total = (sum(x) for x in zip(*(_lit(s, t) for s, t in pairs), strict=True))
+        slopes = [_by_parameter(s, slope, t) for s, t in pairs for slope in s.slopes]
+        pulls = [] if samples.off_axis is None else [_by_place(s, t) for s, t in pairs]
+        return cls(
+            light,
+            total,
+            _stacked([p for p, _ in slopes], light.shape, complex),
+            _stacked([q for _, q in slopes], light.shape, float),
+            _stacked([sum(p[k][0] for p in pulls) for k in (0, 1)], light.shape, complex),
+            _stacked([sum(p[k][1] for p in pulls) for k in (0, 1)], light.shape, float),
+        )
+
+    def pulled(self, moves: FloatArray) -> _Mixed:
+        """Add what parameters do by moving the centre, (n_dim, 2, n_samples, n) mas each."""
+        return replace(
+            self,
+            light_slopes=self.light_slopes - np.einsum("qksn,ksn->qsn", moves, self.light_pulls),
+            total_slopes=self.total_slopes - np.einsum("qksn,ksn->qsn", moves, self.total_pulls),
+        )
+
+
+def _stacked(rows: list[Any], shape: tuple[int, ...], kind: type) -> Any:
+    out: Any = np.empty((len(rows), *shape), dtype=kind)
+    for row, values in zip(out, rows, strict=True):
+        row[...] = values
+    return out
+
+
+def _mixed(
+    samples: UVPoints, sources: Sequence[Source], centre: Place
+) -> tuple[ComplexArray, FloatArray]:
+    """Light (n_samples, n) and flux of all sources seen from a centre."""
+    lit = [_lit(s, _through(samples, s.place, centre, slopes=False)) for s in sources]
+    light, total = (sum(x) for x in zip(*lit, strict=True))
+    return light, total
+
+
+Through = tuple[Any, Any]
+"""Response of the extraction to a source's visibility and flux: values, then slopes by place."""
+
+OPEN: Through = ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+"""All is let through."""
+
+
+def _lit(source: Source, through: Through) -> tuple[Any, Any]:
+    """Light and flux of a source, as the extraction lets them through."""
+    fringe, flux = through
+    return source.flux * (source.wave * fringe[0]), source.flux * flux[0]
+
+
+def _by_place(source: Source, through: Through) -> list[tuple[Any, Any]]:
+    """Derivatives of light and flux by the east and north from which the source is seen."""
+    fringe, flux = through
+    return [(source.flux * (source.wave * fringe[k]), source.flux * flux[k]) for k in (1, 2)]
+
+
+def _by_parameter(source: Source, slope: Slope, through: Through) -> tuple[Any, Any]:
+    """Derivatives of light and flux by one of the source's parameters."""
+    fringe, flux = through
+    light: Any = 0.0
+    total: Any = 0.0
+    if slope.flux is not None:
+        light, total = slope.flux * (source.wave * fringe[0]), slope.flux * flux[0]
+    if slope.wave is not None:
+        light = light + source.flux * (slope.wave * fringe[0])
+    if slope.place is not None and through is not OPEN:
+        pulls = _by_place(source, through)
+        for along, (by_light, by_total) in zip(slope.place, pulls, strict=True):
+            light, total = light + along * by_light, total + along * by_total
+    return light, total
+
+
+def _start(samples: UVPoints) -> Place:
+    """Where the axis is from a lone star."""
+    return CENTRED if samples.off_axis is None else samples.off_axis.start
+
+
+def _through(samples: UVPoints, place: Place | None, centre: Place, *, slopes: bool) -> Through:
+    """What the extraction makes of a source's visibility and flux."""
+    if samples.off_axis is None or place is None:
+        return OPEN
+    seen = place[0] - centre[0], place[1] - centre[1]
+    if slopes:
+        return samples.off_axis.with_slopes(seen)
+    fringe, flux = samples.off_axis.at(seen)
+    return (fringe,), (flux,)

@@ -1,0 +1,158 @@
+"""A companion: a point with contrasts, which may move, seen through a channel of some width.
+
+E = sinc · exp(−2πi(uα + vδ)/λ), whose sinc is the average over the channel. Of data in several
+bands each may have a contrast of its own, and of data of several dates the place may move
+linearly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from amibayes.models.parameters import MAX_CONTRAST, Parameter
+from amibayes.models.source import Slope, Source
+from amibayes.models.uv_points import UVPoints
+from amibayes.units import MAS, ComplexArray, FloatArray
+
+
+def companion_parameters(
+    k: int = 1, bands: tuple[str, ...] = (), fastest_mas_yr: float = 0.0
+) -> tuple[Parameter, ...]:
+    """Parameters of companion ``k``: place, contrasts, rates.
+
+    Parameters
+    ----------
+    k : int
+        1, 2, …
+    bands : tuple of str
+        That have a contrast of their own; empty where all share one.
+    fastest_mas_yr : float
+        0 where it stands still.
+    """
+    suffix = "" if k == 1 else f"_{k}"
+    found = [Parameter(f"{axis}_mas{suffix}", "mas", "position", k) for axis in ("east", "north")]
+    found.append(Parameter(f"contrast{suffix}", "", "flux", k, 0.0, MAX_CONTRAST))
+    found += [
+        Parameter(f"contrast{suffix}[{band}]", "", "flux", k, 0.0, MAX_CONTRAST)
+        for band in bands[1:]
+    ]
+    if fastest_mas_yr > 0.0:
+        limits = (-fastest_mas_yr, fastest_mas_yr)
+        found += [
+            Parameter(f"{axis}_rate_mas_yr{suffix}", "mas/yr", "rate", k, *limits)
+            for axis in ("east", "north")
+        ]
+    return tuple(found)
+
+
+ALONG = ((1.0, 0.0), (0.0, 1.0))
+"""Derivatives of the place by its east and by its north."""
+
+
+@dataclass(frozen=True)
+class PointCompanion:
+    """A point.
+
+    Parameters
+    ----------
+    number : int
+        1 for the first companion.
+    smearing : bool
+        Average over the width of each channel.
+    bands : tuple of str
+        That have a contrast of their own.
+    fastest_mas_yr : float
+        0: it stands still.
+    reference_mjd : float
+        Date at which a moving companion is at its east and north.
+    """
+
+    number: int = 1
+    smearing: bool = True
+    bands: tuple[str, ...] = ()
+    fastest_mas_yr: float = 0.0
+    reference_mjd: float = 0.0
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Place, contrasts, rates."""
+        return companion_parameters(self.number, self.bands, self.fastest_mas_yr)
+
+    @property
+    def n_contrasts(self) -> int:
+        """Number of contrasts."""
+        return max(len(self.bands), 1)
+
+    def source(self, samples: UVPoints, values: FloatArray, *, slopes: bool = False) -> Source:
+        """Make the companion of ``values`` (n_parameters, n)."""
+        place, rest = values[:2], values[2:]
+        bright, rates = rest[: self.n_contrasts], rest[self.n_contrasts :]
+        flux = bright[0] if self.n_contrasts == 1 else bright[samples.band]
+        years = samples.years(self.reference_mjd)[:, None] if len(rates) else np.zeros(1)
+        east, north = place[:, None] + years * rates[:, None] if len(rates) else place
+        if not slopes:
+            wave = point_visibility(samples, east, north, self.smearing)
+            return Source(flux, wave, (east, north))
+        wave, by_angle = point_slope(samples, east, north, self.smearing)
+        by_turn = by_angle * (2.0 * np.pi * MAS)
+        by_place = by_turn * samples.u[:, None], by_turn * samples.v[:, None]
+        found = [Slope(wave=w, place=p) for w, p in zip(by_place, ALONG, strict=True)]
+        found += [Slope(flux=f) for f in self._by_contrast(samples)]
+        if len(rates):
+            found += [s.times(years) for s in found[: len(ALONG)]]
+        return Source(flux, wave, (east, north), found)
+
+    def _by_contrast(self, samples: UVPoints) -> list[Any]:
+        """Derivatives of the flux by each contrast."""
+        if self.n_contrasts == 1:
+            return [1.0]
+        return [1.0 * (samples.band[:, None] == b) for b in range(self.n_contrasts)]
+
+
+def point_visibility(
+    samples: UVPoints, east_mas: FloatArray, north_mas: FloatArray, smearing: bool = True
+) -> ComplexArray:
+    """Visibility of a point at an offset, averaged over the channel, (n_samples, n)."""
+    angle = phase_angle(samples, east_mas, north_mas)
+    wave = np.exp(-1j * angle)
+    if smearing:
+        wave *= np.sinc(angle * (_half_band(samples) / np.pi))
+    return np.asarray(wave)
+
+
+def point_slope(
+    samples: UVPoints, east_mas: FloatArray, north_mas: FloatArray, smearing: bool = True
+) -> tuple[ComplexArray, ComplexArray]:
+    """Visibility of a point and its derivative by the phase angle, (n_samples, n) each."""
+    angle = phase_angle(samples, east_mas, north_mas)
+    wave = np.exp(-1j * angle)
+    if not smearing:
+        return wave, -1j * wave
+    half = _half_band(samples)
+    value, slope = _sinc(angle * half)
+    return value * wave, (half * slope - 1j * value) * wave
+
+
+def phase_angle(samples: UVPoints, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
+    """2π(uα + vδ), (n_samples, n), of places (n,) or of moving ones (n_samples, n)."""
+    if east_mas.ndim == 2:
+        u, v = samples.u[:, None] * MAS, samples.v[:, None] * MAS
+        return np.asarray(2.0 * np.pi * (u * east_mas + v * north_mas))
+    turns = np.outer(samples.u, east_mas * MAS) + np.outer(samples.v, north_mas * MAS)
+    return 2.0 * np.pi * turns
+
+
+def _half_band(samples: UVPoints) -> FloatArray:
+    return 0.5 * samples.relative_band[:, None]
+
+
+def _sinc(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Evaluate sin(x)/x and its derivative."""
+    small = np.abs(x) < 1e-4  # where the series is exact to rounding
+    safe = np.where(small, 1.0, x)
+    value = np.where(small, 1.0 - x * x / 6.0, np.sin(safe) / safe)
+    slope = np.where(small, -x / 3.0, (np.cos(safe) - value) / safe)
+    return value, slope
