@@ -22,6 +22,7 @@ from .cube import (
 from .data.observables import Observables as Observables, join as join
 from .data.point_source import point_source as point_source
 from .detection.false_alarm import Significance as Significance, significance as significance
+from .detection.statistic import statistic_of as statistic_of
 from .errors import (
     AmibayesError as AmibayesError,
     DataError as DataError,
@@ -37,10 +38,7 @@ from .instrument import (
 from .likelihood.joint import joint_likelihood as joint_likelihood
 from .likelihood.likelihood import Likelihood as Likelihood
 from .limits.analytic import AnalyticLimit as AnalyticLimit, analytic_limit as analytic_limit
-from .limits.completeness import (
-    DetectionLimit as DetectionLimit,
-    detection_limit as detection_limit,
-)
+from .limits.completeness import detection_limit as detection_limit
 from .limits.image_injection import (
     Criterion as Criterion,
     MeasuredStar as MeasuredStar,
@@ -48,6 +46,7 @@ from .limits.image_injection import (
     measure_star as measure_star,
 )
 from .limits.injection import Recovery as Recovery, recover as recover
+from .limits.limit import DetectionLimit as DetectionLimit
 from .models.binary import BinaryModel as BinaryModel
 from .oifits import (
     OIFits as OIFits,

@@ -24,15 +24,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes import Likelihood, TemplateBank, load_instrument, open_executor, point_source
+from amibayes import Likelihood, load_instrument, open_executor, point_source
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import resolution_mas, search
 from amibayes.companion_search.template_bank import make_grid
-from amibayes.data.observables import Observables
-from amibayes.limits.injection import TRIALS_AT_ONCE, nearer_aliases, recover
+from amibayes.data.observables import BoolArray, Observables
+from amibayes.detection.statistic import BankStatistic, make_statistic
+from amibayes.limits.aliases import nearer_aliases
+from amibayes.limits.injection import TRIALS_AT_ONCE, recover
 from amibayes.models.parameters import Box
 from amibayes.parallel import Executor
-from amibayes.units import BoolArray, FloatArray, offset
+from amibayes.units import FloatArray, offset
 
 FIELD_MAS = (50.0, 400.0)
 POSITIONS = 10_000
@@ -86,17 +88,13 @@ def dask_workers(n: int) -> Iterator[Executor]:
 class Work:
     """The job: aliases of all places, once, and the trials."""
 
-    likelihood: Likelihood
-    bank: TemplateBank
-    single: FloatArray
+    test: BankStatistic
 
     def __call__(self, n: int, executor: Executor) -> BoolArray:
-        fringe = resolution_mas(self.likelihood)
-        nearer = nearer_aliases(self.bank, rings(), fringe, executor=executor).ravel()
+        fringe = resolution_mas(self.test.likelihood)
+        nearer = nearer_aliases(self.test.bank, rings(), fringe, executor=executor).ravel()
         found = recover(
-            self.likelihood,
-            self.bank,
-            self.single,
+            self.test,
             companions(n),
             THRESHOLD,
             np.random.default_rng(3),
@@ -157,10 +155,11 @@ def main() -> None:
     likelihood = Likelihood(sheet())
     single = search(likelihood, FIELD_MAS).single_theta
     step = np.sqrt(np.pi * (FIELD_MAS[1] ** 2 - FIELD_MAS[0] ** 2) / POSITIONS)
-    bank = TemplateBank(likelihood, make_grid(*FIELD_MAS, float(step)), single)
-    print(f"{bank.n_data} independent data, {len(bank)} positions")
+    grid = make_grid(*FIELD_MAS, float(step))
+    test = make_statistic(likelihood, grid, single, stated_errors=True)
+    print(f"{test.bank.n_data} independent data, {len(grid)} positions")
 
-    work = Work(likelihood, bank, single)
+    work = Work(test)
     n = int(sys.argv[1]) if len(sys.argv) > 1 else TRIALS
     with open_executor(1) as executor:
         alone, expected = timed(work, executor, n)

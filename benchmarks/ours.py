@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from amibayes import BinaryModel, Likelihood, read_oifits, sample, search
-from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.detection.false_alarm import null_maxima
+from amibayes.detection.statistic import statistic_of
 from amibayes.extraction import ExtractOptions, extract_all
 from amibayes.posterior.priors import default_prior
 from benchmarks.search import gemm_seconds
@@ -37,8 +36,9 @@ def searches(path: Path, field: tuple[float, float], model: BinaryModel) -> dict
     """Searches of the data, of null draws, the likelihood, and draws of the posterior."""
     likelihood = Likelihood(read_oifits(path), model)
     whole, result = cpu(lambda: search(likelihood, field))
-    bank = TemplateBank(likelihood, result.grid, result.single_theta)
-    null, _ = cpu(lambda: null_maxima(bank, DRAWS, np.random.default_rng(1)), repeat=1)
+    test = statistic_of(result, stated_errors=True)
+    bank = test.bank
+    null, _ = cpu(lambda: test.draw_null(DRAWS, np.random.default_rng(1)), repeat=1)
     noise, _ = cpu(
         lambda: np.random.default_rng(1).standard_normal((bank.n_data, DRAWS), dtype=np.float32)
     )

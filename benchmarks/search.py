@@ -26,7 +26,7 @@ from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.search import search
 from amibayes.companion_search.template_bank import TemplateBank, make_grid
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import null_maxima
+from amibayes.detection.statistic import make_statistic
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.models.binary import BinaryModel
 
@@ -108,9 +108,9 @@ def main() -> None:
               f"{seconds / len(grid) / n_data * 1e9:.1f} ns each")  # fmt: skip
         seconds, result = cpu(search, likelihood, FIELD)
         print(f"search    {seconds:.2f} s CPU: {len(result.grid)} positions, refinement, check")
-        bank = TemplateBank(likelihood, result.grid, single)
-        rng = np.random.default_rng(1)
-        seconds, _ = cpu(null_maxima, bank, DRAWS, rng, repeat=1)
+        test = make_statistic(likelihood, result.grid, single, stated_errors=True)
+        bank, rng = test.bank, np.random.default_rng(1)
+        seconds, _ = cpu(test.draw_null, DRAWS, rng, repeat=1)
         # Mirror positions share their products: one multiply-add per datum and pair.
         floor = gemm_seconds(2.0 * (len(result.grid) / 2) * bank.n_data * DRAWS)
         print(f"null      {DRAWS} searches in {seconds:.1f} s CPU, "

@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 from amibayes import BinaryModel, Likelihood, Observables, TemplateBank, load_instrument
 from amibayes.companion_search.template_bank import make_grid
 from amibayes.data.point_source import point_source
-from amibayes.detection.false_alarm import clopper_pearson, null_maxima
+from amibayes.detection.false_alarm import clopper_pearson
+from amibayes.detection.statistic import make_statistic
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray, offset
@@ -74,7 +75,9 @@ def measure() -> tuple[dict[str, FloatArray], dict[str, float]]:
     """Share of the companions found at each contrast, and the false-alarm rates."""
     rng = np.random.default_rng(1)
     true = sheet("assumed")
-    threshold = np.quantile(null_maxima(banks(true)[0][0], NULLS, rng), 0.99)
+    grid = make_grid(*FIELD_MAS, 20.0)
+    test = make_statistic(Likelihood(true), grid, np.empty(0), stated_errors=True)
+    threshold = np.quantile(test.draw_null(NULLS, rng), 0.99)
     marks = (threshold, 3.0, 5.0)
 
     def hits(signal: FloatArray, n: int) -> list[float]:

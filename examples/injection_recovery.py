@@ -59,7 +59,7 @@ def main() -> list[tuple[float, float, float]]:
     for contrast in CONTRASTS:
         by_data = criterion.recover(companions(contrast, TRIALS, rng), rng).located
         by_images = [
-            criterion.judge(calibrated(star.with_companion(*one, rng)), *one[:2]).located
+            criterion.apply(calibrated(star.with_companion(*one, rng)), *one[:2]).located
             for one in companions(contrast, TRIALS_IN_IMAGES, rng)
         ]
         shares.append((contrast, float(np.mean(by_data)), float(np.mean(by_images))))

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.companion_search.scan import RunningMaximum, ScanResult, best_positive, weighted_gain
+from amibayes.companion_search.scan import (
+    GroupWeights,
+    RunningMaximum,
+    ScanResult,
+    best_positive,
+    weighted_gain,
+)
 from amibayes.companion_search.template_bank import Grid, MatchedFilter, TemplateBank
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.units import MAS, FloatArray, IntArray
@@ -101,17 +107,17 @@ class JointBank(TemplateBank):
         return ScanResult(*self.scan(residuals), gain, tail, n)
 
     def largest_gain(
-        self, data: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+        self, data: NDArray[np.float32], weights: GroupWeights | None = None
     ) -> tuple[FloatArray, IntArray]:
         """Search many data sets (n_data, n): largest gain over the bank, and where."""
         highest, rows = RunningMaximum(data.shape[1]), np.ascontiguousarray(data.T)
         for index, _, templates in self._all_templates():
             match = [rows @ unit.astype(np.float32) for unit in templates.unit]
-            if weight is None:
+            if weights is None:
                 _, gain = templates.best(match)
             else:
-                gain = weighted_gain(self.groups, templates.unit, match, weight)
-            highest.look(index, gain)
+                gain = weighted_gain(weights, templates.unit, match)
+            highest.update(index, gain)
         return np.asarray(highest.score, dtype=float), highest.position
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:

@@ -53,7 +53,7 @@ def best_positive(
     return np.asarray(best), np.asarray(gain)
 
 
-FEWEST = 8
+MIN_DATA = 8
 """Independent data from which on a kind of data of one file has a scale of its own."""
 
 
@@ -87,7 +87,7 @@ class ScaleGroups:
         return np.asarray(member.astype(values.dtype) @ values)
 
     def variances(self, data: FloatArray) -> FloatArray:
-        """Mean squares of whitened data (n_data, n), (n_groups, n), within what is believed."""
+        """Mean squares of whitened data (n_data, n), (n_groups, n), within `MAX_UNEQUAL`."""
         count = self.share * self.sums(np.ones(len(data)))[:, None]
         square = self.sums(data**2)
         mean = np.where(square.sum(axis=0) > 0.0, square.sum(axis=0) / count.sum(), 1.0)
@@ -116,7 +116,7 @@ def scale_groups(data: Observables, n_nuisance: int) -> ScaleGroups:
     label = _connected(whitening, of_datum)
     count = np.bincount(label)
     # Too few to tell their own scatter: they go with all else that is too few.
-    label = np.where(count[label] < FEWEST, len(count), label)
+    label = np.where(count[label] < MIN_DATA, len(count), label)
     return ScaleGroups(np.unique(label, return_inverse=True)[1], share)
 
 
@@ -131,27 +131,36 @@ def _connected(whitening: csr_array, of_datum: IntArray) -> IntArray:
     return np.asarray(connected_components(edges, directed=False)[1][n:], dtype=np.intp)
 
 
+@dataclass(frozen=True, eq=False)
+class GroupWeights:
+    """Weights (n_groups, n) of the groups of data in n data sets."""
+
+    groups: ScaleGroups
+    weight: NDArray[np.floating]
+
+    def sums(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Weighted sums (n, m) over the data of values (n_data, m)."""
+        return np.asarray(self.weight.T @ self.groups.sums(values).astype(self.weight.dtype))
+
+
 def weighted_gain(
-    groups: ScaleGroups,
+    weights: GroupWeights,
     units: NDArray[np.floating],
     match: Sequence[NDArray[np.floating]],
-    weight: NDArray[np.floating],
 ) -> FloatArray:
     """Gain in weighted χ² of the best contrasts, none below zero, (n, m).
 
     Parameters
     ----------
-    groups : ScaleGroups
+    weights : GroupWeights
+        Of n data sets.
     units : (n_bands, n_data, m) float array
         Templates of unit norm.
     match : sequence of (n, m) arrays
         Products of weighted data with each band's templates.
-    weight : (n_groups, n) array
     """
     products = {
-        (a, b): weight.T @ groups.sums(units[a] * units[b]).astype(weight.dtype)
-        for b in range(len(units))
-        for a in range(b + 1)
+        (a, b): weights.sums(units[a] * units[b]) for b in range(len(units)) for a in range(b + 1)
     }
     length = [np.sqrt(np.maximum(products[b, b], 1e-12)) for b in range(len(units))]
     shared = {(a, b): s / (length[a] * length[b]) for (a, b), s in products.items() if a < b}
@@ -159,7 +168,7 @@ def weighted_gain(
 
 
 class RunningMaximum:
-    """Largest score of many data sets over positions that are looked at part by part.
+    """Largest score of many data sets over positions that come part by part.
 
     Attributes
     ----------
@@ -173,8 +182,8 @@ class RunningMaximum:
         self.position = np.zeros(n, dtype=np.intp)
         self._each = np.arange(n)
 
-    def look(self, index: IntArray, score: NDArray[np.floating]) -> None:
-        """Look at scores (n, m) of positions (m,)."""
+    def update(self, index: IntArray, score: NDArray[np.floating]) -> None:
+        """Take scores (n, m) of positions (m,) into account."""
         top = score.argmax(axis=1)
         value = score[self._each, top]
         better = value > self.score

@@ -10,17 +10,14 @@ whitening is folded into one sparse matrix before any position is looked at.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from copy import copy
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.companion_search.scan import RunningMaximum, ScanResult, scale_groups
+from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
-from amibayes.likelihood.rotation_null import rotation_null
 from amibayes.models.uv_points import UVPoints
 from amibayes.units import MAS, FloatArray, IntArray
 
@@ -202,7 +199,6 @@ class TemplateBank:
     ) -> None:
         self.grid = grid
         self.n_data = likelihood.n_independent
-        self.freedom = likelihood.observables.freedom
         self.n_contrasts = likelihood.model.n_contrasts
         self._samples = likelihood.samples
         self._smearing = likelihood.model.smearing
@@ -214,26 +210,12 @@ class TemplateBank:
             self.nuisance_basis = nuisance_directions(likelihood, nuisance)
         else:
             self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
-        single = likelihood.with_model(replace(likelihood.model, companions=0))
-        left = single.residuals(nuisance) if beside is None else likelihood.residuals(beside)
-        left = self.project(left)
-        self.estimate = rotation_null(likelihood.observables, left[:, 0])
-        self.groups = scale_groups(likelihood.observables, self.n_nuisance)
-        self.scale = np.sqrt(self.groups.variances(left))[self.groups.label]
 
     joint = False
     """Whether contrasts of bands, or rates, are free."""
 
     def __len__(self) -> int:
         return len(self.grid)
-
-    def beside(self, residuals: FloatArray) -> Self:
-        """Make the same bank for data that left other whitened residuals (n_data,)."""
-        other, left = copy(self), self.project(residuals)
-        other.scale = np.sqrt(self.groups.variances(left[:, None]))[self.groups.label]
-        if self.estimate is not None:
-            other.estimate = replace(self.estimate, residual=left)
-        return other
 
     @property
     def n_nuisance(self) -> int:
@@ -272,7 +254,7 @@ class TemplateBank:
         return ScanResult(contrast, sigma, gain, contrast[:, None])
 
     def largest_gain(
-        self, data: NDArray[np.float32], weight: NDArray[np.float32] | None = None
+        self, data: NDArray[np.float32], weights: GroupWeights | None = None
     ) -> tuple[FloatArray, IntArray]:
         """Search many data sets: largest gain in χ² over the bank, for positive contrast.
 
@@ -280,8 +262,8 @@ class TemplateBank:
         ----------
         data : (n_data, n) float32 array
             Whitened, nuisance directions taken out, times their weights.
-        weight : (n_groups, n) float32 array, optional
-            Weights of the groups of data, where they are not 1.
+        weights : GroupWeights, optional
+            Of the groups of data, where they are not 1.
 
         Returns
         -------
@@ -293,21 +275,20 @@ class TemplateBank:
         data_even = np.ascontiguousarray(data[self._even.rows].T)
         data_odd = np.ascontiguousarray(data[self._odd.rows].T)
         for index, even, odd in self._halves():
-            scale = self._inverse_length(even, odd, weight)
+            scale = self._inverse_length(even, odd, weights)
             a, b = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
             for half, match in zip(np.split(np.arange(len(index)), 2), (a + b, a - b), strict=True):
                 match *= scale[..., half]
-                highest.look(index[half], match)
+                highest.update(index[half], match)
         return np.asarray(highest.score, dtype=float) ** 2, highest.position
 
     def _inverse_length(
-        self, even: FloatArray, odd: FloatArray, weight: NDArray[np.float32] | None
+        self, even: FloatArray, odd: FloatArray, weights: GroupWeights | None
     ) -> NDArray[np.float32]:
         """1/√(t·t) of templates, (2m,), or with weights of each data set, (n, 2m)."""
-        if weight is None:
+        if weights is None:
             return np.asarray(1.0 / np.sqrt(self._norm(even, odd)), dtype=np.float32)
-        square = self.groups.sums(self._both_laid_out(even, odd) ** 2).astype(np.float32)
-        return np.asarray(1.0 / np.sqrt(weight.T @ square))
+        return np.asarray(1.0 / np.sqrt(weights.sums(self._both_laid_out(even, odd) ** 2)))
 
     def _laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
         """Templates (n_data, m) of their two parts, nuisance directions taken out."""

@@ -28,19 +28,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import special, stats
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.detection.statistic import Statistic, make_statistic
 from amibayes.likelihood.combinations import combination_of, require
-from amibayes.likelihood.likelihood import single_likelihood
-from amibayes.limits.injection import injected_signal
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.support.options import LIMITS_SEPARATIONS, AnalyticMethod
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import FloatArray, contrast_to_delta_mag
+from amibayes.units import BoolArray, FloatArray, contrast_to_delta_mag
 
 SIGMAS = 3.0
 
@@ -90,6 +89,27 @@ class AnalyticLimit:
     contrast_at: FloatArray
     rings: Rings
     removed: bool = False
+
+    @property
+    def by_detection(self) -> BoolArray:
+        """Where a companion counts wherever it is seen, (n,): nowhere."""
+        return np.zeros(len(self.separation_mas), dtype=bool)
+
+    def facts(self) -> dict[str, Any]:
+        """What it means; see `amibayes.limits.limit.Limit`."""
+        return {
+            "criterion": self.criterion,
+            "companion_removed": self.removed,
+            "false_positive_rate": None,
+            "completeness": None,
+        }
+
+    def columns(self) -> dict[str, FloatArray]:
+        """No further ones."""
+        return {}
+
+    def cells(self) -> None:
+        """None: there are no injections."""
 
     @property
     def criterion(self) -> str:
@@ -154,7 +174,7 @@ def analytic_limit(
     require(combination_of(likelihood, method="closed limits"), likelihood.observables.source)
     rings = make_rings(result, n_separations, separation_mas)
     problem = _Problem.of(result, method, sigmas, remove=remove)
-    contrast, sigma = rings.sensitivity(problem.bank, problem.residuals)
+    contrast, sigma = rings.sensitivity(problem.test.bank, problem.residuals)
     limit = _linear(problem, contrast.ravel(), sigma.ravel())
     bright = np.flatnonzero(~(limit <= LINEAR))
     if len(bright):
@@ -167,8 +187,7 @@ def analytic_limit(
 class _Problem:
     """One criterion on one data set."""
 
-    result: SearchResult
-    bank: TemplateBank
+    test: Statistic
     method: AnalyticMethod
     sigmas: float
     residuals: FloatArray
@@ -180,21 +199,19 @@ class _Problem:
         cls, result: SearchResult, method: AnalyticMethod, sigmas: float, *, remove: bool
     ) -> _Problem:
         likelihood, single = result.likelihood, result.single_theta
-        bank = TemplateBank(likelihood, result.grid, single)
+        test = make_statistic(likelihood, result.grid, single, stated_errors=True)
+        bank, residuals = test.bank, test.observed
         if remove:
             residuals = likelihood.residuals(result.theta)[:, 0]
-        else:
-            residuals = single_likelihood(likelihood).residuals(single)[:, 0]
         residuals = bank.project(residuals)
         chi2, dof = float(residuals @ residuals), bank.n_data - bank.n_nuisance
         worse = chi2 * float(stats.chi2.isf(2.0 * stats.norm.sf(sigmas), dof)) / dof
-        return cls(result, bank, method, sigmas, residuals, chi2, worse)
+        return cls(test, method, sigmas, residuals, chi2, worse)
 
     def signal(self, contrast: FloatArray, places: FloatArray) -> FloatArray:
         """Whitened signal (n_data, n) of companions, what the nuisance could do taken out."""
-        theta = np.column_stack([places, contrast])
-        signal = injected_signal(self.result.likelihood, self.result.single_theta, theta)
-        return self.bank.project(signal)
+        signal = self.test.signal_of(np.column_stack([places, contrast]))
+        return self.test.bank.project(signal)
 
 
 def _linear(problem: _Problem, contrast: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -13,19 +13,18 @@ import numpy as np
 
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolution_mas
-from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.cube import Cube
 from amibayes.cube.source import InMemoryCube
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance, bank_statistic, significance
+from amibayes.detection.false_alarm import Significance, significance
+from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
 from amibayes.errors import DataError
 from amibayes.extraction.frames import Frames, measure_file
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.view import View
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.limits.injection import Recovery, judge, recover
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.limits.injection import Recovery, classify_recovery, recover
 from amibayes.optics import psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
 from amibayes.support.options import ALPHA
@@ -164,8 +163,8 @@ def _filled(frames: Frames, source: str) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What a search says of a data set into which a companion was put.
+class ImageRecovery:
+    """What a search makes of a data set into which a companion was put.
 
     Parameters
     ----------
@@ -189,13 +188,19 @@ class Criterion:
     ----------
     result : SearchResult
         Its data, field, lattice and model are used.
+    test : BankStatistic
+        Of that search.
     significance : Significance
         Its null draws set the threshold, at its α: for whitened data it depends on the number
         of data and on the field, and hardly on the errors.
+    stated_errors : bool
+        The statistic takes the size of the errors for known.
     """
 
     result: SearchResult
+    test: BankStatistic
     significance: Significance
+    stated_errors: bool
 
     def recover(self, companions: FloatArray, rng: np.random.Generator) -> Recovery:
         """Put companions into the model of the search's own data, with fresh noise.
@@ -206,18 +211,10 @@ class Criterion:
             east_mas, north_mas, contrast.
         rng : numpy.random.Generator
         """
-        result = self.result
-        return recover(
-            result.likelihood,
-            TemplateBank(result.likelihood, result.grid, result.single_theta),
-            result.single_theta,
-            np.asarray(companions, dtype=float),
-            self.significance.threshold(),
-            rng,
-            free_scale=self.significance.free_scale,
-        )
+        companions = np.asarray(companions, dtype=float)
+        return recover(self.test, companions, self.significance.threshold(), rng)
 
-    def judge(self, data: Observables, east_mas: float, north_mas: float) -> Verdict:
+    def apply(self, data: Observables, east_mas: float, north_mas: float) -> ImageRecovery:
         """Search data that hold a companion at a known place.
 
         Parameters
@@ -229,18 +226,12 @@ class Criterion:
         """
         likelihood = Likelihood(data.only(self._kinds()), self.result.likelihood.model)
         single, _ = fit_single(likelihood)
-        bank = TemplateBank(likelihood, self.result.grid, single)
-        verdict = judge(
-            bank,
-            resolution_mas(likelihood),
-            np.array([[east_mas, north_mas]]),
-            single_likelihood(likelihood).residuals(single),
-            self.significance.threshold(),
-            free_scale=self.significance.free_scale,
-        )
-        found = (verdict[name][0] for name in ("detected", "located", "statistic"))
-        detected, located, statistic = found
-        return Verdict(bool(detected), bool(located), float(statistic))
+        grid = self.result.grid
+        test = make_statistic(likelihood, grid, single, stated_errors=self.stated_errors)
+        hits, place = test.hits(test.observed[:, None]), np.array([[east_mas, north_mas]])
+        found = classify_recovery(test, place, hits, self.significance.threshold())
+        detected, located = bool(found.detected[0]), bool(found.located[0])
+        return ImageRecovery(detected, located, float(hits.statistic[0]))
 
     def _kinds(self) -> tuple[str, ...]:
         """Kinds of observables that the search used."""
@@ -255,23 +246,21 @@ def make_criterion(
     *,
     alpha: float = ALPHA,
     null_draws: int = 20_000,
-    free_scale: bool = True,
+    stated_errors: bool = False,
 ) -> Criterion:
     """Draw noise to find the statistic that a search takes for a companion.
 
     Parameters
     ----------
     result : SearchResult
-        Of data like those that will be judged.
+        Of data like those that it will be applied to.
     rng : numpy.random.Generator
     alpha : float
         False-alarm probability of a detection.
     null_draws : int
-    free_scale : bool
-        The statistic does not take the size of the errors on trust, as that of the command.
+    stated_errors : bool
+        Take the size of the errors for known; the command does not, by default.
     """
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    residuals = single_likelihood(result.likelihood).residuals(result.single_theta)
-    statistic = float(bank_statistic(bank, residuals, free_scale=free_scale)[0])
-    weight = significance(bank, statistic, null_draws, rng, alpha, free_scale=free_scale)
-    return Criterion(result, weight)
+    test = statistic_of(result, stated_errors=stated_errors)
+    drawn = significance(test, null_draws, rng, alpha)
+    return Criterion(result, test, drawn, stated_errors)

@@ -9,19 +9,15 @@ search, a column of a matrix product.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from amibayes.companion_search.draws import Searched, likelihood_ratio, search_many
 from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.detection.false_alarm import bounded, search_drawn
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.student import SymmetricWhitening
+from amibayes.detection.statistic import Hits, Statistic
+from amibayes.limits.aliases import ambiguous, nearer_alias
 from amibayes.limits.rings import Rings
 from amibayes.parallel import (
     Executor,
@@ -59,16 +55,12 @@ class Trials:
 class InjectionSetup:
     """What stays the same over all rounds."""
 
-    likelihood: Likelihood
-    single: FloatArray
-    frame: SymmetricWhitening | None
-    bank: TemplateBank
+    test: Statistic
     rings: Rings
     nearer: FloatArray
     level: FloatArray
     by_detection: BoolArray
     threshold: float
-    free_scale: bool
     executor: Executor | None
     journals: Journals | None
 
@@ -155,14 +147,10 @@ def _one_round(
         ]
     )
     found = recover(
-        setting.likelihood,
-        setting.bank,
-        setting.single,
+        setting.test,
         theta,
         setting.threshold,
         rng,
-        free_scale=setting.free_scale,
-        frame=setting.frame,
         nearer=setting.nearer[ring, angle],
         executor=setting.executor,
         progress=progress,
@@ -176,14 +164,6 @@ TRIALS_AT_ONCE = 2048
 
 ALIAS = 0.875
 """Correlation of two templates on the lattice above which one position stands for the other."""
-
-
-ALIKE = 0.75
-"""Squared correlation that `innermost_first` calls alike, however bright the companion."""
-
-
-SUBSTEPS = np.linspace(-0.5, 0.5, 5)
-"""Where, in steps of the lattice, an alias is looked for around its best lattice point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,15 +184,11 @@ class Recovery:
 
 
 def recover(
-    likelihood: Likelihood,
-    bank: TemplateBank,
-    single: FloatArray,
-    theta: FloatArray,
+    test: Statistic,
+    companions: FloatArray,
     threshold: float,
     rng: np.random.Generator,
     *,
-    free_scale: bool = False,
-    frame: SymmetricWhitening | None = None,
     nearer: FloatArray | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -222,20 +198,14 @@ def recover(
 
     Parameters
     ----------
-    likelihood : Likelihood
-    bank : TemplateBank
-    single : (n_nuisance,) float array
-        The fit without a companion.
-    theta : (n, 3) float array
+    test : Statistic
+        Draws the noise, and searches.
+    companions : (n, 3) float array
         east_mas, north_mas, contrast (the same in every band, at rest) of each trial. Trials
         at one place are cheapest side by side.
     threshold : float
         Statistic that counts as a detection.
     rng : numpy.random.Generator
-    free_scale : bool
-        The statistic is `profiled`, else 2Δln L with the errors as they are.
-    frame : SymmetricWhitening, optional
-        The statistic is the robust one; see `amibayes.detection.false_alarm.bank_statistic`.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places of the trials, if it is known already.
     executor : Executor, optional
@@ -249,12 +219,12 @@ def recover(
     -------
     Recovery
     """
-    parts = slices(len(theta), TRIALS_AT_ONCE)
+    parts = slices(len(companions), TRIALS_AT_ONCE)
     pieces = [
-        (theta[p], None if nearer is None else nearer[p], seed)
+        (companions[p], None if nearer is None else nearer[p], seed)
         for p, seed in zip(parts, spawn(rng, len(parts)), strict=True)
     ]
-    work = partial(_recover_piece, likelihood, bank, single, threshold, free_scale, frame)
+    work = partial(_recover_piece, test, threshold)
     executor = executor or SerialExecutor()
     done = list(run_job(work, pieces, executor, journal=journal, progress=progress))
     return Recovery(
@@ -263,92 +233,55 @@ def recover(
 
 
 def _recover_piece(
-    likelihood: Likelihood,
-    bank: TemplateBank,
-    single: FloatArray,
+    test: Statistic,
     threshold: float,
-    free_scale: bool,
-    frame: SymmetricWhitening | None,
     piece: tuple[FloatArray, FloatArray | None, np.random.SeedSequence],
 ) -> dict[str, BoolArray]:
-    theta, nearer, seed = piece
-    signal = injected_signal(likelihood, single, theta)
+    companions, nearer, seed = piece
     rng = np.random.default_rng(seed)
-    noise = rng.standard_normal(signal.shape)
-    hit = search_drawn(bank, noise, rng, frame, signal, own_scales=free_scale)
-    fringe, places = resolution_mas(likelihood), theta[:, :2]
-    found = _judged(bank, fringe, places, hit, threshold, free_scale=free_scale, nearer=nearer)
-    return {name: found[name] for name in ("detected", "located")}
+    hits = test.simulated(len(companions), rng, test.signal_of(companions))
+    found = classify_recovery(test, companions[:, :2], hits, threshold, nearer=nearer)
+    return {"detected": found.detected, "located": found.located}
 
 
-def judge(
-    bank: TemplateBank,
-    fringe_mas: float,
+def classify_recovery(
+    test: Statistic,
     places: FloatArray,
-    white: FloatArray,
+    hits: Hits,
     threshold: float,
     *,
-    free_scale: bool = False,
-    frame: SymmetricWhitening | None = None,
     nearer: FloatArray | None = None,
-) -> dict[str, Any]:
-    """Search data sets that hold a companion each.
+) -> Recovery:
+    """Say which data sets that hold a companion each were recovered.
 
     Parameters
     ----------
-    bank : TemplateBank
-    fringe_mas : float
-        λ/B_max.
+    test : Statistic
     places : (n, 2) float array
         east_mas, north_mas of the companions.
-    white : (n_data, n) float array
-        Whitened residuals of the fit without a companion.
+    hits : Hits
+        What the statistic made of the data sets.
     threshold : float
         Statistic that counts as a detection.
-    free_scale : bool
-        The statistic is `profiled`, else 2Δln L with the errors as they are.
-    frame : SymmetricWhitening, optional
-        The statistic is the robust one; see `amibayes.detection.false_alarm.bank_statistic`.
     nearer : (n,) float array, optional
         From `nearer_alias` for the places, if it is known already.
-
-    Returns
-    -------
-    dict of (n,) arrays
-        ``detected`` and ``located`` as in `Recovery`, and the ``statistic``.
     """
-    own = free_scale and frame is None
-    hit = search_many(bank, bounded(bank, white, frame), own_scales=own)
-    return _judged(bank, fringe_mas, places, hit, threshold, free_scale=free_scale, nearer=nearer)
-
-
-def _judged(
-    bank: TemplateBank,
-    fringe_mas: float,
-    places: FloatArray,
-    hit: Searched,
-    threshold: float,
-    *,
-    free_scale: bool,
-    nearer: FloatArray | None,
-) -> dict[str, Any]:
-    """What the search makes of what was found, as `judge` has it."""
-    statistic = likelihood_ratio(bank, hit.gain, hit.chi2, free_scale=free_scale)
-    position, detected = hit.position, statistic > threshold
+    bank, fringe = test.bank, resolution_mas(test.likelihood)
+    position, detected = hits.position, hits.statistic > threshold
     found = np.column_stack([bank.grid.east_mas[position], bank.grid.north_mas[position]])
-    right = at_its_place(found, places, fringe_mas)
-    doubtful = np.flatnonzero(detected & ~right)
-    right[doubtful] = _correlation(bank, found[doubtful], places[doubtful]) > ALIAS
-    # Aliases are the dearest part: only those are asked for that decide something.
+    right = at_its_place(found, places, fringe)
+    elsewhere = np.flatnonzero(detected & ~right)
+    right[elsewhere] = _correlation(bank, found[elsewhere], places[elsewhere]) > ALIAS
+    # Aliases are the dearest part: only those are looked for that decide something.
     sure = np.flatnonzero(detected & right)
     if nearer is None:
         distinct, which = np.unique(places[sure], axis=0, return_inverse=True)
-        closer = nearer_alias(bank, fringe_mas, distinct)[which.ravel()]
+        closer = nearer_alias(bank, fringe, distinct)[which.ravel()]
     else:
         closer = nearer[sure]
     located = np.zeros(len(places), dtype=bool)
-    located[sure] = ~ambiguous(closer, hit.gain[sure])
-    return {"detected": detected, "located": located, "statistic": statistic}
+    located[sure] = ~ambiguous(closer, hits.gain[sure])
+    return Recovery(detected, located)
 
 
 def at_its_place(found: FloatArray, places: FloatArray, fringe_mas: float) -> BoolArray:
@@ -362,145 +295,3 @@ def _correlation(bank: TemplateBank, there: FloatArray, here: FloatArray) -> Flo
         return np.empty(0)
     pair = [bank.templates_at(*place.T) for place in (there, here)]
     return np.asarray((pair[0] * pair[1]).sum(axis=0))
-
-
-def ambiguous(nearer: FloatArray, gain: FloatArray) -> BoolArray:
-    """Say where the search would report an alias that is nearer to the star.
-
-    Parameters
-    ----------
-    nearer : (n,) float array
-        From `nearer_alias`.
-    gain : (n,) float array
-        In χ². Fits that differ by less than 9 over all the data are alike to
-        `amibayes.companion_search.search.innermost_first`, and so are any whose difference is less
-        than half of the signal.
-    """
-    alike = np.minimum(1.0 - ALIKE, 9.0 / np.maximum(gain, 1e-30))
-    return np.asarray(1.0 - np.clip(nearer, 0.0, 1.0) ** 2 < alike)
-
-
-def nearer_aliases(
-    bank: TemplateBank,
-    places: FloatArray,
-    fringe_mas: float,
-    *,
-    executor: Executor | None = None,
-    journal: Journal | None = None,
-) -> FloatArray:
-    """`nearer_alias` of many places, (n_pieces, n, 2), as a job; (n_pieces, n)."""
-    work = partial(_alias_piece, bank, fringe_mas)
-    done = run_job(work, list(places), executor or SerialExecutor(), journal=journal)
-    return np.array([piece["correlation"] for piece in done])
-
-
-def _alias_piece(
-    bank: TemplateBank, fringe_mas: float, places: FloatArray
-) -> dict[str, FloatArray]:
-    return {"correlation": nearer_alias(bank, fringe_mas, places)}
-
-
-def nearer_alias(bank: TemplateBank, fringe_mas: float, places: FloatArray) -> FloatArray:
-    """Largest correlation with a position that is nearer to the star and not the same one.
-
-    Parameters
-    ----------
-    bank : TemplateBank
-    fringe_mas : float
-        Positions within it are the same. Without closure phases so are those within half of
-        it about the opposite place, which no data tell and no rule prefers.
-    places : (n, 2) float array
-        east_mas, north_mas.
-
-    Returns
-    -------
-    (n,) float array
-        0 where there is none.
-    """
-    clear, marginal = _best_inward(bank, fringe_mas, places)
-    radius = np.hypot(*places.T)
-    found = np.zeros(len(places))
-    for most, where in (clear, marginal):
-        most, at = _between_lattice_points(bank, places, most, where)
-        found = np.maximum(found, np.where(np.hypot(*at.T) < radius, most, 0.0))
-    return found
-
-
-def _best_inward(
-    bank: TemplateBank, fringe_mas: float, places: FloatArray
-) -> list[tuple[FloatArray, IntArray]]:
-    """Largest correlations on the lattice and where they are, (n,) each.
-
-    First among positions nearer to the star by a step of the lattice or more, then among
-    those at the same separation within a step, of which the lattice cannot tell.
-    """
-    own = bank.templates_at(*places.T)
-    radius, grid = np.hypot(*places.T)[:, None], bank.grid
-    best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
-    each = np.arange(len(places))
-    for index, templates in bank.chunks():
-        match = own.T @ templates
-        east, north = grid.east_mas[index], grid.north_mas[index]
-        match[_same_place(bank, fringe_mas, places, east, north)] = 0.0
-        inward = (radius - np.hypot(east, north)) / grid.step_mas
-        for (most, where), zone in zip(best, (inward > 1.0, np.abs(inward) <= 1.0), strict=True):
-            here = np.where(zone, match, 0.0)
-            top = here.argmax(axis=1)
-            better = here[each, top] > most
-            most[better], where[better] = here[each, top][better], index[top[better]]
-    return best
-
-
-def _same_place(
-    bank: TemplateBank,
-    fringe_mas: float,
-    places: FloatArray,
-    east: FloatArray,
-    north: FloatArray,
-) -> BoolArray:
-    """Which positions (m,) count as the same as a place (n, 2), or as its opposite; (n, m)."""
-    along = np.outer(places[:, 0], east) + np.outer(places[:, 1], north)
-    square = (east**2 + north**2)[None] + (places**2).sum(axis=1)[:, None]
-    same = square - 2.0 * along < fringe_mas**2
-    if bank.symmetric:
-        same |= square + 2.0 * along < (0.5 * fringe_mas) ** 2
-    return np.asarray(same)
-
-
-def _between_lattice_points(
-    bank: TemplateBank, places: FloatArray, most: FloatArray, where: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Look around the best lattice points: near 1 a correlation must be known well.
-
-    Returns
-    -------
-    best : (n,) float array
-    at : (n, 2) float array
-        Where it is.
-    """
-    grid = bank.grid
-    at = np.column_stack([grid.east_mas[where], grid.north_mas[where]])
-    likely = np.flatnonzero(most**2 > 0.8 * ALIKE)
-    if not len(likely):
-        return most, at
-    own = bank.templates_at(*places[likely].T)
-    best, middle = most[likely], at[likely]
-    for shift in itertools.product(SUBSTEPS * grid.step_mas, repeat=2):
-        there = middle + shift
-        match = (own * bank.templates_at(*there.T)).sum(axis=0)
-        better = match > best
-        best[better], at[likely[better]] = match[better], there[better]
-    out = most.copy()
-    out[likely] = best
-    return out, at
-
-
-def injected_signal(likelihood: Likelihood, single: FloatArray, theta: FloatArray) -> FloatArray:
-    """Whitened change of the data by companions (n, 3) on top of the fit without one."""
-    whole = likelihood.model.at_rest(theta)
-    full = np.hstack([whole, np.broadcast_to(single, (len(theta), len(single)))])
-    alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
-    change = likelihood.predict(full) - alone
-    closure = change[likelihood.samples.squares.shape[0] :]
-    closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-    return likelihood.observables.covariance.whiten(change)

@@ -2,46 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from amibayes.companion_search.joint_bank import bank_of
-from amibayes.companion_search.result import SearchResult, null_likelihood
-from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.detection.false_alarm import (
-    Significance,
-    bank_statistic,
-    significance,
-    statistic_field,
-)
-from amibayes.likelihood.likelihood import single_likelihood
-from amibayes.likelihood.student import SymmetricWhitening
+from amibayes.companion_search.result import SearchResult
+from amibayes.detection.false_alarm import Significance, significance
+from amibayes.detection.statistic import statistic_of
 from amibayes.parallel import Executor, Journal, Progress
 from amibayes.pipeline.options import SearchOptions
-from amibayes.units import FloatArray
 
 
-def weigh(
+def false_alarm(
     result: SearchResult,
     options: SearchOptions,
     rng: np.random.Generator,
-    executor: Executor | None,
-    progress: Progress | None,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
     journal: Journal | None = None,
 ) -> Significance:
-    """Weigh the search; unless errors are to be trusted, by a statistic free of their scale.
+    """Find the chance that noise alone gives what the search found.
 
-    Whether noise was added depends on the data, and a false companion can hide that it
-    should have been: a statistic that does not know the scale needs no such decision.
+    Unless ``options`` take the stated errors for right, by a statistic free of their scale.
     """
-    likelihood, frame = null_likelihood(result)
-    bank = bank_of(likelihood, result.grid, result.single_theta)
-    residuals = single_likelihood(likelihood).residuals(result.single_theta)
-    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, journal)
-    weight = run.judge(bank, residuals, options, rng)
-    field = statistic_field(bank, residuals[:, 0], free_scale=run.free_scale, frame=frame)
-    return replace(weight, field=field)
+    test = statistic_of(result, stated_errors=not options.extra_noise)
+    found = significance(
+        test,
+        options.null_draws,
+        rng,
+        options.alpha,
+        executor=executor,
+        progress=progress,
+        journal=journal,
+    )
+    return replace(found, field=test.field(test.observed))
 
 
 def second_false_alarm(
@@ -51,46 +45,12 @@ def second_false_alarm(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Significance:
-    """Weigh what the first companion leaves: the chance that noise alone gives a second one.
+    """Find the chance that noise alone gives a second companion beside the first.
 
     All that the first companion can do by moving or brightening is projected out, of the
     data and of the null sets.
     """
-    likelihood, frame = null_likelihood(result)
-    bank = bank_of(likelihood, result.grid, result.single_theta, beside=result.theta)
-    residuals = likelihood.residuals(result.theta)
-    run = _Nulls(frame, options.extra_noise or frame is not None, executor, progress, None)
-    return run.judge(bank, residuals, options, rng)
-
-
-@dataclass(frozen=True)
-class _Nulls:
-    """How null searches are run."""
-
-    frame: SymmetricWhitening | None
-    free_scale: bool
-    executor: Executor | None
-    progress: Progress | None
-    journal: Journal | None
-
-    def judge(
-        self,
-        bank: TemplateBank,
-        residuals: FloatArray,
-        options: SearchOptions,
-        rng: np.random.Generator,
-    ) -> Significance:
-        """Place the statistic of residuals (n_data, 1) among null searches."""
-        statistic = bank_statistic(bank, residuals, free_scale=self.free_scale, frame=self.frame)
-        return significance(
-            bank,
-            float(statistic[0]),
-            options.null_draws,
-            rng,
-            options.alpha,
-            free_scale=self.free_scale,
-            frame=self.frame,
-            executor=self.executor,
-            progress=self.progress,
-            journal=self.journal,
-        )
+    test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
+    return significance(
+        test, options.null_draws, rng, options.alpha, executor=executor, progress=progress
+    )

@@ -15,11 +15,12 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.limits.analytic import AnalyticLimit, analytic_limit
-from amibayes.limits.completeness import DetectionLimit, detection_limit
+from amibayes.limits.analytic import analytic_limit
+from amibayes.limits.completeness import detection_limit
+from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
 from amibayes.parallel import Executor, Journals, Progress
-from amibayes.pipeline.false_alarm import weigh
+from amibayes.pipeline.false_alarm import false_alarm
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Clock, Prepared, Stage, prepare
 from amibayes.pipeline.search import search_field
@@ -80,14 +81,14 @@ class MeasuredLimit:
         Of the search whose limit it is.
     noise : ExtraNoise
     significance : Significance or None
-    limit : DetectionLimit or AnalyticLimit
+    limit : Limit
     """
 
     observables: Kinds
     result: SearchResult
     noise: ExtraNoise
     significance: Significance | None
-    limit: DetectionLimit | AnalyticLimit
+    limit: Limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +246,7 @@ def _one_limit(
     if search.null_draws:
         with where.clock.stage(f"null searches {name}"):
             journal = journals.of("null") if journals else None
-            weight = weigh(
+            weight = false_alarm(
                 result, search, streams[0], where.executor, where.progress, journal=journal
             )
     with where.clock.stage(f"limits {name}"):
@@ -261,7 +262,7 @@ def _limit(
     rng: np.random.Generator,
     journals: Journals | None,
     where: _Where,
-) -> DetectionLimit | AnalyticLimit:
+) -> Limit:
     if options.criterion != "injection":
         remove = weight is not None and bool(weight.detected)
         return analytic_limit(

@@ -10,7 +10,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.limits.completeness import DetectionLimit
+from amibayes.limits.limit import DetectionLimit
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.vetting import Vetting
 from amibayes.posterior.ensemble import Posterior

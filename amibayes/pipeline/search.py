@@ -26,10 +26,11 @@ from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.limits.completeness import DetectionLimit, detection_limit
+from amibayes.limits.completeness import detection_limit
+from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
 from amibayes.parallel import Executor, Progress
-from amibayes.pipeline.false_alarm import second_false_alarm, weigh
+from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Clock, Stage, prepare
 from amibayes.pipeline.report_types import SearchReport
@@ -159,7 +160,7 @@ class _Run:
             return None
         with self.clock.stage("significance"):
             rng = self.streams["significance"]
-            return weigh(result, self.options, rng, self.executor, self.progress)
+            return false_alarm(result, self.options, rng, self.executor, self.progress)
 
     def limits(self, result: SearchResult, weight: Significance | None) -> DetectionLimit | None:
         """Measure the detection limits; None where unwanted or without null draws."""

@@ -19,17 +19,18 @@ from scipy.sparse.csgraph import connected_components
 
 from amibayes.calibration import calibrate
 from amibayes.calibration.matching import keys_of, match, sharing
-from amibayes.companion_search.draws import profiled
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolves_stars, search
-from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance, bank_statistic, significance
+from amibayes.detection.false_alarm import Significance, significance
+from amibayes.detection.statistic import statistic_of
+from amibayes.detection.treatments import Ratio
 from amibayes.errors import DataError
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.limits.completeness import DetectionLimit, detection_limit
+from amibayes.limits.completeness import detection_limit
+from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
 from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
 from amibayes.units import BoolArray
@@ -244,11 +245,8 @@ def _by_itself(
     free = resolves_stars(Likelihood(data))
     likelihood = Likelihood(data, BinaryModel(diameter_mas="free" if free else 0.0))
     found = search(likelihood, separation_mas)
-    bank = TemplateBank(likelihood, found.grid, found.single_theta)
-    # Neither test takes the size of the stated errors on trust.
-    residuals = single_likelihood(likelihood).residuals(found.single_theta)
-    statistic = float(bank_statistic(bank, residuals, free_scale=True)[0])
-    weight = significance(bank, statistic, null_draws, rng, alpha, free_scale=True)
+    # Neither test takes the size of the stated errors for known.
+    weight = significance(statistic_of(found), null_draws, rng, alpha)
     limit = detection_limit(found, weight, rng) if limits else None
     verdict = replace(verdict, companion=found, significance=weight, limit=limit)
     if not data.n_vis2:
@@ -258,7 +256,7 @@ def _by_itself(
     chi2 = float(single_likelihood(disc).chi2(best)[0])
     point = float(disc.chi2([[0.0, 0.0, 0.0, 0.0]])[0])
     # A diameter cannot be negative: half of the χ² distribution of one degree of freedom.
-    gain = profiled(np.array([max(point - chi2, 0.0)]), np.array([point]), data.n_independent)
+    gain = Ratio.scale_free(data.n_independent)(np.array([max(point - chi2, 0.0)]), point)
     probability = 0.5 * float(stats.chi2.sf(gain[0], 1))
     return replace(verdict, diameter_mas=float(best[0]), diameter_probability=probability)
 

@@ -150,9 +150,12 @@ def probability_maps(weight: Significance) -> dict[str, FloatArray]:
     ValueError
         Where the significance holds no field.
     """
-    if weight.field is None:
+    if weight.field is None or weight.test is None:
         raise ValueError("this significance holds no statistic per position")
-    return {"local": weight.local_survival(weight.field), "global": weight.survival(weight.field)}
+    return {
+        "local": weight.test.local_survival(weight.field),
+        "global": weight.survival(weight.field),
+    }
 
 
 def _outline_extrapolation(ax: Axes, grid: Grid, weight: Significance) -> None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import resolution_mas
 from amibayes.detection.false_alarm import Significance
-from amibayes.limits.completeness import DetectionLimit
+from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
@@ -104,7 +104,7 @@ def _calibrators(report: SearchReport) -> Figure:
 def _null(weight: Significance) -> Figure:
     label = (
         "Largest 2Δln L anywhere in the field, scale of the noise free"
-        if weight.free_scale
+        if weight.test is not None and weight.test.label != "Δχ²"
         else "Largest Δχ² anywhere in the field"
     )
     return null_plot(
@@ -159,22 +159,24 @@ def _completeness(report: SearchReport) -> Figure:
     return completeness_picture(report.limits)
 
 
-def completeness_picture(limits: DetectionLimit) -> Figure:
+def completeness_picture(limits: Limit) -> Figure:
     """Draw the completeness map of a limit by injection."""
-    magnitude = contrast_to_delta_mag(limits.level)
+    cells = limits.cells()
+    assert cells is not None
+    magnitude, share = np.array(cells["delta_mag"]), np.array(cells["completeness"])
     low, high = float(magnitude.min()), float(magnitude.max())
     regular = np.linspace(low, high, 60)
     fraction = np.array(
         [
             np.interp(regular, mag, s, left=np.nan, right=np.nan)
-            for mag, s in zip(magnitude[:, ::-1], limits.share[:, ::-1], strict=True)
+            for mag, s in zip(magnitude[:, ::-1], share[:, ::-1], strict=True)
         ]
     )
     return completeness_map(
         limits.separation_mas,
         regular,
         fraction,
-        c50=contrast_to_delta_mag(limits.contrast_50),
+        c50=limits.columns()["delta_mag_50"],
         c95=limits.delta_mag,
     )
 
@@ -187,7 +189,7 @@ def limits_picture_names(method: str) -> list[str]:
 def save_limits_pictures(report: LimitsReport, folder: Path) -> None:
     """Draw the curves of all limits, and the completeness map of the main one."""
     save(limits_picture(report), folder / "limits.png")
-    if isinstance(report.main.limit, DetectionLimit):
+    if report.main.limit.cells() is not None:
         save(completeness_picture(report.main.limit), folder / "completeness.png")
 
 
@@ -197,9 +199,8 @@ def limits_picture(report: LimitsReport) -> Figure:
     for measured in report.limits:
         limit = measured.limit
         low, _, high = contrast_to_delta_mag(limit.spread).T
-        marked = limit.by_detection if isinstance(limit, DetectionLimit) else None
         curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
-            limit.delta_mag, low, high, marked
+            limit.delta_mag, low, high, limit.by_detection
         )
     weight, main = report.main.significance, report.main.result
     found = main.companion if weight is not None and weight.detected else None

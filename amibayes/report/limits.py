@@ -9,17 +9,14 @@ from astropy.table import Table
 
 from amibayes import __version__
 from amibayes.companion_search.search import resolution_mas
-from amibayes.limits.analytic import AnalyticLimit
-from amibayes.limits.completeness import DetectionLimit
+from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
 from amibayes.support.atomic_files import atomic_path
 from amibayes.units import contrast_to_delta_mag
 
-MAG_PER_LOG = 2.5 / np.log(10.0)
 
-
-def limits_json(limits: DetectionLimit | AnalyticLimit) -> Json:
+def limits_json(limits: Limit) -> Json:
     """Build the content of ``limits`` in ``result.json``; null where no contrast will do."""
     out: Json = {
         "method": limits.method,
@@ -28,28 +25,8 @@ def limits_json(limits: DetectionLimit | AnalyticLimit) -> Json:
         "contrast": numbers(limits.contrast),
         "delta_mag_spread": [numbers(row) for row in contrast_to_delta_mag(limits.spread)],
     }
-    if isinstance(limits, AnalyticLimit):
-        return out | {
-            "criterion": limits.criterion,
-            "companion_removed": limits.removed,
-            "false_positive_rate": None,
-            "completeness": None,
-        }
-    return out | {
-        "criterion": "false-alarm probability of the search below the false-positive rate, and "
-        "position within lambda/2B of the truth (anywhere, where criterion_at says detection)",
-        "criterion_at": ["detection" if d else "position" for d in limits.by_detection],
-        "ambiguous_share": list(limits.ambiguous),
-        "delta_mag_error": numbers(MAG_PER_LOG * limits.log_error),
-        "delta_mag_50": numbers(contrast_to_delta_mag(limits.contrast_50)),
-        "delta_mag_50_error": numbers(MAG_PER_LOG * limits.log_error_50),
-        "false_positive_rate": limits.false_positive_rate,
-        "false_positive_rate_measured": limits.false_positives[0] / limits.false_positives[1],
-        "false_positive_interval": list(limits.false_positive_interval),
-        "threshold": limits.threshold,
-        "completeness": limits.completeness,
-        "n_trials": int(limits.trials.sum()),
-    }
+    facts = {k: numbers(v) if isinstance(v, np.ndarray) else v for k, v in limits.facts().items()}
+    return out | facts
 
 
 def limits_report_json(report: LimitsReport, request: str = "") -> Json:
@@ -94,21 +71,10 @@ def _curve(measured: MeasuredLimit, report: LimitsReport) -> Json:
     return out
 
 
-def _map(limit: DetectionLimit | AnalyticLimit) -> Json | None:
+def _map(limit: Limit) -> Json | None:
     """Completeness of every cell, with its Jeffreys interval; null for closed criteria."""
-    if isinstance(limit, AnalyticLimit):
-        return None
-    low, high = limit.jeffreys()
-    return {
-        "separation_mas": list(limit.separation_mas),
-        "contrast": limit.level.tolist(),
-        "delta_mag": contrast_to_delta_mag(limit.level).tolist(),
-        "trials": limit.trials.tolist(),
-        "detected": limit.detected.tolist(),
-        "located": limit.located.tolist(),
-        "completeness": [numbers(row) for row in limit.share],
-        "jeffreys_68": [low.tolist(), high.tolist()],
-    }
+    cells = limit.cells()
+    return cells and cells | {"completeness": [numbers(row) for row in cells["completeness"]]}
 
 
 def limits_table(report: LimitsReport) -> Table:
@@ -137,10 +103,8 @@ def _add_columns(table: Table, measured: MeasuredLimit, report: LimitsReport) ->
         f"delta_mag_{percent}": contrast_to_delta_mag(spread)
         for percent, spread in zip(("p16", "p50", "p84"), limit.spread.T, strict=True)
     }
-    if isinstance(limit, DetectionLimit):
-        columns["delta_mag_error"] = MAG_PER_LOG * limit.log_error
-        columns["delta_mag_c50"] = contrast_to_delta_mag(limit.contrast_50)
-        columns["delta_mag_c50_error"] = MAG_PER_LOG * limit.log_error_50
+    columns |= {key.replace("_50", "_c50"): values for key, values in limit.columns().items()}
+    if limit.cells() is not None:
         table[f"by_detection_{name}"] = limit.by_detection
     for key, values in columns.items():
         table[f"{key}_{name}"] = values

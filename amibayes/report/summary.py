@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.tails import MIN_PROBABILITY
-from amibayes.limits.completeness import DetectionLimit
+from amibayes.limits.limit import DetectionLimit
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import Evidence

@@ -12,7 +12,6 @@ from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
-from amibayes.companion_search.draws import profiled, search_many, search_simulated
 from amibayes.companion_search.joint_bank import JointBank, bank_of, trial_rates
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.residuals_by_file import file_residuals
@@ -25,7 +24,8 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.point_source import point_source
-from amibayes.detection.false_alarm import bank_statistic, null_maxima, significance
+from amibayes.detection.rotations import Rotations
+from amibayes.detection.statistic import make_statistic
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.averaged_noise import averaged_noise, files_share_errors
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, add_noise
@@ -320,17 +320,18 @@ NULLS = {
 
 
 @pytest.mark.parametrize("name", list(NULLS))
-@pytest.mark.parametrize("free_scale", [True, False])
-def test_reported_probability_of_a_joint_null_is_uniform(name, free_scale) -> None:
+@pytest.mark.parametrize("stated_errors", [False, True])
+def test_reported_probability_of_a_joint_null_is_uniform(name, stated_errors) -> None:
     """500 null sets of another maker: Kolmogorov-Smirnov p > 1e-4, P(p < 0.05) within 4 σ."""
     rng = np.random.default_rng(31)
     sheets, options = NULLS[name]
     likelihood = free(join(sheets), **options)
-    bank = bank_of(likelihood, make_grid(*FIELD, 30.0), np.empty(0))
-    assert isinstance(bank, JointBank)
-    null = np.sort(null_maxima(bank, 8000, rng, free_scale=free_scale))
+    grid = make_grid(*FIELD, 30.0)
+    test = make_statistic(likelihood, grid, np.empty(0), stated_errors=stated_errors)
+    assert isinstance(test.bank, JointBank)
+    null = np.sort(test.draw_null(8000, rng))
     white = likelihood.observables.covariance.whiten(null_data(sheets, rng, 500))
-    statistic = bank_statistic(bank, white, free_scale=free_scale)
+    statistic = test.evaluate(white)
     p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
     assert stats.kstest(p, "uniform").pvalue > 1e-4
     assert abs((p < 0.05).sum() - 25) < 4 * np.sqrt(500 * 0.05 * 0.95)
@@ -355,10 +356,8 @@ def unequal(scales: tuple[float, ...], n: int, rng: np.random.Generator) -> np.n
             turned = replace(sheet.closure_phase, value=closure)
             parts.append(replace(sheet, vis2=moved, closure_phase=turned))
         likelihood = free(join(parts))
-        bank = bank_of(likelihood, make_grid(*FIELD, 60.0), np.empty(0))
-        white = single_likelihood(likelihood).residuals(np.empty((1, 0)))
-        statistic = float(bank_statistic(bank, white, free_scale=True)[0])
-        null = null_maxima(bank, 400, rng, free_scale=True)
+        test = make_statistic(likelihood, make_grid(*FIELD, 60.0), np.empty(0))
+        statistic, null = test.value, test.draw_null(400, rng)
         ties = rng.random() * (null == statistic).sum()
         out[i] = (1 + (null > statistic).sum() + ties) / 401
     return out
@@ -382,18 +381,17 @@ def test_local_probability_of_two_bands_is_the_chance_at_one_place() -> None:
     """One place, 40 000 draws: the share above against the stated one, 4.5 σ."""
     rng = np.random.default_rng(32)
     likelihood = free(join(NULLS["two filters"][0]))
-    bank = bank_of(likelihood, make_grid(150.0, 151.0, 150.5), np.empty(0))
-    for free_scale in (True, False):
-        weight = significance(bank, 5.0, 2000, rng, free_scale=free_scale)
+    grid = make_grid(150.0, 151.0, 150.5)
+    for stated_errors in (False, True):
+        test = make_statistic(likelihood, grid, np.empty(0), stated_errors=stated_errors)
+        bank = test.bank
         white = rng.standard_normal((bank.n_data, 40_000))
         data = bank.project(white)
         first = next(iter(bank._all_templates()))[2]
         _, gain = first.best([data.T @ unit for unit in first.unit])
-        gain = gain[:, 0]
-        if free_scale:
-            gain = profiled(gain, (data**2).sum(axis=0), bank.n_data - bank.n_nuisance)
+        gain = test.ratio(gain[:, 0], (data**2).sum(axis=0))
         for at in (1.0, 4.0, 9.0):
-            expected = float(weight.local_survival(np.array(at)))
+            expected = float(test.local_survival(np.array(at)))
             error = np.sqrt(expected * (1.0 - expected) / 40_000)
             assert abs((gain > at).mean() - expected) < 4.5 * error
 
@@ -585,19 +583,22 @@ def test_estimates_drawn_anew_search_all_bands(model, rng) -> None:
     """Against the bank of each null set's own estimate, bands correlated and all."""
     data = replace(join(NULLS["two filters"][0]), freedom=Freedom(90.0, 50.0))
     grid, nuisance = make_grid(*FIELD, 60.0), np.zeros(len(model.parameters.nuisance))
-    bank = bank_of(joint_likelihood(Likelihood(data, model)), grid, nuisance)
+    test = make_statistic(joint_likelihood(Likelihood(data, model)), grid, nuisance)
+    bank = test.bank
     noise = rng.standard_normal((bank.n_data, 3))
-    found = search_simulated(bank, noise, np.random.default_rng(7))
-    assert bank.estimate is not None
-    means = bank.estimate.draw(noise, np.random.default_rng(7))
+    assert isinstance(test.treatment, Rotations)
+    found = test.treatment.search_simulated(bank, noise, np.random.default_rng(7))
+    means = test.treatment.null.draw(noise, np.random.default_rng(7))
     colour = np.linalg.pinv(data.covariance.whitening.toarray())
-    own = bank.estimate.residual
+    own = test.treatment.null.residual
     for k in range(3):
         outer = np.outer(own, own) - np.outer(means[:, k], means[:, k])
         matrix = colour @ (np.eye(len(own)) + outer / 88.0) @ colour.T
         covariance = dense_covariance(matrix, linalg.orth(colour))
         alone = replace(data, covariance=covariance, freedom=None)
-        other = bank_of(joint_likelihood(Likelihood(alone, model)), grid, nuisance)
-        expected = search_many(other, covariance.whiten(colour @ means[:, k])[:, None])
+        other = make_statistic(
+            joint_likelihood(Likelihood(alone, model)), grid, nuisance, stated_errors=True
+        )
+        expected = other.hits(covariance.whiten(colour @ means[:, k])[:, None])
         assert found.gain[k] == pytest.approx(expected.gain[0], rel=1e-3)
         assert found.position[k] == expected.position[0]

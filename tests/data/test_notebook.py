@@ -17,7 +17,7 @@ from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.completeness import detection_limit
-from amibayes.pipeline.false_alarm import weigh
+from amibayes.pipeline.false_alarm import false_alarm
 from amibayes.pipeline.options import SearchOptions
 from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import grid_posterior
@@ -87,7 +87,7 @@ def test_posterior(found: SearchResult) -> None:
 
 def test_limits_and_weights_in_a_line(found: SearchResult) -> None:
     options = SearchOptions(null_draws=2000)
-    weight = weigh(found, options, np.random.default_rng(1), None, None)
+    weight = false_alarm(found, options, np.random.default_rng(1), None, None)
     limit = detection_limit(
         found, weight, np.random.default_rng(2), trials_per_cell=20, separation_mas=[100.0, 300.0]
     )

@@ -12,19 +12,15 @@ from noise_maker import Recipe
 from scipy import linalg, stats
 from scipy.sparse import csr_array
 
-from amibayes.companion_search.draws import search_simulated
 from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank, make_grid
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import dense_covariance, sparse_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
-from amibayes.detection.false_alarm import (
-    bank_statistic,
-    null_maxima,
-    significance,
-    statistic_field,
-)
+from amibayes.detection.false_alarm import significance
+from amibayes.detection.rotations import Rotations
+from amibayes.detection.statistic import BankStatistic, make_statistic
 from amibayes.extraction.shrinkage import shrunk_covariance
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
@@ -36,8 +32,9 @@ UNEVEN = Recipe(
 )
 
 
-def bank_of(data: Observables, step_mas: float) -> TemplateBank:
-    return TemplateBank(Likelihood(data), make_grid(*FIELD, step_mas), np.empty(0))
+def made(data: Observables, step_mas: float, *, stated_errors: bool = False) -> BankStatistic:
+    grid = make_grid(*FIELD, step_mas)
+    return make_statistic(Likelihood(data), grid, np.empty(0), stated_errors=stated_errors)
 
 
 def basis_of(data: Observables) -> np.ndarray:
@@ -46,7 +43,7 @@ def basis_of(data: Observables) -> np.ndarray:
 
 
 def probabilities(
-    kind: str, n: int, rng: np.random.Generator, *, free_scale: bool, step_mas: float = 23.5
+    kind: str, n: int, rng: np.random.Generator, *, stated_errors: bool, step_mas: float = 23.5
 ) -> np.ndarray:
     """Reported probabilities of n null data sets whose covariance is known."""
     sheet = niriss(covariance="diagonal" if kind == "diagonal" else "assumed")
@@ -58,10 +55,10 @@ def probabilities(
     noise = {"diagonal": Recipe(), "given": GAINS}.get(kind, Recipe()).draw(rng, n)
     if kind == "diagonal":
         noise[21:] = rng.normal(0.0, np.radians(0.3), (35, n))
-    bank = bank_of(sheet, step_mas)
+    test = made(sheet, step_mas, stated_errors=stated_errors)
     white = sheet.covariance.whiten(noise[-sheet.covariance.size :])
-    found = bank_statistic(bank, white, free_scale=free_scale)
-    null = np.sort(null_maxima(bank, 20_000, rng, free_scale=free_scale))
+    found = test.evaluate(white)
+    null = np.sort(test.draw_null(20_000, rng))
     return (1 + len(null) - np.searchsorted(null, found)) / (1 + len(null))
 
 
@@ -92,19 +89,12 @@ class Estimated:
                 freedom=found.carried,
                 scatter=csr_array(found.scatter / size) if found.carried else None,
             )
-            out[k] = self._reported(data, mean, rng)
+            out[k] = self._reported(data, rng)
         return out
 
-    def _reported(
-        self, data: Observables, mean: np.ndarray, rng: np.random.Generator
-    ) -> list[float]:
-        bank, white = bank_of(data, self.step_mas), data.covariance.whiten(mean)[:, None]
-        reported = []
-        for free in (False, True):
-            statistic = float(bank_statistic(bank, white, free_scale=free)[0])
-            weight = significance(bank, statistic, self.draws, rng, 0.05, free_scale=free)
-            reported.append(weight.probability)
-        return reported
+    def _reported(self, data: Observables, rng: np.random.Generator) -> list[float]:
+        tests = [made(data, self.step_mas, stated_errors=stated) for stated in (True, False)]
+        return [significance(test, self.draws, rng, 0.05).probability for test in tests]
 
 
 def with_values(sheet: Observables, noise: np.ndarray) -> Observables:
@@ -125,11 +115,11 @@ def check(p: np.ndarray, least: float, low: float = 0.01) -> None:
 KNOWN = ["kernel", "assumed", "diagonal", "given"]
 
 
-@pytest.mark.parametrize("free_scale", [False, True])
+@pytest.mark.parametrize("stated_errors", [True, False])
 @pytest.mark.parametrize("kind", KNOWN)
-def test_probability_is_uniform_in_400_null_sets(kind: str, free_scale: bool) -> None:
-    rng = np.random.default_rng([1, KNOWN.index(kind), free_scale])
-    check(probabilities(kind, 400, rng, free_scale=free_scale, step_mas=31.0), 1e-4, 0.05)
+def test_probability_is_uniform_in_400_null_sets(kind: str, stated_errors: bool) -> None:
+    rng = np.random.default_rng([1, KNOWN.index(kind), not stated_errors])
+    check(probabilities(kind, 400, rng, stated_errors=stated_errors, step_mas=31.0), 1e-4, 0.05)
 
 
 def test_probability_is_uniform_with_estimated_covariance() -> None:
@@ -139,11 +129,11 @@ def test_probability_is_uniform_with_estimated_covariance() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("free_scale", [False, True])
+@pytest.mark.parametrize("stated_errors", [True, False])
 @pytest.mark.parametrize("kind", KNOWN)
-def test_probability_is_uniform_in_2000_null_sets(kind: str, free_scale: bool) -> None:
-    rng = np.random.default_rng([3, KNOWN.index(kind), free_scale])
-    check(probabilities(kind, 2000, rng, free_scale=free_scale), 0.01)
+def test_probability_is_uniform_in_2000_null_sets(kind: str, stated_errors: bool) -> None:
+    rng = np.random.default_rng([3, KNOWN.index(kind), not stated_errors])
+    check(probabilities(kind, 2000, rng, stated_errors=stated_errors), 0.01)
 
 
 ESTIMATED = {
@@ -183,9 +173,8 @@ def scaled(n: int, vis2: float, closure: float, rng: np.random.Generator) -> np.
     out = np.empty(n)
     for k in range(n):
         data = with_values(sheet, noise[:, k])
-        bank, white = bank_of(data, 47.0), data.covariance.whiten(noise[:, k : k + 1])
-        statistic = float(bank_statistic(bank, white, free_scale=True)[0])
-        null = null_maxima(bank, 400, rng, free_scale=True)
+        test = made(data, 47.0)
+        statistic, null = test.value, test.draw_null(400, rng)
         above, ties = (null > statistic).sum(), (null == statistic).sum()
         out[k] = (1 + above + rng.random() * ties) / 401
     return out
@@ -213,9 +202,11 @@ def test_probability_is_uniform_whatever_the_kinds_scatter(vis2: float, closure:
 def test_kinds_are_weighed_by_their_own_scatter(rng) -> None:
     """Against the same written down with dense templates, and the map of the statistic."""
     data, free = niriss(), BinaryModel(background="free")
-    bank = TemplateBank(Likelihood(data, free), make_grid(*FIELD, 31.0), np.array([0.05]))
+    grid = make_grid(*FIELD, 31.0)
+    test = make_statistic(Likelihood(data, free), grid, np.array([0.05]))
+    bank = test.bank
     white = rng.standard_normal((36, 4)) * np.repeat([1.0, 0.2], [21, 15])[:, None]
-    found = bank_statistic(bank, white, free_scale=True)
+    found = test.evaluate(white)
     templates = np.hstack([units for _, units in bank.chunks()])
     residual, count = bank.project(white), np.array([21.0, 15.0]) * 35.0 / 36.0
     for k in range(4):
@@ -224,7 +215,7 @@ def test_kinds_are_weighed_by_their_own_scatter(rng) -> None:
         match = np.maximum(templates.T @ (weight * r), 0.0)
         gain = (match**2 / (weight @ templates**2)).max()
         assert found[k] == pytest.approx(-35.0 * np.log1p(-gain / 35.0), rel=1e-4)
-        field = statistic_field(bank, white[:, k], free_scale=True)
+        field = test.field(white[:, k])
         assert field.max() == pytest.approx(found[k], rel=1e-4)
 
 
@@ -258,8 +249,10 @@ def test_simulated_data_have_the_distribution_of_the_likelihood(freedom: Freedom
     if freedom.scatter == nu + p - 1.0:
         share = (nu - 2.0) / freedom.scatter
         sheet = replace(sheet, scatter=share * sparse_covariance(sheet.covariance))
-    bank = bank_of(sheet, 60.0)
-    chi2 = search_simulated(bank, rng.standard_normal((p, 4000)), rng).chi2
+    test = made(sheet, 60.0)
+    assert isinstance(test.treatment, Rotations)
+    normals = rng.standard_normal((p, 4000))
+    chi2 = test.treatment.search_simulated(test.bank, normals, rng).chi2
     law = stats.f(p, nu)
     assert stats.kstest(chi2 * nu / ((nu - 2.0) * p), law.cdf).pvalue > 1e-4
 
@@ -273,12 +266,13 @@ def test_each_data_set_is_searched_with_its_own_covariance() -> None:
     scatter = csr_array(colour @ rows.T @ rows @ colour.T / 24.0)
     sheet = with_values(replace(sheet, scatter=scatter), sheet.covariance.draw(rng, 1)[:, 0])
     model, grid = BinaryModel(background="free"), make_grid(*FIELD, 31.0)
-    bank = TemplateBank(Likelihood(sheet, model), grid, np.array([0.05]))
+    test = make_statistic(Likelihood(sheet, model), grid, np.array([0.05]))
+    bank = test.bank
     noise, signal = rng.standard_normal((2, bank.n_data, 4))
-    found = search_simulated(bank, noise, np.random.default_rng(7), signal)
-    assert bank.estimate is not None
-    means = bank.estimate.draw(noise, np.random.default_rng(7))
-    own = bank.estimate.residual
+    assert isinstance(test.treatment, Rotations)
+    found = test.treatment.search_simulated(bank, noise, np.random.default_rng(7), signal)
+    means = test.treatment.null.draw(noise, np.random.default_rng(7))
+    own = test.treatment.null.residual
     for k in range(4):
         outer = np.outer(own, own) - np.outer(means[:, k], means[:, k])
         # The whitening rows of the sheet are V², then closures: its own factor undoes them.

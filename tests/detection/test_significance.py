@@ -9,24 +9,23 @@ from scipy import stats
 
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import make_grid
 from amibayes.detection.false_alarm import (
     Significance,
-    bank_statistic,
     clopper_pearson,
-    null_maxima,
     significance,
-    statistic_field,
 )
+from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
 from amibayes.detection.tails import extreme_value_survival, pareto_survival
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 
 
-def kernel_bank(step_mas: float) -> TemplateBank:
+def kernel_test(step_mas: float) -> BankStatistic:
     likelihood = Likelihood(niriss().only(("cp",)))
-    return TemplateBank(likelihood, make_grid(50.0, 400.0, step_mas), np.empty(0))
+    grid = make_grid(50.0, 400.0, step_mas)
+    return make_statistic(likelihood, grid, np.empty(0), stated_errors=True)
 
 
 def test_null_quantiles_for_15_kernel_phases() -> None:
@@ -35,7 +34,7 @@ def test_null_quantiles_for_15_kernel_phases() -> None:
     40 000 draws: the quantiles scatter by sqrt(p(1-p)/n)/density, 0.02/0.04/0.12/0.4; the
     lattice of λ/16B is 0.05-0.1 below the continuum.
     """
-    null = null_maxima(kernel_bank(11.75), 40_000, np.random.default_rng(2))
+    null = kernel_test(11.75).draw_null(40_000, np.random.default_rng(2))
     found = np.quantile(null, [0.5, 0.9, 0.99, 0.999])
     assert (np.abs(found - [6.4, 10.9, 16.0, 20.5]) < [0.2, 0.35, 0.7, 2.0]).all()
 
@@ -49,8 +48,8 @@ def test_reported_probability_is_uniform_under_noise_of_another_maker() -> None:
     sheet = niriss()
     cp = sheet.closure_phase
     likelihood = Likelihood(sheet.only(("cp",)))
-    bank = TemplateBank(likelihood, make_grid(50.0, 400.0, 23.5), np.empty(0))
-    null = np.sort(null_maxima(bank, 20_000, rng))
+    test = make_statistic(likelihood, make_grid(50.0, 400.0, 23.5), np.empty(0), stated_errors=True)
+    null = np.sort(test.draw_null(20_000, rng))
     pairs = {(i, j): k for k, (i, j) in enumerate(sheet.vis2.stations.tolist())}
     n = 400
     phase = rng.normal(0.0, np.radians(0.3) / np.sqrt(3.0), (21, n))
@@ -61,7 +60,7 @@ def test_reported_probability_is_uniform_under_noise_of_another_maker() -> None:
         ]
     )
     white = likelihood.observables.covariance.whiten(closure)
-    statistic, _ = bank.largest_gain(white.astype(np.float32))
+    statistic = test.evaluate(white)
     p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
     assert stats.kstest(p, "uniform").pvalue > 1e-4
     assert abs((p < 0.1).sum() - 40) < 4 * np.sqrt(36)
@@ -71,8 +70,9 @@ def test_statistic_of_the_data_and_of_the_null_are_the_same(rng) -> None:
     """A free background is projected out of both; its value does not move the null."""
     model = BinaryModel(background="free")
     result = search(Likelihood(simulated(niriss(), [0, 0, 0, 0.1], rng, model), model), (50, 400))
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    found = significance(bank, float(result.bank_delta_chi2.max()), 2000, rng)
+    test = statistic_of(result, stated_errors=True)
+    assert test.value == pytest.approx(result.bank_delta_chi2.max(), rel=1e-5)
+    found = significance(test, 2000, rng)
     assert 1e-3 < found.probability <= 1.0
     low, high = found.interval
     assert low <= found.probability <= high
@@ -82,14 +82,14 @@ def test_statistic_of_the_data_and_of_the_null_are_the_same(rng) -> None:
 
 
 def test_same_seed_same_null_whatever_came_before() -> None:
-    bank = kernel_bank(47.0)
-    first = null_maxima(bank, 5000, np.random.default_rng(5))
-    np.testing.assert_array_equal(first, null_maxima(bank, 5000, np.random.default_rng(5)))
-    np.testing.assert_array_equal(first[:2048], null_maxima(bank, 2048, np.random.default_rng(5)))
+    test = kernel_test(47.0)
+    first = test.draw_null(5000, np.random.default_rng(5))
+    np.testing.assert_array_equal(first, test.draw_null(5000, np.random.default_rng(5)))
+    np.testing.assert_array_equal(first[:2048], test.draw_null(2048, np.random.default_rng(5)))
 
 
 def test_strong_companion_is_bounded_by_the_draws_and_the_tail_says_it_is_extrapolated() -> None:
-    found = significance(kernel_bank(23.5), 30.0, 10_000, np.random.default_rng(4))
+    found = significance(kernel_test(23.5), 10_000, np.random.default_rng(4), observed=30.0)
     assert found.probability == pytest.approx(1 / 10_001)
     assert found.detected
     assert found.tail is not None
@@ -134,16 +134,14 @@ def test_both_tails_find_laws_they_did_not_make(law, far) -> None:
         assert 0.5 < found / far < 2.0, survival.__name__
 
 
-@pytest.mark.parametrize("free_scale", [True, False])
-def test_local_probability_is_uniform_at_a_fixed_position(free_scale) -> None:
+@pytest.mark.parametrize("stated_errors", [True, False])
+def test_local_probability_is_uniform_at_a_fixed_position(stated_errors) -> None:
     """1500 null data sets; half of them gain nothing there. Binomial chance 1e-5 per level."""
     model = BinaryModel(background="free")
-    bank = TemplateBank(Likelihood(niriss(), model), make_grid(100.0, 110.0, 47.0), np.array([0.0]))
-    white = np.random.default_rng(10).standard_normal((bank.n_data, 1500))
-    field = np.array([statistic_field(bank, w, free_scale=free_scale)[3] for w in white.T])
-    n_free = bank.n_data - bank.n_nuisance
-    weight = Significance(1.0, field, 1.0, (0, 1), None, 0.1, free_scale, None, n_free)
-    p = weight.local_survival(field)
+    likelihood, grid = Likelihood(niriss(), model), make_grid(100.0, 110.0, 47.0)
+    test = make_statistic(likelihood, grid, np.array([0.0]), stated_errors=stated_errors)
+    white = np.random.default_rng(10).standard_normal((test.bank.n_data, 1500))
+    p = test.local_survival(np.array([test.field(w)[3] for w in white.T]))
     for level in (0.3, 0.1, 0.02):
         assert stats.binomtest(int((p < level).sum()), 1500, level).pvalue > 1e-5
 
@@ -151,16 +149,14 @@ def test_local_probability_is_uniform_at_a_fixed_position(free_scale) -> None:
 def test_field_peaks_at_the_statistic_of_the_search(rng) -> None:
     data = simulated(niriss(), [150.0, -80.0, 0.005], rng)
     result = search(Likelihood(data), (50, 400))
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
     white = result.likelihood.observables.covariance.whiten(result.likelihood.observables.data)
     white = white - result.likelihood.observables.covariance.whiten(
         Likelihood(niriss()).observables.data
     )
-    for free in (True, False):
-        field = statistic_field(bank, white, free_scale=free)
-        assert field.max() == pytest.approx(
-            bank_statistic(bank, white[:, None], free_scale=free)[0], rel=1e-5
-        )
+    for stated in (True, False):
+        test = statistic_of(result, stated_errors=stated)
+        at_most = test.field(white).max()
+        assert at_most == pytest.approx(test.evaluate(white[:, None])[0], rel=1e-5)
 
 
 def test_second_companion_is_judged_fairly_beside_the_first() -> None:
@@ -171,14 +167,13 @@ def test_second_companion_is_judged_fairly_beside_the_first() -> None:
     rng, truth = np.random.default_rng(14), np.array([150.0, -80.0, 0.02])
     sheet = niriss()
     grid, box = make_grid(50.0, 400.0, 23.5), Box(50.0, 400.0, 188.0)
-    bank = TemplateBank(Likelihood(sheet), grid, np.empty(0), beside=truth)
-    null = np.sort(null_maxima(bank, 10_000, rng, free_scale=True))
+    test = make_statistic(Likelihood(sheet), grid, np.empty(0), beside=truth)
+    null = np.sort(test.draw_null(10_000, rng))
     statistic = []
     for _ in range(300):
         likelihood = Likelihood(simulated(sheet, truth, rng))
         theta = np.array(refine(likelihood, truth, box, 0.0).theta)
-        own = TemplateBank(likelihood, grid, np.empty(0), beside=theta)
-        statistic.append(bank_statistic(own, likelihood.residuals(theta), free_scale=True)[0])
+        statistic.append(make_statistic(likelihood, grid, np.empty(0), beside=theta).value)
     p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
     assert stats.kstest(p, "uniform").pvalue > 1e-4
     for level in (0.1, 0.02):

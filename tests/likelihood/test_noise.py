@@ -9,13 +9,13 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.draws import profiled
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import make_grid
 from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
 from amibayes.data.observables import join
-from amibayes.detection.false_alarm import bank_statistic, null_maxima
+from amibayes.detection.statistic import make_statistic, statistic_of
+from amibayes.detection.treatments import Ratio
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood
 
 FIELD = (50.0, 400.0)
 EXTRA = ExtraNoise(0.02, np.radians(1.0))
@@ -102,11 +102,8 @@ def test_false_alarms_stay_at_their_rate_whatever_the_errors_say(factor: float) 
     for _ in range(n):
         data = understated([0.0, 0.0, 0.0], rng, extra)
         result, _ = search_with_noise(Likelihood(data), FIELD)
-        bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-        white = single_likelihood(result.likelihood).residuals(result.single_theta)
-        statistic = bank_statistic(bank, white, free_scale=True)[0]
-        null = null_maxima(bank, 1000, rng, free_scale=True)
-        p.append((1 + (null >= statistic).sum()) / 1001)
+        test = statistic_of(result)
+        p.append((1 + (test.draw_null(1000, rng) >= test.value).sum()) / 1001)
     for level in (0.1, 0.02):
         hits = int((np.array(p) < level).sum())
         assert stats.binomtest(hits, n, level, alternative="greater").pvalue > 1e-4
@@ -114,11 +111,14 @@ def test_false_alarms_stay_at_their_rate_whatever_the_errors_say(factor: float) 
 
 def test_profiled_statistic_does_not_depend_on_the_scale(rng) -> None:
     data = niriss().only(("cp",))
-    bank = TemplateBank(Likelihood(data), make_grid(50.0, 400.0, 30.0), np.empty(0))
-    white = rng.standard_normal((bank.n_data, 5))
-    first = bank_statistic(bank, white, free_scale=True)
-    np.testing.assert_allclose(bank_statistic(bank, 7 * white, free_scale=True), first, rtol=1e-5)
-    gain = bank_statistic(bank, white, free_scale=False)
+    grid = make_grid(50.0, 400.0, 30.0)
+    free, known = (
+        make_statistic(Likelihood(data), grid, np.empty(0), stated_errors=s) for s in (False, True)
+    )
+    white = rng.standard_normal((free.bank.n_data, 5))
+    first = free.evaluate(white)
+    np.testing.assert_allclose(free.evaluate(7 * white), first, rtol=1e-5)
+    gain = known.evaluate(white)
     expected = -15 * np.log(1 - gain / (white**2).sum(axis=0))
     np.testing.assert_allclose(first, expected, rtol=1e-6)
-    np.testing.assert_allclose(profiled(np.array([1e-6]), np.array([36.0]), 36), 1e-6, rtol=1e-5)
+    np.testing.assert_allclose(Ratio.scale_free(36)(np.array([1e-6]), 36.0), 1e-6, rtol=1e-5)

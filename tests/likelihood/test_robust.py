@@ -13,15 +13,15 @@ from weighted_draws import ranks_of
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.robust import RobustFits, search_robust
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import make_grid
 from amibayes.companion_search.with_extra_noise import fit_noise
 from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.detection.false_alarm import bank_statistic, null_maxima
+from amibayes.detection.statistic import make_statistic
 from amibayes.errors import UsageError
 from amibayes.likelihood.averaged_noise import AveragedNoise, averaged_noise, with_nodes
 from amibayes.likelihood.extra_noise import add_noise
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments, scales, scores, symmetric_whitening
 from amibayes.likelihood.student_noise import student_terms
 from amibayes.models.parameters import Box
@@ -132,11 +132,12 @@ def test_estimated_errors_are_refused(rng) -> None:
 
 def test_statistic_does_not_depend_on_the_scale_and_bounds_one_datum(rng) -> None:
     data = niriss()
-    bank = TemplateBank(Likelihood(data), make_grid(50.0, 400.0, 30.0), np.empty(0))
-    frame = symmetric_whitening(data)
+    frame, grid = symmetric_whitening(data), make_grid(50.0, 400.0, 30.0)
+    test = make_statistic(Likelihood(data), grid, np.empty(0), whitening=frame)
+    bank = test.bank
     white = rng.standard_normal((bank.n_data, 5))
-    first = bank_statistic(bank, white, free_scale=True, frame=frame)
-    again = bank_statistic(bank, 7.0 * white, free_scale=True, frame=frame)
+    first = test.evaluate(white)
+    again = test.evaluate(7.0 * white)
     np.testing.assert_allclose(again, first, rtol=1e-4)
     bounded = scores(frame, np.where(np.arange(bank.n_data)[:, None] == 2, 1e3, white))
     assert np.abs(bounded).max() < 3.0
@@ -206,14 +207,14 @@ def test_false_alarm_probability_stays_uniform(share) -> None:
     rng = np.random.default_rng(12)
     data = niriss()
     likelihood = Likelihood(data)
-    bank = TemplateBank(likelihood, make_grid(*FIELD, 23.5), np.empty(0))
-    frame = symmetric_whitening(data)
-    null = np.sort(null_maxima(bank, 20_000, rng, free_scale=True, frame=frame))
+    frame, grid = symmetric_whitening(data), make_grid(*FIELD, 23.5)
+    test = make_statistic(likelihood, grid, np.empty(0), whitening=frame)
+    null = np.sort(test.draw_null(20_000, rng))
     n = 400
     sets = [spoiled(np.zeros(3), rng, share)[0] for _ in range(n)]
     blank = likelihood.predict([np.zeros(3)])[:, 0]
     white = data.covariance.whiten(np.array([s.data - blank for s in sets]).T)
-    statistic = bank_statistic(bank, white, free_scale=True, frame=frame)
+    statistic = test.evaluate(white)
     p = (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
     if share == 0.0:
         assert stats.kstest(p, "uniform").pvalue > 1e-4
@@ -226,8 +227,7 @@ def test_a_companion_is_found_as_surely_as_by_gaussian_residuals(rng) -> None:
     """Both statistics put a companion of 10σ far beyond their nulls."""
     data, _ = spoiled([150.0, -80.0, 0.006], rng, 0.0)
     result = search(Likelihood(data), FIELD)
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-    white = single_likelihood(result.likelihood).residuals(result.single_theta)
-    for frame in (None, symmetric_whitening(data)):
-        null = null_maxima(bank, 4000, rng, free_scale=True, frame=frame)
-        assert bank_statistic(bank, white, free_scale=True, frame=frame)[0] > 1.2 * null.max()
+    made = result.likelihood, result.grid, result.single_theta
+    for whitening in (None, symmetric_whitening(data)):
+        test = make_statistic(*made, whitening=whitening)
+        assert test.value > 1.2 * test.draw_null(4000, rng).max()

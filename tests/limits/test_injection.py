@@ -101,10 +101,10 @@ def test_a_criterion_finds_what_is_bright_and_only_that(kinds: tuple[str, ...]) 
     assert recovery.located[:50].all()
     # Noise alone passes at 1 %: more than 17 of 400 has a probability below 1e-5.
     assert recovery.detected[50:].sum() <= 17
-    verdict = criterion.judge(simulated(niriss(), bright, rng), 100.0, 60.0)
+    verdict = criterion.apply(simulated(niriss(), bright, rng), 100.0, 60.0)
     assert verdict.detected
     assert verdict.located
-    elsewhere = criterion.judge(simulated(niriss(), bright, rng), -150.0, -60.0)
+    elsewhere = criterion.apply(simulated(niriss(), bright, rng), -150.0, -60.0)
     assert elsewhere.detected
     assert not elsewhere.located
     assert verdict.statistic > criterion.significance.threshold()
@@ -151,7 +151,7 @@ def test_images_and_observables_agree_on_how_many_are_found(way: str) -> None:
                 [*offset(150.0, rng.uniform(0, 360, 500)), np.full(500, contrast)]
             )
             expected.append(criterion.recover(ring, rng).located.mean())
-        found += criterion.judge(data, east, north).located
+        found += criterion.apply(data, east, north).located
     p = np.mean(expected)
     assert 0.2 < p < 0.8
     spread = np.sqrt(n * p * (1 - p) + (n * np.std(expected)) ** 2 / 10)

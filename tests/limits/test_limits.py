@@ -9,19 +9,20 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.result import null_likelihood
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.covariance import sparse_covariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.detection.false_alarm import bank_statistic, significance
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.limits.completeness import detection_limit, fit_logistic
+from amibayes.detection.false_alarm import significance
+from amibayes.detection.statistic import statistic_of
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import recover
+from amibayes.limits.logistic import fit_logistic
 from amibayes.oifits import write_oifits
+from amibayes.pipeline.false_alarm import false_alarm
 from amibayes.pipeline.limits import LimitsOptions, measure_limits
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.search import search_field, weigh
+from amibayes.pipeline.search import search_field
 from amibayes.units import offset
 
 
@@ -29,11 +30,11 @@ from amibayes.units import offset
 def setting():
     data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
     result = search(Likelihood(data), (50.0, 400.0))
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    test = statistic_of(result, stated_errors=True)
     rng = np.random.default_rng(2)
-    weight = significance(bank, 0.0, 20_000, rng, alpha=0.01)
+    weight = significance(test, 20_000, rng, alpha=0.01, observed=0.0)
     limit = detection_limit(result, weight, rng, n_separations=6, trials_per_cell=200)
-    return result, bank, weight, limit
+    return result, test, weight, limit
 
 
 def found_by_a_full_search(theta: list[float], rng, threshold: float) -> bool:
@@ -105,9 +106,7 @@ def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) 
             east, north = (float(x) for x in offset(limit.separation_mas[k], angle))
             data = simulated(niriss(), [east, north, contrast], rng)
             result, _, _ = search_field(data, asked)
-            bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
-            white = single_likelihood(result.likelihood).residuals(result.single_theta)
-            seen = bank_statistic(bank, white, free_scale=True)[0] > limit.threshold
+            seen = statistic_of(result).value > limit.threshold
             c = result.companion
             found += bool(seen and np.hypot(c.east_mas - east, c.north_mas - north) < 94.0)
         slope = 7.0 * expected * (1.0 - expected)
@@ -120,7 +119,8 @@ def test_false_positive_rate_is_alpha(setting) -> None:
 
     Both the threshold (20 000 draws) and the count (20 000) scatter; 4.5 sigma.
     """
-    result, bank, weight, limit = setting
+    result, test, weight, limit = setting
+    bank = test.bank
     likelihood = result.likelihood
     covariance, n = likelihood.observables.covariance, 20_000
     step = 1e-6
@@ -149,14 +149,14 @@ def test_rounds_change_nothing_but_where_trials_go(setting) -> None:
 
 def test_spread_over_angles_is_what_injections_at_single_angles_find(setting) -> None:
     """Limits at single position angles, by many injections at each: their median and 68 %."""
-    result, bank, weight, limit = setting
+    _, test, weight, limit = setting
     k, rng = 2, np.random.default_rng(12)
     each = []
     for angle in np.arange(0.0, 360.0, 15.0) + 3.0:
         east, north = offset(limit.separation_mas[k], angle)
         level = np.repeat(limit.contrast_50[k] * np.geomspace(0.6, 2.2, 8), 250)
         theta = np.column_stack([np.full(2000, east), np.full(2000, north), level])
-        found = recover(result.likelihood, bank, np.empty(0), theta, weight.threshold(), rng)
+        found = recover(test, theta, weight.threshold(), rng)
         share = found.located.reshape(8, 250).sum(axis=1).astype(float)
         fit = fit_logistic(np.log(level[::250]), share, np.full(8, 250.0))
         each.append(np.exp(fit.crossing(0.95)[0]))
@@ -181,14 +181,12 @@ def test_completeness_rises_with_contrast(setting) -> None:
 
 
 def test_bright_companions_are_recovered_and_absent_ones_are_not(setting) -> None:
-    result, bank, weight, _ = setting
+    _, test, weight, _ = setting
     rng = np.random.default_rng(6)
     east, north = offset(200.0, rng.uniform(0, 360, 500))
     for contrast, low, high in ((0.05, 500, 500), (0.0, 0, 15)):
         theta = np.column_stack([east, north, np.full(500, contrast)])
-        found = recover(
-            result.likelihood, bank, result.single_theta, theta, weight.threshold(), rng
-        )
+        found = recover(test, theta, weight.threshold(), rng)
         assert low <= found.located.sum() <= high
 
 
@@ -213,23 +211,12 @@ def test_robust_search_has_limits_of_its_own_statistic() -> None:
     found = []
     for data in (clean, spoilt):
         result, _, _ = search_field(data, asked)
-        weight = weigh(result, asked, np.random.default_rng(2), None, None)
+        weight = false_alarm(result, asked, np.random.default_rng(2), None, None)
         rng = np.random.default_rng(3)
         limit = detection_limit(result, weight, rng, separation_mas=[200.0], trials_per_cell=300)
-        likelihood, frame = null_likelihood(result)
-        assert frame is not None
-        bank = TemplateBank(likelihood, result.grid, result.single_theta)
+        assert result.robustness is not None
         nothing = np.column_stack([np.full(10_000, 200.0), np.zeros((10_000, 2))])
-        blank = recover(
-            likelihood,
-            bank,
-            np.empty(0),
-            nothing,
-            limit.threshold,
-            rng,
-            free_scale=True,
-            frame=frame,
-        )
+        blank = recover(statistic_of(result), nothing, limit.threshold, rng)
         sigma = np.sqrt(0.01 * 0.99 * (1 / 10_000 + 1 / 20_000))
         assert abs(blank.detected.mean() - 0.01) < 4.5 * sigma
         found.append(limit.delta_mag[0])
@@ -244,7 +231,7 @@ def test_limits_of_an_estimated_covariance_do_not_feel_the_companion_that_is_the
         sheet = replace(sheet, scatter=sparse_covariance(sheet.covariance))
         data = simulated(sheet, [150.0, 90.0, contrast], np.random.default_rng(6))
         result = search(Likelihood(data), (50.0, 400.0))
-        weight = weigh(
+        weight = false_alarm(
             result, SearchOptions(null_draws=2000, alpha=0.01), np.random.default_rng(1), None, None
         )
         assert weight.detected == (contrast > 0.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from amibayes.limits.completeness import fit_logistic
 from amibayes.limits.injection import allocate
+from amibayes.limits.logistic import fit_logistic
 
 X = np.log(np.geomspace(0.4, 4.0, 14))
 

@@ -7,9 +7,10 @@ import pytest
 from helpers import niriss, simulated
 
 from amibayes.companion_search.search import resolution_mas, search
-from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.limits.injection import ambiguous, injected_signal, nearer_alias, recover
+from amibayes.limits.aliases import ambiguous, nearer_alias
+from amibayes.limits.injection import recover
 from amibayes.models.binary import BinaryModel
 from amibayes.units import MAS, offset
 
@@ -18,11 +19,10 @@ LATTICE_MAS = 4.817e-6 / 1.14315 / MAS
 
 
 @pytest.fixture(scope="module")
-def monochromatic() -> tuple[Likelihood, TemplateBank]:
+def monochromatic() -> BankStatistic:
     data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
     likelihood = Likelihood(data, BinaryModel(1, smearing=False))
-    result = search(likelihood, (50.0, 600.0))
-    return likelihood, TemplateBank(likelihood, result.grid, result.single_theta)
+    return statistic_of(search(likelihood, (50.0, 600.0)), stated_errors=True)
 
 
 def test_alias_stands_where_the_lattice_of_the_mask_puts_it(monochromatic) -> None:
@@ -31,26 +31,21 @@ def test_alias_stands_where_the_lattice_of_the_mask_puts_it(monochromatic) -> No
     A place 0.6 of the lattice's period to the east has its alias 0.4 to the west, nearer to
     the star; a place at 0.3 has it at 0.7, farther out.
     """
-    likelihood, bank = monochromatic
-    fringe = resolution_mas(likelihood)
+    fringe = resolution_mas(monochromatic.likelihood)
     places = np.array([[0.6 * LATTICE_MAS, 30.0], [0.3 * LATTICE_MAS, 30.0]])
-    far, near = nearer_alias(bank, fringe, places)
+    far, near = nearer_alias(monochromatic.bank, fringe, places)
     assert far > 0.997  # looked for on a lattice of λ/32B
     assert near < 0.9
-    signals = injected_signal(
-        likelihood,
-        np.empty(0),
-        np.array([[*places[0], 0.01], [places[0, 0] - LATTICE_MAS, 30.0, 0.01]]),
-    )
+    pair = np.array([[*places[0], 0.01], [places[0, 0] - LATTICE_MAS, 30.0, 0.01]])
+    signals = monochromatic.signal_of(pair)
     # The last digits of the holes' coordinates are rounded.
     np.testing.assert_allclose(*signals.T, atol=2e-3 * np.abs(signals).max())
 
 
 def test_alias_nearer_in_makes_a_companion_seen_but_not_found_at_its_place(monochromatic) -> None:
-    likelihood, bank = monochromatic
     theta = np.repeat([[0.6 * LATTICE_MAS, 30.0, 0.01], [0.3 * LATTICE_MAS, 30.0, 0.01]], 50, 0)
     rng = np.random.default_rng(3)
-    found = recover(likelihood, bank, np.empty(0), theta, 25.0, rng)
+    found = recover(monochromatic, theta, 25.0, rng)
     assert found.detected.all()
     assert not found.located[:50].any()
     assert found.located[50:].all()
@@ -59,10 +54,10 @@ def test_alias_nearer_in_makes_a_companion_seen_but_not_found_at_its_place(monoc
 def test_opposite_place_counts_as_the_right_one_without_closure_phases() -> None:
     data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)).only(("vis2",))
     result = search(Likelihood(data), (50.0, 400.0))
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    test = statistic_of(result, stated_errors=True)
     east, north = offset(200.0, np.random.default_rng(2).uniform(0.0, 360.0, 400))
     theta = np.column_stack([east, north, np.full(400, 0.02)])
-    found = recover(result.likelihood, bank, np.empty(0), theta, 25.0, np.random.default_rng(3))
+    found = recover(test, theta, 25.0, np.random.default_rng(3))
     assert found.located.all()
 
 
@@ -79,12 +74,10 @@ def test_the_search_itself_reports_what_recovery_says(separation: float, n: int)
     rng = np.random.default_rng(5)
     sheet = niriss()
     blank = search(Likelihood(simulated(sheet, [0.0, 0.0, 0.0], rng)), (50.0, 520.0))
-    likelihood = blank.likelihood
-    bank = TemplateBank(likelihood, blank.grid, blank.single_theta)
-    fringe = resolution_mas(likelihood)
+    fringe = resolution_mas(blank.likelihood)
     east, north = offset(separation, rng.uniform(0.0, 360.0, n))
     theta = np.column_stack([east, north, np.full(n, 0.006)])
-    nearer = nearer_alias(bank, fringe, theta[:, :2])
+    nearer = nearer_alias(statistic_of(blank).bank, fringe, theta[:, :2])
     alike = 0
     for row, alias in zip(theta, nearer, strict=True):
         found = search(Likelihood(simulated(sheet, row, rng)), (50.0, 520.0))

@@ -24,6 +24,7 @@ from amibayes.companion_search.template_bank import make_grid
 from amibayes.data.covariance import DiagonalCovariance
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.statistic import statistic_of
 from amibayes.errors import RunError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.mass_table import MassTable
@@ -126,7 +127,7 @@ PICTURES: dict[str, Callable[[SearchResult], Figure]] = {
     "map and signed contrast": lambda r: detection_map(r, quantity="delta_chi2", contrast="signed"),
     "map and contrast": lambda r: detection_map(r, contrast="positive"),
     "n sigma": lambda r: sky_map(r, local_n_sigma(r), "Local nσ (σ)", vmin=0.0),
-    "false alarms": lambda r: false_alarm_map(r, replace(weight_of(r), n_free=30)),
+    "false alarms": lambda r: false_alarm_map(r, weight_of(r)),
     "fit": fit_plot,
     "fit of closure phases": lambda r: fit_plot(
         by_hand(r.likelihood.observables.only(["cp"]), TRUTH)
@@ -282,13 +283,14 @@ def test_fits_maps_without_coordinates_are_offsets_in_mas(
 
 def weight_of(result: SearchResult) -> Significance:
     null = np.sort(null_maxima())
-    return Significance(31.0, null, 1e-3, (0.0, 4e-3), None, 0.0013, True, result.bank_delta_chi2)
+    test, field = statistic_of(result), result.bank_delta_chi2
+    return Significance(31.0, null, 1e-3, (0.0, 4e-3), None, 0.0013, test, field)
 
 
 def test_false_alarm_probability_is_lowest_where_the_statistic_is_highest(
     found: SearchResult,
 ) -> None:
-    maps = probability_maps(replace(weight_of(found), n_free=30))
+    maps = probability_maps(weight_of(found))
     peak = int(np.argmax(found.bank_delta_chi2))
     for p in maps.values():
         assert p.argmin() == peak

@@ -1,0 +1,363 @@
+"""One statistic for the data, null draws, injected companions, limits and vetting.
+
+It is made once from a search, with the noise that was fitted there. Its value for a data set
+is the largest gain in likelihood over the template bank, for positive contrast, nuisance
+directions projected out. What it takes for known of the errors is an `ErrorTreatment`;
+simulated data sets are drawn and searched by the same one as the data are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol, Self
+
+import numpy as np
+
+from amibayes.companion_search.joint_bank import bank_of
+from amibayes.companion_search.result import SearchResult, null_likelihood
+from amibayes.companion_search.scan import scale_groups
+from amibayes.companion_search.template_bank import Grid, TemplateBank
+from amibayes.detection.rotations import Rotations
+from amibayes.detection.treatments import (
+    ErrorTreatment,
+    FreeScale,
+    KnownErrors,
+    Ratio,
+    Searched,
+    StudentScores,
+)
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.rotation_null import rotation_null
+from amibayes.likelihood.student import SymmetricWhitening
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.units import FloatArray, IntArray
+
+DRAWS_AT_ONCE = 2048
+"""Null data sets per matrix product: what keeps the product in cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What the statistic makes of n data sets.
+
+    Parameters
+    ----------
+    statistic : (n,) float array
+    gain : (n,) float array
+        The gain in χ² behind it.
+    position : (n,) int array
+        Where on the grid.
+    """
+
+    statistic: FloatArray
+    gain: FloatArray
+    position: IntArray
+
+
+class Statistic(Protocol):
+    """What decides whether data hold a companion: asked by the data and by all simulated ones."""
+
+    @property
+    def likelihood(self) -> Likelihood:
+        """Of the data, with the noise that was fitted."""
+        ...
+
+    @property
+    def bank(self) -> TemplateBank:
+        """Positions that are searched, and what a companion does there."""
+        ...
+
+    @property
+    def observed(self) -> FloatArray:
+        """Whitened residuals (n_data,) of the data that it was made from."""
+        ...
+
+    @property
+    def label(self) -> str:
+        """What its values are called."""
+        ...
+
+    def hits(self, white: FloatArray) -> Hits:
+        """Search data sets, whitened residuals (n_data, n) of the fit without a companion."""
+        ...
+
+    def evaluate(self, white: FloatArray) -> FloatArray:
+        """Statistic of whitened residuals (n_data, n), (n,)."""
+        ...
+
+    def field(self, white: FloatArray) -> FloatArray:
+        """Statistic of one data set (n_data,) at every position, (n_grid,)."""
+        ...
+
+    def signal_of(self, companions: FloatArray) -> FloatArray:
+        """Whitened change of the data (n_data, n) by companions (n, 3)."""
+        ...
+
+    def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
+        """Draw n data sets with the noise of the data, and a signal in them, and search them."""
+        ...
+
+    def draw_null(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        *,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+        journal: Journal | None = None,
+    ) -> FloatArray:
+        """Statistic of n data sets of noise alone, (n,)."""
+        ...
+
+    def gain_at(self, threshold: float) -> float:
+        """Gain in χ², in units of the noise, that reaches a value of the statistic."""
+        ...
+
+    def contrast_error(self, places: FloatArray) -> FloatArray:
+        """Error of a faint companion's contrast at places (n, 2), mas, (n,)."""
+        ...
+
+    def local_survival(self, statistic: FloatArray) -> FloatArray:
+        """Probability that noise alone reaches a statistic at one given position, any shape."""
+        ...
+
+    def with_noise_of(self, residuals: FloatArray) -> Self:
+        """Make the same with the noise of other whitened residuals (n_data,)."""
+        ...
+
+    @property
+    def null_rests_on_residuals(self) -> bool:
+        """Whether `with_noise_of` other residuals changes the distribution of null draws."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class BankStatistic:
+    """The largest gain in likelihood over a template bank.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the noise that was fitted.
+    single : (n_nuisance,) float array
+        The fit without a companion.
+    bank : TemplateBank
+    treatment : ErrorTreatment
+    ratio : Ratio
+        What is made of a gain in χ².
+    observed : (n_data,) float array
+        Whitened residuals of the data.
+    """
+
+    likelihood: Likelihood
+    single: FloatArray
+    bank: TemplateBank
+    treatment: ErrorTreatment
+    ratio: Ratio
+    observed: FloatArray
+
+    @property
+    def label(self) -> str:
+        """What its values are called."""
+        return "Δχ²" if np.isinf(self.ratio.count) else "2Δln L, scale of the noise free"
+
+    def hits(self, white: FloatArray) -> Hits:
+        """Search data sets, whitened residuals (n_data, n) of the fit without a companion."""
+        return self._hits(self.treatment.search(self.bank, white))
+
+    def evaluate(self, white: FloatArray) -> FloatArray:
+        """Statistic of whitened residuals (n_data, n), (n,)."""
+        return self.hits(white).statistic
+
+    @property
+    def value(self) -> float:
+        """The statistic of the data."""
+        return float(self.evaluate(self.observed[:, None])[0])
+
+    def field(self, white: FloatArray) -> FloatArray:
+        """Statistic of one data set (n_data,) at every position, (n_grid,).
+
+        Its maximum is that of `evaluate`.
+        """
+        return self.ratio(*self.treatment.field(self.bank, white))
+
+    def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
+        """Draw n data sets with the noise of the data, and search them.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+        signal : (n_data, n) float array, optional
+            What is in them beside noise, whitened; see `signal_of`.
+
+        Notes
+        -----
+        Noise is drawn in single precision, as the products are done: a relative error of 1e-6
+        of the statistic, against a scatter between draws of tens of per cent.
+        """
+        normals = rng.standard_normal((self.bank.n_data, n), dtype=np.float32).astype(float)
+        return self._hits(self.treatment.search_simulated(self.bank, normals, rng, signal))
+
+    def _hits(self, found: Searched) -> Hits:
+        return Hits(self.ratio(found.gain, found.chi2), found.gain, found.position)
+
+    def signal_of(self, companions: FloatArray) -> FloatArray:
+        """Whitened change of the data (n_data, n) by companions on top of the fit without one.
+
+        Parameters
+        ----------
+        companions : (n, 3) float array
+            east_mas, north_mas, contrast (the same in every band, at rest).
+        """
+        likelihood, single = self.likelihood, self.single
+        whole = likelihood.model.at_rest(companions)
+        full = np.hstack([whole, np.broadcast_to(single, (len(companions), len(single)))])
+        alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
+        change = likelihood.predict(full) - alone
+        closure = change[likelihood.samples.squares.shape[0] :]
+        closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+        return likelihood.observables.covariance.whiten(change)
+
+    def draw_null(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        *,
+        executor: Executor | None = None,
+        progress: Progress | None = None,
+        journal: Journal | None = None,
+    ) -> FloatArray:
+        """Statistic of ``n`` null data sets, (n,).
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+        executor : Executor, optional
+            Where it is computed; the result does not depend on it.
+        progress : callable, optional
+            Told (pieces done, pieces in all).
+        journal : Journal, optional
+            Keeps finished pieces.
+        """
+        sizes = [len(range(n)[part]) for part in slices(n, DRAWS_AT_ONCE)]
+        pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
+        work, where = partial(_null_piece, self), executor or SerialExecutor()
+        done = run_job(work, pieces, where, journal=journal, progress=progress)
+        return np.concatenate([piece["statistic"] for piece in done])
+
+    def gain_at(self, threshold: float) -> float:
+        """Gain in χ², in units of the noise, that reaches a value of the statistic."""
+        return self.ratio.gain_at(threshold)
+
+    def contrast_error(self, places: FloatArray) -> FloatArray:
+        """Error of a faint companion's contrast at places (n, 2), mas, (n,)."""
+        return self.treatment.contrast_error(self.bank, places)
+
+    def local_survival(self, statistic: FloatArray) -> FloatArray:
+        """Probability that noise alone reaches a statistic at one given position, any shape."""
+        return self.ratio.local_survival(statistic, self.bank.n_contrasts)
+
+    def with_noise_of(self, residuals: FloatArray) -> Self:
+        """Make the same with the noise of other whitened residuals (n_data,)."""
+        return replace(self, treatment=self.treatment.with_noise_of(self.bank, residuals))
+
+    @property
+    def null_rests_on_residuals(self) -> bool:
+        """Whether `with_noise_of` other residuals changes the distribution of null draws."""
+        return self.treatment.null_rests_on_residuals
+
+
+def _null_piece(
+    test: BankStatistic, piece: tuple[np.random.SeedSequence, int]
+) -> dict[str, FloatArray]:
+    seed, size = piece
+    return {"statistic": test.simulated(size, np.random.default_rng(seed)).statistic}
+
+
+def statistic_of(
+    result: SearchResult, *, stated_errors: bool = False, beside: bool = False
+) -> BankStatistic:
+    """Make the statistic of a search, with the noise that was fitted.
+
+    Parameters
+    ----------
+    result : SearchResult
+    stated_errors : bool
+        The size of the errors is known. By default it is not: whether noise was added depends
+        on the data, and a false companion can hide that it should have been. A statistic that
+        does not know the scale needs no such decision.
+    beside : bool
+        For a second companion: all that the first one can do by moving or brightening is
+        projected out, of the data and of the null sets.
+    """
+    likelihood, whitening = null_likelihood(result)
+    return make_statistic(
+        likelihood,
+        result.grid,
+        result.single_theta,
+        stated_errors=stated_errors,
+        whitening=whitening,
+        beside=result.theta if beside else None,
+    )
+
+
+def make_statistic(
+    likelihood: Likelihood,
+    grid: Grid,
+    single: FloatArray,
+    *,
+    stated_errors: bool = False,
+    whitening: SymmetricWhitening | None = None,
+    beside: FloatArray | None = None,
+) -> BankStatistic:
+    """Make the statistic of data and a field.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+    grid : Grid
+    single : (n_nuisance,) float array
+        The fit without a companion.
+    stated_errors : bool
+        As for `statistic_of`.
+    whitening : SymmetricWhitening, optional
+        Residuals follow Student's t, by these directions of the data.
+    beside : (n_dim,) float array, optional
+        Parameters with a companion that is there already.
+    """
+    bank = bank_of(likelihood, grid, single, beside=beside)
+    left = single_likelihood(likelihood).residuals(single)
+    observed = (left if beside is None else likelihood.residuals(beside))[:, 0]
+    treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)
+    ratio = _ratio(likelihood, bank, known=stated_errors and whitening is None)
+    return BankStatistic(likelihood, single, bank, treatment, ratio, observed)
+
+
+def _treatment(
+    likelihood: Likelihood,
+    bank: TemplateBank,
+    observed: FloatArray,
+    stated_errors: bool,
+    whitening: SymmetricWhitening | None,
+) -> ErrorTreatment:
+    if whitening is not None:
+        return StudentScores(whitening)
+    null = rotation_null(likelihood.observables, bank.project(observed))
+    if null is not None:
+        return Rotations(null)
+    if stated_errors:
+        return KnownErrors()
+    groups = scale_groups(likelihood.observables, bank.n_nuisance)
+    return FreeScale.measured(groups, bank, observed)
+
+
+def _ratio(likelihood: Likelihood, bank: TemplateBank, *, known: bool) -> Ratio:
+    n_free = bank.n_data - bank.n_nuisance
+    if not known:
+        return Ratio.scale_free(n_free)
+    if not np.isfinite(likelihood.degrees):
+        return Ratio.known(n_free)
+    return Ratio.student(n_free, bank.n_data, likelihood.degrees)

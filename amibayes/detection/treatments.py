@@ -1,0 +1,330 @@
+"""What a significance test takes for known of the errors, and how it then searches data sets.
+
+A treatment searches whitened data sets over a template bank, and draws and searches null sets
+in the same way. `KnownErrors` takes the covariance as it is; `FreeScale` lets every group of
+data (kinds and files) scatter by its own amount; `StudentScores` bounds every residual first;
+`amibayes.detection.rotations.Rotations` estimates the covariance of every set anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+from scipy import stats
+
+from amibayes.companion_search.scan import GroupWeights, ScaleGroups, weighted_gain
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.student import SymmetricWhitening, scores
+from amibayes.units import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search of n data sets over the bank found.
+
+    Parameters
+    ----------
+    gain : (n,) float array
+        Largest gain in χ², for positive contrast.
+    position : (n,) int array
+        Where on the grid.
+    chi2 : (n,) float array
+        Without a companion, nuisance directions taken out.
+    """
+
+    gain: FloatArray
+    position: IntArray
+    chi2: FloatArray
+
+
+class ErrorTreatment(Protocol):
+    """How data sets are searched, and how null sets are made."""
+
+    def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
+        """Search data sets (n_data, n), whitened by the bank's own covariance."""
+        ...
+
+    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+        """Gain in χ² of one data set (n_data,) at every position, and its χ²."""
+        ...
+
+    def search_simulated(
+        self,
+        bank: TemplateBank,
+        normals: FloatArray,
+        rng: np.random.Generator,
+        signal: FloatArray | None = None,
+    ) -> Searched:
+        """Search simulated data sets.
+
+        Parameters
+        ----------
+        bank : TemplateBank
+        normals : (n_data, n) float array
+            Independent unit normals, made into noise here.
+        rng : numpy.random.Generator
+            For what else is drawn.
+        signal : (n_data, n) float array, optional
+            What is in the data beside noise, whitened.
+        """
+        ...
+
+    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
+        """Make the same with the noise of other whitened residuals (n_data,)."""
+        ...
+
+    @property
+    def null_rests_on_residuals(self) -> bool:
+        """Whether null draws have another distribution where the residuals are others."""
+        ...
+
+    def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
+        """Error of a faint companion's contrast at places (n, 2), mas, under its noise, (n,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class KnownErrors:
+    """The covariance is what is stated, or was fitted."""
+
+    null_rests_on_residuals = False
+
+    def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
+        """Search data sets; see `ErrorTreatment`."""
+        data = bank.project(white)
+        gain, position = bank.largest_gain(data.astype(np.float32))
+        return Searched(gain, position, (data**2).sum(axis=0))
+
+    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+        """Gain everywhere; see `ErrorTreatment`."""
+        data = bank.project(white)
+        return bank.survey(data).gain, float(data @ data)
+
+    def search_simulated(
+        self,
+        bank: TemplateBank,
+        normals: FloatArray,
+        rng: np.random.Generator,
+        signal: FloatArray | None = None,
+    ) -> Searched:
+        """Search simulated data sets; see `ErrorTreatment`."""
+        return self.search(bank, normals if signal is None else normals + signal)
+
+    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
+        """Nothing is taken from the residuals."""
+        return self
+
+    def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
+        """Error of the contrast at places; see `ErrorTreatment`."""
+        return bank.scan_at(np.zeros(bank.n_data), *places.T)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeScale:
+    """Every group of data scatters by its own amount, which each data set tells by itself.
+
+    Parameters
+    ----------
+    groups : ScaleGroups
+    scale : (n_data,) float array
+        Standard deviation of the noise of null sets: as measured in the data.
+    """
+
+    groups: ScaleGroups
+    scale: FloatArray
+
+    @classmethod
+    def measured(cls, groups: ScaleGroups, bank: TemplateBank, residuals: FloatArray) -> Self:
+        """Measure the scatter of the groups in whitened residuals (n_data,)."""
+        left = bank.project(residuals)[:, None]
+        return cls(groups, np.sqrt(groups.variances(left)[:, 0])[groups.label])
+
+    @property
+    def null_rests_on_residuals(self) -> bool:
+        """One common scale drops out of the ratio; those of several groups do not."""
+        return self.groups.several
+
+    def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
+        """Search data sets, each group's data weighted by its own scatter.
+
+        The gain is that share of χ² which the weighted data lose.
+        """
+        if not self.groups.several:
+            return KnownErrors().search(bank, white)
+        data = bank.project(white)
+        chi2 = (data**2).sum(axis=0)
+        rows, weight, total = self._weighted(bank, data)
+        own = GroupWeights(self.groups, weight.astype(np.float32))
+        gain, position = bank.largest_gain(rows.astype(np.float32), own)
+        return Searched(gain * chi2 / total, position, chi2)
+
+    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+        """Gain everywhere in weighted χ² of one data set (n_data,), and its weighted χ²."""
+        if not self.groups.several:
+            return KnownErrors().field(bank, white)
+        rows, weight, total = self._weighted(bank, bank.project(white)[:, None])
+        gain = np.zeros(len(bank))
+        for index, units in bank.by_band():
+            match = [rows.T @ unit for unit in units]
+            found = weighted_gain(GroupWeights(self.groups, weight), units, match)[0]
+            gain[index] = np.maximum(gain[index], found)
+        return gain, float(total[0])
+
+    def _weighted(
+        self, bank: TemplateBank, data: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Weigh data (n_data, n) by the scatter of their groups: (n_data, n), (n_groups, n), χ²."""
+        weight = 1.0 / self.groups.variances(data)
+        rows = weight[self.groups.label] * data
+        return bank.project(rows), weight, (rows * data).sum(axis=0)
+
+    def search_simulated(
+        self,
+        bank: TemplateBank,
+        normals: FloatArray,
+        rng: np.random.Generator,
+        signal: FloatArray | None = None,
+    ) -> Searched:
+        """Search data sets whose noise scatters as the data do; see `ErrorTreatment`."""
+        noise = normals * self.scale[:, None]
+        return self.search(bank, noise if signal is None else noise + signal)
+
+    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
+        """Measure the scatter in other residuals."""
+        return self.measured(self.groups, bank, residuals)
+
+    def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
+        """Error of the contrast at places with the groups' own scatter; see `ErrorTreatment`."""
+        sigma = KnownErrors().contrast_error(bank, places)
+        if not self.groups.several:
+            return np.asarray(sigma * self.scale[0])
+        square = [
+            (bank.templates_at(*part.T) ** 2 / self.scale[:, None] ** 2).sum(axis=0)
+            for part in np.array_split(places, 1 + len(places) // PLACES_AT_ONCE)
+        ]
+        return np.asarray(sigma / np.sqrt(np.concatenate(square)))
+
+
+PLACES_AT_ONCE = 512
+"""Places whose templates are held in memory together."""
+
+
+@dataclass(frozen=True, eq=False)
+class StudentScores:
+    """Residuals follow Student's t: each is bounded, so that no outlier can dominate.
+
+    What goes through the bank are the scores of `amibayes.likelihood.student.scores`, divided
+    by the robust scale of each data set.
+
+    Parameters
+    ----------
+    whitening : SymmetricWhitening
+    """
+
+    whitening: SymmetricWhitening
+    null_rests_on_residuals = False
+
+    def _scores(self, bank: TemplateBank, white: FloatArray) -> FloatArray:
+        return scores(self.whitening, bank.project(white))
+
+    def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
+        """Search data sets; see `ErrorTreatment`."""
+        return KnownErrors().search(bank, self._scores(bank, white))
+
+    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+        """Gain everywhere; see `ErrorTreatment`."""
+        return KnownErrors().field(bank, self._scores(bank, white[:, None])[:, 0])
+
+    def search_simulated(
+        self,
+        bank: TemplateBank,
+        normals: FloatArray,
+        rng: np.random.Generator,
+        signal: FloatArray | None = None,
+    ) -> Searched:
+        """Search simulated data sets; see `ErrorTreatment`."""
+        return self.search(bank, normals if signal is None else normals + signal)
+
+    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
+        """Nothing is taken from the residuals: their scale was fitted with the search."""
+        return self
+
+    def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
+        """Error of the contrast at places; see `ErrorTreatment`."""
+        return KnownErrors().contrast_error(bank, places)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """The statistic of a gain in χ²: the gain itself, or twice the logarithm of a likelihood ratio.
+
+    With the scale of the errors free, 2Δln L = n ln(χ²/(χ² − gain)): residuals and errors of one
+    data set grow together, and only their ratio counts. Data whose covariance was estimated
+    follow a t distribution, n + ν takes the place of n, and χ² has ν − 2 added.
+
+    Parameters
+    ----------
+    n_free : int
+        Independent data less the nuisance parameters.
+    count : float
+        n of the formula; infinite where the gain itself is the statistic.
+    added : float
+        What χ² has added.
+    degrees : float
+        Degrees of freedom of the covariance that count beside the n_free of the data; infinite
+        where it is known.
+    """
+
+    n_free: int
+    count: float = np.inf
+    added: float = 0.0
+    degrees: float = np.inf
+
+    @classmethod
+    def known(cls, n_free: int) -> Ratio:
+        """The gain itself: errors are known."""
+        return cls(n_free)
+
+    @classmethod
+    def scale_free(cls, n_free: int) -> Ratio:
+        """2Δln L of fits that scale the errors as well."""
+        return cls(n_free, n_free, 0.0, 0.0)
+
+    @classmethod
+    def student(cls, n_free: int, n_data: int, degrees: float) -> Ratio:
+        """2Δln L of data with a covariance of ``degrees`` degrees of freedom."""
+        return cls(n_free, n_data + degrees, degrees - 2.0, degrees)
+
+    def __call__(self, gain: FloatArray, chi2: FloatArray | float) -> FloatArray:
+        """Statistic of gains in χ² (n,) from a χ² without a companion (n,)."""
+        if not np.isfinite(self.count):
+            return gain
+        share = np.minimum(gain / (chi2 + self.added), 1.0 - 1e-15)
+        return np.asarray(-self.count * np.log1p(-share))
+
+    def gain_at(self, statistic: float) -> float:
+        """Gain in χ² of that statistic, if what is left of χ² is its expectation."""
+        if not np.isfinite(self.count):
+            return statistic
+        return float((self.n_free + self.added) * np.expm1(statistic / self.count))
+
+    def local_survival(self, statistic: FloatArray, n_contrasts: int = 1) -> FloatArray:
+        """Probability that noise alone reaches the statistic at one given position, any shape.
+
+        One side of a normal deviate, or of Student's t with the scale free or the covariance
+        estimated: exact for one linear parameter. Of several bands each contrast is positive
+        half of the time (exact where they are independent); of a motion it is at one rate.
+        """
+        x = np.asarray(statistic, dtype=float)
+        k = np.arange(1, n_contrasts + 1)
+        each = [self._beyond(x, int(number)) for number in k]
+        return np.tensordot(stats.binom.pmf(k, n_contrasts, 0.5), each, axes=1)
+
+    def _beyond(self, x: FloatArray, dof: int) -> FloatArray:
+        """Probability that the gain by ``dof`` parameters, of either sign, exceeds x."""
+        if not np.isfinite(self.count):
+            return np.asarray(stats.chi2.sf(x, dof))
+        rest = self.n_free + self.degrees - dof
+        return np.asarray(stats.f.sf(np.expm1(x / self.count) * rest / dof, dof, rest))
