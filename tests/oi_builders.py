@@ -137,6 +137,119 @@ class HandMade:
         return path
 
 
+HOLES_M = np.array(
+    [(0, -2.64), (-2.28631, 0), (2.28631, -1.32), (-2.28631, 1.32), (-1.14315, 1.98),
+     (2.28631, 1.32), (1.14315, 1.98)]
+)  # fmt: skip
+"""Those of NIRISS: no two baselines are alike."""
+
+
+class MaskFile:
+    """Exposures of a mask on a turning field, as a sound version 1 file to be spoilt at will.
+
+    ``tables`` and ``keywords`` as in `HandMade`; ``vis2`` and ``phase_deg`` are random, their
+    errors differ from row to row, so that the covariance tells which triangles share what.
+    """
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        *,
+        holes_m: np.ndarray = HOLES_M,
+        n_exposures: int = 3,
+        n_channels: int = 2,
+        turn_deg: float = 5.0,
+    ) -> None:
+        n = len(holes_m)
+        self.pairs = np.array(list(combinations(range(n), 2)))
+        self.triples = np.array(list(combinations(range(n), 3)))
+        self.n_exposures, self.wavelength_m = n_exposures, 2.1e-6 + 0.15e-6 * np.arange(n_channels)
+        angle = np.radians(turn_deg) * np.arange(n_exposures)
+        turned = [
+            holes_m @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) for a in angle
+        ]
+        leg = [np.concatenate([xy[t[:, 1]] - xy[t[:, 0]] for xy in turned])
+               for t in (self.pairs, self.triples, self.triples[:, 1:])]  # fmt: skip
+        date = 57890.17 + 0.004 * np.arange(n_exposures)
+
+        def rows(per_exposure: int) -> dict[str, Any]:
+            mjd = np.repeat(date, per_exposure)
+            return {
+                "TARGET_ID": ("1I", np.ones(len(mjd)), ""),
+                "TIME": ("1D", (mjd - np.floor(mjd)) * 86400.0, "s"),
+                "MJD": ("1D", mjd, "day"),
+                "INT_TIME": ("1D", np.ones(len(mjd)), "s"),
+            }
+
+        def values(count: int, low: float, high: float) -> tuple[str, Any]:
+            return f"{n_channels}D", rng.uniform(low, high, (count * n_exposures, n_channels))
+
+        n_pairs, n_triples, flag = len(self.pairs), len(self.triples), f"{n_channels}L"
+        self.tables: dict[str, Any] = {
+            "OI_TARGET": {
+                "TARGET_ID": ("1I", [1], ""),
+                "TARGET": ("16A", ["alf Test"], ""),
+                "RAEP0": ("1D", [10.0], "deg"),
+                "DECEP0": ("1D", [-20.0], "deg"),
+            },
+            "OI_ARRAY": {
+                "TEL_NAME": ("16A", [f"H{i}" for i in range(n)], ""),
+                "STA_NAME": ("16A", [f"H{i}" for i in range(n)], ""),
+                "STA_INDEX": ("1I", np.arange(1, n + 1), ""),
+                "DIAMETER": ("1E", np.ones(n), "m"),
+                "STAXYZ": ("3D", np.c_[holes_m, np.zeros(n)], "m"),
+            },
+            "OI_WAVELENGTH": {
+                "EFF_WAVE": ("1E", self.wavelength_m, "m"),
+                "EFF_BAND": ("1E", np.full(n_channels, 5e-8), "m"),
+            },
+            "OI_VIS2": rows(n_pairs)
+            | {
+                "VIS2DATA": (*values(n_pairs, 0.5, 1.0), ""),
+                "VIS2ERR": (*values(n_pairs, 0.01, 0.02), ""),
+                "UCOORD": ("1D", leg[0][:, 0], "m"),
+                "VCOORD": ("1D", leg[0][:, 1], "m"),
+                "STA_INDEX": ("2I", np.tile(self.pairs + 1, (n_exposures, 1)), ""),
+                "FLAG": (flag, np.zeros((n_pairs * n_exposures, n_channels), bool), ""),
+            },
+            "OI_T3": rows(n_triples)
+            | {
+                "T3PHI": (*values(n_triples, -5.0, 5.0), "deg"),
+                "T3PHIERR": (*values(n_triples, 0.5, 0.7), "deg"),
+                "U1COORD": ("1D", leg[1][:, 0], "m"),
+                "V1COORD": ("1D", leg[1][:, 1], "m"),
+                "U2COORD": ("1D", leg[2][:, 0], "m"),
+                "V2COORD": ("1D", leg[2][:, 1], "m"),
+                "STA_INDEX": ("3I", np.tile(self.triples + 1, (n_exposures, 1)), ""),
+                "FLAG": (flag, np.zeros((n_triples * n_exposures, n_channels), bool), ""),
+            },
+        }
+        common = {"OI_REVN": 1, "DATE_OBS": "2017-05-17", "ARRNAME": "SAM", "INSNAME": "I"}
+        self.keywords: dict[str, dict[str, Any]] = {
+            "OI_TARGET": {"OI_REVN": 1},
+            "OI_ARRAY": {"OI_REVN": 1, "ARRNAME": "SAM", "FRAME": "SKY"},
+            "OI_WAVELENGTH": {"OI_REVN": 1, "INSNAME": "I"},
+            "OI_VIS2": dict(common),
+            "OI_T3": dict(common),
+        }
+        self.more: list[Any] = []
+
+    put = HandMade.put
+    write = HandMade.write
+
+    def change(self, name: str, how: Any, *columns: str) -> None:
+        """Apply a function to the values of columns."""
+        for column in columns:
+            form, values, unit = self.tables[name][column]
+            self.tables[name][column] = form, how(np.asarray(values)), unit
+
+    def drop(self, *columns: str) -> None:
+        """Leave columns out of both data tables."""
+        for column in columns:
+            for name in {"OI_VIS2", "OI_T3"} & set(self.tables):
+                self.tables[name].pop(column, None)
+
+
 def random_setup(rng: np.random.Generator, n_stations: int, n_channels: int, name: str) -> Setup:
     return Setup(
         insname=name,
@@ -246,4 +359,12 @@ def diagonal(observables: Observables) -> Observables:
     )
 
 
-__all__ = ["HandMade", "diagonal", "random_observables", "stack_covariances", "table"]
+__all__ = [
+    "HOLES_M",
+    "HandMade",
+    "MaskFile",
+    "diagonal",
+    "random_observables",
+    "stack_covariances",
+    "table",
+]

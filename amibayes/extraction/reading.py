@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +13,8 @@ from astropy.io import fits
 from amibayes.data.observables import Observables
 from amibayes.extraction.extract import SEPARATOR, extract_all
 from amibayes.extraction.options import ExtractOptions
-from amibayes.oifits import read_oifits
+from amibayes.oifits import OIFits, observables_of, open_oifits
+from amibayes.oifits.audit import errors_in
 from amibayes.support.fits_errors import UNREADABLE
 
 
@@ -107,7 +108,13 @@ def _extracted(
 def _oifits(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    return [read_oifits(path, **options) for path in paths]
+    return [_with_errors(open_oifits(path), **options) for path in paths]
+
+
+def _with_errors(oifits: OIFits, **options: Any) -> Observables:
+    """Read a file; what an audit calls an error stands in the notes."""
+    found = observables_of(oifits, **options)
+    return replace(found, notes=(*found.notes, *errors_in(oifits, found)))
 
 
 FORMATS: tuple[InputFormat, ...] = (

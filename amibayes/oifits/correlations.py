@@ -14,7 +14,7 @@ from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
 from amibayes.data.observables import Measurements, closure_sets, exposure_labels
 from amibayes.errors import DataError
-from amibayes.oifits.setups import integers, numbers, placed, rest_of, same
+from amibayes.oifits.columns import integers, numbers, placed, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import DEGREE, BoolArray, FloatArray, IntArray
 

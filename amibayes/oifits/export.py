@@ -21,7 +21,7 @@ from amibayes.data.closure import canonical
 from amibayes.data.covariance import DiagonalCovariance
 from amibayes.data.observables import Measurements, Observables, Setup, join
 from amibayes.errors import DataError, UsageError
-from amibayes.oifits.setups import same
+from amibayes.oifits.columns import same
 from amibayes.oifits.writer import to_hdus
 from amibayes.support.atomic_files import atomic_path
 from amibayes.support.options import ImagingProgram

@@ -10,19 +10,16 @@ import numpy as np
 
 from amibayes.data.observables import Measurements, Observables, Setup
 from amibayes.errors import DataError
+from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response
+from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import Rows, channel_count, read_rows
 from amibayes.oifits.scatter import SCATTER
 from amibayes.oifits.setups import (
     DATA_TABLES,
     Target,
-    array_table,
     doubts_of_bands,
-    integers,
-    listing,
     make_setup,
-    same,
-    stations_of,
     targets_of,
     wavelength_table,
 )
@@ -83,6 +80,12 @@ def observables_of(
         _in_written_order(_stack([p for p in parts if p.u == 1], 1)),
         _in_written_order(_stack([p for p in parts if p.u == 2], 2)),
     )
+    if all(column.measurements.flag.all() for column in content.both):
+        raise DataError(
+            "holds no usable V² or closure phase: " + "; ".join(p.rows.unused for p in parts),
+            source=oifits.path,
+            remedy="check FLAG and what is named",
+        )
     stated = stated_covariance(oifits, content, closure_covariance)
     unused = tuple(
         f"{t.name or 'unnamed'} {t.extver} is not used"
@@ -132,7 +135,7 @@ def _chosen_target(
 ) -> tuple[str, dict[int, Target]]:
     """Name of the target to read, and the target of every TARGET_ID in use."""
     known = targets_of(oifits)
-    ids = np.unique(np.concatenate([integers(oifits, t, "TARGET_ID", 1)[:, 0] for t in tables]))
+    ids = np.unique(np.concatenate([_target_ids(oifits, t) for t in tables]))
     found = {int(i): known.get(int(i), Target(f"target {i}")) for i in ids}
     alike = [t for t in found.values() if wanted is None or same(t.name, wanted)]
     if not alike:
@@ -156,32 +159,45 @@ def _parts(
     setups: dict[tuple[int, int, int], Setup] = {}
     rows_so_far: dict[tuple[int, int], int] = {}
     parts: list[_Part] = []
+    chosen = {t.number: _rows_of_target(oifits, t, targets, name) for t in tables}
+    tables = [t for t in tables if len(chosen[t.number])]
+    identified = stations_of_rows(oifits, tables, chosen)
     for table in tables:
-        ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
-        chosen = np.flatnonzero([same(targets[int(i)].name, name) for i in ids])
-        if not len(chosen):
-            continue
+        rows_in_use, found = chosen[table.number], identified[table.number]
         wavelengths = wavelength_table(oifits, table, channel_count(oifits, table))
-        array = array_table(oifits, table)
-        stations = stations_of(oifits, array, _stations_in_use(oifits, tables, array))
         own = table.header.get(f"{OWN_KEY} SETUP", 0)
         doubts: tuple[str, ...] = ()
-        key = (wavelengths.number, 0 if array is None else array.number, own)
+        key = (wavelengths.number, 0 if found.array is None else found.array.number, own)
         if key not in setups:
-            made = make_setup(oifits, wavelengths, array, stations, targets[int(ids[chosen[0]])])
+            target = targets[int(_target_ids(oifits, table)[rows_in_use[0]])]
+            made = make_setup(oifits, wavelengths, found.array, found.stations, target)
             setups[key] = with_response(oifits, made, own)
             doubts = doubts_of_bands(oifits, wavelengths)
         setup = setups[key]
-        index = integers(oifits, table, "STA_INDEX", 2 + (table.name == "OI_T3"))
         rows = read_rows(
-            oifits, table, chosen, stations.position(index), (setup.wavelength_m, setup.band_m)
+            oifits, table, rows_in_use, found.position, (setup.wavelength_m, setup.band_m)
         )
         number, k = list(setups).index(key), 1 + (table.name == "OI_T3")
-        rows = replace(rows, notes=(*doubts, *rows.notes))
+        rows = replace(rows, notes=(*doubts, *found.notes, *rows.notes))
         first = rows_so_far.get((number, k), 0)
-        rows_so_far[number, k] = first + len(chosen)
+        rows_so_far[number, k] = first + len(rows_in_use)
         parts.append(_Part(k, _numbered(rows, number, first, table)))
     return tuple(setups.values()), parts
+
+
+def _target_ids(oifits: OIFits, table: OITable) -> IntArray:
+    """TARGET_ID of each row; of the only target, where the column is absent."""
+    known = list(targets_of(oifits))
+    if "TARGET_ID" not in table.columns and len(known) < 2:
+        return np.full(len(table), known[0] if known else 1, dtype=np.intp)
+    return integers(oifits, table, "TARGET_ID", 1)[:, 0]
+
+
+def _rows_of_target(
+    oifits: OIFits, table: OITable, targets: dict[int, Target], name: str
+) -> IntArray:
+    ids = _target_ids(oifits, table)
+    return np.flatnonzero([same(targets[int(i)].name, name) for i in ids])
 
 
 def _numbered(rows: Rows, setup: int, first_row: int, table: OITable) -> Rows:
@@ -196,15 +212,6 @@ def _numbered(rows: Rows, setup: int, first_row: int, table: OITable) -> Rows:
         ),
         independent=independent,
     )
-
-
-def _stations_in_use(oifits: OIFits, tables: list[OITable], array: OITable | None) -> IntArray:
-    used = [
-        integers(oifits, t, "STA_INDEX", 2 + (t.name == "OI_T3")).ravel()
-        for t in tables
-        if array_table(oifits, t) is array
-    ]
-    return np.unique(np.concatenate(used))
 
 
 def _stack(parts: Sequence[_Part], k: int) -> Column:

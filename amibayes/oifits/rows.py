@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.data.observables import Measurements
 from amibayes.errors import DataError
+from amibayes.oifits.columns import coordinates, integers, numbers, rest_of
 from amibayes.oifits.dates import mjd_of_date
-from amibayes.oifits.scales import ANGLE, LENGTH, TIME, scale_of
-from amibayes.oifits.setups import integers, numbers, rest_of
+from amibayes.oifits.scales import ANGLE, TIME, scale_of
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -78,6 +80,8 @@ class Rows:
     independent : bool
         The file says that its closure phases are to be taken as independent.
     notes : tuple of str
+    unused : str
+        How many values are flagged, and why.
     """
 
     measurements: Measurements
@@ -88,6 +92,7 @@ class Rows:
     insname: str
     independent: bool = False
     notes: tuple[str, ...] = field(default=())
+    unused: str = ""
 
 
 def grid(oifits: OIFits, table: OITable, name: str, n_channels: int) -> FloatArray:
@@ -146,14 +151,28 @@ def _one_number(table: OITable, name: str, absent: float) -> FloatArray:
 def _flags(oifits: OIFits, table: OITable, n_channels: int) -> tuple[BoolArray, str]:
     if "FLAG" not in table.columns:
         return np.zeros((len(table), n_channels), dtype=bool), f"{table.label} has no FLAG"
-    values = table.columns["FLAG"]
+    values = _logical(table.columns["FLAG"])
     if values.shape == (len(table),):
         values = np.repeat(values[:, None], n_channels, axis=1)
-    if values.dtype.kind == "U":
-        values = values == "T"
     if values.size != len(table) * n_channels:
         raise DataError(f"{table.label}: FLAG has another shape than the data", source=oifits.path)
     return values.reshape(len(table), n_channels).astype(bool), ""
+
+
+def _logical(values: NDArray[Any]) -> BoolArray:
+    """Flags, whatever type a file gives them; a NULL byte, or a blank, is no flag.
+
+    Some programs write the letters T and F as text or as bytes.
+    """
+    if values.dtype.kind == "U":
+        width = values.dtype.itemsize // 4
+        letters = np.char.ljust(values, width).view(f"U{1}") if width > 1 else values
+        return np.isin(letters.reshape(*values.shape[:1], -1), ["T", "t", "1"])
+    if values.dtype.kind in "iu" and np.isin(values, [ord("T"), ord("F"), 0]).all():
+        return np.asarray(values == ord("T"))
+    if values.dtype.kind not in "biuf":
+        return np.zeros(values.shape, dtype=bool)
+    return np.asarray(np.nan_to_num(values.astype(float)) != 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,23 +186,8 @@ class _Cells:
     notes: tuple[str, ...]
 
 
-def _scaled(
-    oifits: OIFits, table: OITable, names: tuple[str, ...], known: dict[str, float], default: str
-) -> tuple[FloatArray, list[str]]:
-    """Columns of one number a row in SI, (rows, len(names)), and units that were not understood."""
-    out, notes = [], []
-    for name in names:
-        scale, understood = scale_of(table.units.get(name, ""), known, default)
-        values = numbers(oifits, table, name)
-        if values.size != len(table):
-            raise DataError(f"{table.label}: {name} is not one number a row", source=oifits.path)
-        out.append(values.reshape(-1) * scale)
-        if not understood:
-            notes.append(f"{table.label}: unit {table.units[name]!r} of {name} read as {default}")
-    return np.stack(out, axis=1), notes
-
-
-def _cells(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> _Cells:
+def _cells(oifits: OIFits, table: OITable, kind: Kind, wavelength: FloatArray) -> _Cells:
+    n_channels = len(wavelength)
     value = grid(oifits, table, kind.value, n_channels)
     sigma = grid(oifits, table, kind.error, n_channels)
     notes: list[str] = []
@@ -198,8 +202,8 @@ def _cells(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> _Cell
     with np.errstate(over="ignore", invalid="ignore"):
         variance = np.where(sigma > 0, sigma**2, np.nan)
     variance = variance + rest_of(table, kind.error, value.shape)
-    u, u_notes = _scaled(oifits, table, kind.u, LENGTH, "m")
-    v, v_notes = _scaled(oifits, table, kind.v, LENGTH, "m")
+    u, u_notes = coordinates(oifits, table, kind.u, wavelength)
+    v, v_notes = coordinates(oifits, table, kind.v, wavelength)
     return _Cells(value, variance, u, v, (*notes, *u_notes, *v_notes))
 
 
@@ -243,16 +247,16 @@ def read_rows(
     kind = KINDS[table.name]
     wavelength, band = channels
     n_channels, n = len(wavelength), len(chosen)
-    cells = _cells(oifits, table, kind, n_channels)
+    cells = _cells(oifits, table, kind, wavelength)
     mjd, time_note = times_of(table)
     flag, flag_note = _flags(oifits, table, n_channels)
-    flag, newly = _with_unusable(flag, cells, kind, wavelength, station_position)
+    faults = _faults(cells, kind, wavelength, station_position)
+    causes = _causes({name: mask[chosen] & ~flag[chosen] for name, mask in faults.items()})
+    stated = f"{flag[chosen].sum()} of {flag[chosen].size} flagged in the file"
+    flag = np.logical_or.reduce([flag, *(np.broadcast_to(m, flag.shape) for m in faults.values())])
     notes = [*cells.notes, time_note, flag_note]
-    if newly[chosen].any():
-        count = newly[chosen].sum()
-        notes.append(f"{table.label}: {count} value(s) without a usable value or error flagged")
-    each = np.repeat(chosen, n_channels)
-    channel = np.tile(np.arange(n_channels), n)
+    notes += [f"{table.label}: values that cannot be used were flagged: {causes}"] * bool(causes)
+    each, channel = np.repeat(chosen, n_channels), np.tile(np.arange(n_channels), n)
     measurements = Measurements(
         value=cells.value[chosen].ravel(),
         u_m=cells.u_m[each],
@@ -275,21 +279,38 @@ def read_rows(
         _place(table, n_channels, chosen),
         table.keyword("INSNAME"),
         notes=tuple(note for note in notes if note),
+        unused=f"{table.label}: {stated}" + (f", {causes}" if causes else ""),
     )
 
 
-def _with_unusable(
-    flag: BoolArray,
-    cells: _Cells,
-    kind: Kind,
-    wavelength: FloatArray,
-    station_position: IntArray,
-) -> tuple[BoolArray, BoolArray]:
-    """(flags with those of cells that cannot be used, which of them are new)."""
-    wrong = unusable(kind, cells.value, cells.variance) | ~(wavelength > 0)
-    wrong |= ~np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)[:, None]
-    wrong |= _repeats_a_station(station_position)[:, None]
-    return flag | wrong, wrong & ~flag
+def _faults(
+    cells: _Cells, kind: Kind, wavelength: FloatArray, station_position: IntArray
+) -> dict[str, BoolArray]:
+    """Where a cell cannot be used, by the reason; each mask spreads to (rows, channels)."""
+    has_error = np.where(np.isfinite(cells.value), cells.variance, 1.0)
+    fine = np.ones_like(cells.value)
+    known = np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)
+    return {
+        "without a usable value": unusable(kind, cells.value, fine),
+        "without a usable error": unusable(kind, np.zeros_like(cells.value), has_error),
+        "without a wavelength": np.broadcast_to(~(wavelength > 0), cells.value.shape),
+        "without (u, v)": np.broadcast_to(~known[:, None], cells.value.shape),
+        "of a station with itself": np.broadcast_to(
+            _repeats_a_station(station_position)[:, None], cells.value.shape
+        ),
+    }
+
+
+def _causes(faults: dict[str, BoolArray]) -> str:
+    """How many cells have each fault; a cell that has several counts for the first."""
+    counted = np.zeros(next(iter(faults.values())).shape, dtype=bool)
+    found = []
+    for name, mask in faults.items():
+        count = int((mask & ~counted).sum())
+        counted |= mask
+        if count:
+            found.append(f"{count} {name}")
+    return ", ".join(found)
 
 
 def _correlation_index(oifits: OIFits, table: OITable, kind: Kind, n_channels: int) -> IntArray:

@@ -28,6 +28,14 @@ _TIME = {
     "h hour hours hr": 3600.0,
     "d day days": 86400.0,
 }
+_FREQUENCY = {
+    "lambda wavelength wavelengths rad-1 rad^-1 1/rad cycles/rad cycle/rad": 1.0,
+    "klambda kilolambda 1e3lambda": 1e3,
+    "mlambda megalambda 1e6lambda": 1e6,
+    "glambda gigalambda 1e9lambda": 1e9,
+    "arcsec-1 arcsec^-1 1/arcsec cycles/arcsec cycle/arcsec": 1.0 / (MAS * 1e3),
+    "mas-1 mas^-1 1/mas cycles/mas": 1.0 / MAS,
+}
 
 
 def _spelled_out(scales: dict[str, float]) -> dict[str, float]:
@@ -35,6 +43,9 @@ def _spelled_out(scales: dict[str, float]) -> dict[str, float]:
 
 
 LENGTH, ANGLE, TIME = _spelled_out(_LENGTH), _spelled_out(_ANGLE), _spelled_out(_TIME)
+
+FREQUENCY = _spelled_out(_FREQUENCY)
+"""Baselines as numbers of wavelengths, per radian; small letters, so that m is mega here."""
 
 
 def scale_of(unit: str, known: dict[str, float], default: str) -> tuple[float, bool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from amibayes.data.observables import Setup
 from amibayes.errors import DataError
+from amibayes.oifits.columns import column, integers, numbers, rest_of, same
 from amibayes.oifits.scales import ANGLE, LENGTH, scale_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, plain
 from amibayes.units import DEGREE, FloatArray, IntArray
@@ -42,62 +42,6 @@ class Stations:
         return np.asarray(order[np.searchsorted(self.index[order], index)])
 
 
-def column(oifits: OIFits, table: OITable, name: str) -> NDArray[Any]:
-    """A column that has to be there.
-
-    Raises
-    ------
-    DataError
-        Where it is not.
-    """
-    if name not in table.columns:
-        raise DataError(
-            f"{table.label} has no column {name}",
-            source=oifits.path,
-            remedy="write the file again with the columns that OIFITS requires",
-        )
-    return table.columns[name]
-
-
-def numbers(oifits: OIFits, table: OITable, name: str) -> FloatArray:
-    """A required column as float64.
-
-    Raises
-    ------
-    DataError
-        Where the column is absent or holds no numbers.
-    """
-    values = column(oifits, table, name)
-    if values.dtype.kind not in "iufb":
-        raise DataError(f"{table.label}: column {name} holds no numbers", source=oifits.path)
-    return values.astype(float)
-
-
-def integers(oifits: OIFits, table: OITable, name: str, width: int) -> IntArray:
-    """A required column of whole numbers, (rows, width).
-
-    Raises
-    ------
-    DataError
-        Where it is absent, holds no numbers or has another width.
-    """
-    values = numbers(oifits, table, name)
-    if values.size != len(table) * width or not np.isfinite(values).all():
-        raise DataError(
-            f"{table.label}: column {name} does not hold {width} number(s) in each row",
-            source=oifits.path,
-        )
-    return values.reshape(len(table), width).astype(np.intp)
-
-
-def rest_of(table: OITable, name: str, shape: tuple[int, ...]) -> FloatArray:
-    """What rounding to the standard's units lost, as `write_oifits` keeps it; 0 elsewhere."""
-    values = table.columns.get(f"NS_{name}_REST")
-    if values is None or values.size != np.prod(shape) or values.dtype.kind != "f":
-        return np.zeros(shape)
-    return np.asarray(values.reshape(shape), dtype=float)
-
-
 def targets_of(oifits: OIFits) -> dict[int, Target]:
     """Targets by TARGET_ID; a file without OI_TARGET has none."""
     found: dict[int, Target] = {}
@@ -118,11 +62,6 @@ def _degrees(table: OITable, name: str) -> list[float]:
     # Degrees are the standard's unit: they pass unchanged, bit for bit.
     degrees = values.astype(float) * (1.0 if scale == DEGREE else scale / DEGREE)
     return [float(x) if np.isfinite(x) else 0.0 for x in degrees]
-
-
-def same(a: str, b: str) -> bool:
-    """Whether two names are one, whatever their padding and case."""
-    return plain(a).casefold() == plain(b).casefold()
 
 
 def array_table(oifits: OIFits, table: OITable) -> OITable | None:
@@ -224,13 +163,24 @@ def channels_of(oifits: OIFits, table: OITable) -> tuple[FloatArray, FloatArray]
         band = np.abs(_metres(oifits, table, "EFF_BAND"))
     usable = wavelength[np.isfinite(wavelength) & (wavelength > 0)]
     if not len(usable) or usable.max() > 1e-2:
+        swapped = _looks_swapped(table.columns["EFF_WAVE"])
         raise DataError(
-            f"{table.label}: EFF_WAVE is no wavelength in metres",
+            f"{table.label}: EFF_WAVE is no wavelength in metres"
+            + (": its bytes are in the reverse of FITS's order" if swapped else ""),
             source=oifits.path,
-            remedy="give the unit of EFF_WAVE in its TUNIT",
+            remedy="write the file with a FITS library"
+            if swapped
+            else "give the unit of EFF_WAVE in its TUNIT",
         )
     with np.errstate(invalid="ignore"):
         return wavelength, np.where(band <= wavelength, band, 0.0)
+
+
+def _looks_swapped(values: NDArray[Any]) -> bool:
+    """Whether numbers would be wavelengths of light if their bytes were turned round."""
+    turned = values.byteswap()
+    with np.errstate(invalid="ignore"):
+        return bool(((turned > 1e-7) & (turned < 1e-3)).all())
 
 
 def doubts_of_bands(oifits: OIFits, table: OITable) -> tuple[str, ...]:
@@ -290,15 +240,3 @@ def make_setup(
         right_ascension_deg=target.right_ascension_deg,
         declination_deg=target.declination_deg,
     )
-
-
-def listing(names: Sequence[str]) -> str:
-    """Names for an error message, each once."""
-    return ", ".join(dict.fromkeys(names))
-
-
-def placed(wanted: IntArray, known: IntArray, place: IntArray) -> IntArray:
-    """Places of rising numbers where they are wanted, −1 for others; any may be a billion."""
-    known, place = np.append(0, known), np.append(-1, place)
-    at = np.searchsorted(known, wanted, side="right") - 1
-    return np.where(known[at] == wanted, place[at], -1)

@@ -13,6 +13,7 @@ from amibayes.data.covariance import Covariance, DiagonalCovariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import CovarianceKind, Measurements
 from amibayes.errors import DataError
+from amibayes.oifits.columns import same
 from amibayes.oifits.correlations import (
     REMEDY,
     Pairs,
@@ -24,7 +25,6 @@ from amibayes.oifits.correlations import (
     trusted_pairs,
 )
 from amibayes.oifits.scatter import scatter_of
-from amibayes.oifits.setups import same
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -87,12 +87,6 @@ def stated_covariance(
     variance = np.concatenate([c.variance for c in content.both])
     closure = content.closure.measurements
     closure = closure.select(~closure.flag)
-    if flag.all():
-        raise DataError(
-            "holds no usable V² or closure phase: every value is flagged or without an error",
-            source=oifits.path,
-            remedy="check FLAG and the errors",
-        )
     tables = _tables_in_use(oifits, content)
     images, variance, notes = _image_pairs(oifits, content, variance)
     if closure_covariance == "diagonal":

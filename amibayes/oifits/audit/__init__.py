@@ -10,11 +10,12 @@ from amibayes.errors import DataError
 from amibayes.oifits.audit import geometry, noise, packages, structure, values
 from amibayes.oifits.audit.finding import Finding, Severity
 from amibayes.oifits.audit.repair import repair
+from amibayes.oifits.columns import integers
 from amibayes.oifits.reader import observables_of
-from amibayes.oifits.setups import DATA_TABLES, integers, targets_of
+from amibayes.oifits.setups import DATA_TABLES, targets_of
 from amibayes.oifits.tables import OIFits, open_oifits
 
-__all__ = ["Audit", "Finding", "Severity", "audit", "repair"]
+__all__ = ["Audit", "Finding", "Severity", "audit", "errors_in", "repair"]
 
 FILE_CHECKS = (
     *structure.CHECKS,
@@ -75,6 +76,29 @@ def audit(path: str | Path | OIFits) -> Audit:
     parts = [p for p in (_part(oifits, name) for name in names) if p is not None]
     found += [finding for check in DATA_CHECKS for finding in check(oifits, parts)]
     return Audit(oifits, tuple(sorted(found, key=lambda f: f.severity != "error")))
+
+
+def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
+    """What an audit calls an error, one line for each kind, for data that were read already.
+
+    Parameters
+    ----------
+    oifits : OIFits
+    observables : Observables
+        What was read of it.
+    """
+    found = [finding for check in FILE_CHECKS for finding in check(oifits)]
+    found += [f for check in geometry.DATA_CHECKS for f in check(oifits, [observables])]
+    groups: dict[str, list[Finding]] = {}
+    for finding in found:
+        if finding.severity == "error":
+            groups.setdefault(finding.code, []).append(finding)
+    return tuple(_line(group) for group in groups.values())
+
+
+def _line(group: list[Finding]) -> str:
+    first, more = group[0], f" (and {len(group) - 1} more like it)" if len(group) > 1 else ""
+    return f"{first.where}: {first.what}{more}: {first.why} (amibayes audit)"
 
 
 def _targets(oifits: OIFits) -> list[str]:

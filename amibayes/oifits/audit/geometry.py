@@ -12,6 +12,7 @@ from amibayes.data.closure import canonical
 from amibayes.data.observables import Measurements, Observables, closure_sets
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
 from amibayes.oifits.tables import OIFits
+from amibayes.oifits.uv_stations import common_factor
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 SAME_UV = 0.02
@@ -49,9 +50,20 @@ def repeated_stations(oifits: OIFits) -> Findings:
 def uv_against_stations(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
     """(u, v) of triangles against those of the same baselines in OI_VIS2."""
     for part in parts:
-        agree, reverse, compared = _legs(part)
+        factor = _factor(part)
+        agree, reverse, compared = _legs(part, factor)
         off = compared & ~agree & ~reverse
         where = listed(s.insname for s in part.setups)
+        if factor != 1.0:
+            yield Finding(
+                "error",
+                "uv-factor",
+                where,
+                f"(u, v) of baselines are {factor:.4f} times those of the same sides of triangles, "
+                "as if one of them had been divided by another mean wavelength",
+                "separations from V² and from closure phases differ by that factor",
+                "multiply UCOORD, VCOORD or U1COORD … V2COORD by it, whichever is wrong",
+            )
         if off.sum() > 0.01 * max(compared.sum(), 1):
             yield Finding(
                 "error",
@@ -74,7 +86,14 @@ def uv_against_stations(oifits: OIFits, parts: Sequence[Observables]) -> Finding
             )
 
 
-def _legs(part: Observables) -> tuple[BoolArray, BoolArray, BoolArray]:
+def _factor(part: Observables) -> float:
+    """By what the triangles' (u, v) have to be multiplied to be V²'s."""
+    vis2, closure = _rows(part.vis2), _rows(part.closure_phase)
+    sides = np.stack([closure.u_m, closure.v_m], axis=2).reshape(-1, 2, 2)
+    return common_factor(np.concatenate([vis2.u_m, vis2.v_m], axis=1), sides)
+
+
+def _legs(part: Observables, factor: float) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Where the two sides of each triangle agree with V²'s (u, v), or with its reverse."""
     vis2, closure = _rows(part.vis2), _rows(part.closure_phase)
     n = len(closure)
@@ -83,7 +102,7 @@ def _legs(part: Observables) -> tuple[BoolArray, BoolArray, BoolArray]:
         return agree, reverse, compared
     for side in range(2):
         pair = closure.stations[:, side : side + 2]
-        uv = np.stack([closure.u_m[:, side], closure.v_m[:, side]], axis=1)
+        uv = factor * np.stack([closure.u_m[:, side], closure.v_m[:, side]], axis=1)
         nearest, days = _same_baseline(closure, pair, vis2)
         turned = (pair[:, 0] > pair[:, 1]) != (
             vis2.stations[nearest, 0] > vis2.stations[nearest, 1]

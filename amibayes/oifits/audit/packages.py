@@ -13,7 +13,7 @@ import numpy as np
 
 from amibayes.oifits.audit.finding import Finding, Findings, column, data_tables, radians, unflagged
 from amibayes.oifits.audit.values import value_and_error
-from amibayes.oifits.setups import same
+from amibayes.oifits.columns import same
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
 

@@ -11,10 +11,15 @@ from collections import Counter
 import numpy as np
 
 from amibayes.oifits.audit.finding import DATA_TABLES, Finding, Findings, column, listed
+from amibayes.oifits.columns import same
 from amibayes.oifits.scales import ANGLE
-from amibayes.oifits.setups import same
 from amibayes.oifits.standard import PRIMARY_KEYWORDS, TABLES, ColumnRule
 from amibayes.oifits.tables import OIFits, OITable, plain
+
+NEEDED = {"TARGET_ID", "TARGET", "STA_INDEX", "EFF_WAVE", "MJD", "FLAG", "UCOORD", "VCOORD"}
+NEEDED |= {"U1COORD", "V1COORD", "U2COORD", "V2COORD", "IINDX", "JINDX", "CORR"}
+NEEDED |= {"VIS2DATA", "VIS2ERR", "T3PHI", "T3PHIERR", "VISAMP", "VISPHI"}
+"""Columns without which numbers have no meaning; others are the standard's formalities."""
 
 READERS = "programs that follow the standard may not read it, or read it wrongly"
 
@@ -109,7 +114,7 @@ def columns(oifits: OIFits) -> Findings:
         absent = [r.name for r in rules if not r.optional and r.name not in table.columns]
         if absent:
             yield Finding(
-                "error",
+                "error" if NEEDED & set(absent) else "warning",
                 "column-missing",
                 table.label,
                 f"has no column {listed(absent)}",
