@@ -125,7 +125,7 @@ def _same_place(
 def _between_lattice_points(
     bank: TemplateBank, places: FloatArray, most: FloatArray, where: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Look around the best lattice points: near 1 a correlation must be known well.
+    """Search around the best lattice points: near 1 a correlation must be known well.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Companions put into measured images, and whether the search finds them there.
 
-The star of a measured cube is located and weighed in every integration, as extraction does
-it; a companion is the same star's image again, fainter and elsewhere. What follows (extraction,
-calibration, search) does not know of it: the losses of the real way are all there.
+The star of a measured cube is located, and its flux measured, in every integration, as
+extraction does; a companion is the same star's image again, fainter and elsewhere. What follows
+(extraction, calibration, search) does not know of it: the losses of the real way are all there.
 """
 
 from __future__ import annotations

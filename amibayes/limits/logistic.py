@@ -9,7 +9,7 @@ from scipy import optimize, special
 
 from amibayes.units import FloatArray
 
-MAX_STEPS, SETTLED = 100, 1e-10
+MAX_STEPS, CONVERGED = 100, 1e-10
 
 
 TYPICAL = np.array([0.0, 6.0, 0.0, 0.0])
@@ -101,7 +101,7 @@ def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Lo
         # Far from the answer the curvature is that of another place.
         step *= min(1.0, 3.0 / max(np.abs(step).max(), 1e-300))
         beta = beta + step
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
     return Logistic(low, high, beta, np.linalg.inv(information))
 

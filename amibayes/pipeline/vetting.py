@@ -1,9 +1,9 @@
-"""Vetting: may a calibrator be believed? Each against the rest, and each by itself.
+"""Vetting: which calibrators to keep or drop. Each against the rest, and each by itself.
 
 A calibrator that disagrees with the others, has a companion of its own or is resolved puts
 its own structure into the target. Calibrators are compared by calibrating each with the
 others: what is left has to be a point source within errors that include the scatter between
-calibrators. The worst one is dropped first and the rest are looked at again, so that one bad
+calibrators. The worst one is dropped first and the rest are compared again, so that one bad
 calibrator does not take good ones along.
 """
 
@@ -79,7 +79,7 @@ class Vetted:
 
 @dataclass(frozen=True, eq=False)
 class Vetting:
-    """Verdicts on a set of calibrators, in the order given."""
+    """What vetting says of a set of calibrators, in the order given."""
 
     calibrators: tuple[Vetted, ...]
     alpha: float
@@ -102,13 +102,13 @@ def vet(
     fewest: int = 2,
     seed: int = SEED,
 ) -> Vetting:
-    """Judge every calibrator, against the others that share baselines with it and by itself.
+    """Test every calibrator, against the others that share baselines with it and by itself.
 
     Parameters
     ----------
     calibrators : sequence of Observables
     calibrated : bool
-        The data are calibrated already (a vetting programme): each is judged by itself.
+        The data are calibrated already (a vetting programme): each is tested by itself.
     separation_mas : (inner, outer), optional
         Field of the companion search.
     alpha : float
@@ -120,13 +120,13 @@ def vet(
     charge_levels : sequence of float, optional
         Of the target, then of each calibrator.
     fewest : int
-        Calibrators that must share baselines to be judged against each other; fewer are kept.
+        Calibrators that must share baselines to be tested against each other; fewer are kept.
     seed : int
 
     Raises
     ------
     DataError
-        Where there is nothing to judge.
+        Where there is nothing to test.
     """
     if not calibrators:
         raise DataError("no calibrator given", remedy="give at least one")
@@ -134,22 +134,22 @@ def vet(
     leave_out = _LeaveOut(data)
     agreement: list[float | None] = [None] * len(data)
     # Alone and uncalibrated, the instrument's own closure phases would pass for a companion.
-    judged: list[Observables | None] = list(data if calibrated else [None] * len(data))
+    alone: list[Observables | None] = list(data if calibrated else [None] * len(data))
     dropped: set[int] = set()
     for family in [] if calibrated else leave_out.families(max(fewest, 2)):
         dropped |= _compare(leave_out, family, agreement, alpha)
         for k in family:
-            judged[k] = leave_out.rest(k, [j for j in family if j not in dropped])
+            alone[k] = leave_out.rest(k, [j for j in family if j not in dropped])
     streams = np.random.SeedSequence(seed).spawn(len(data))
-    verdicts = []
+    calibrators_tested = []
     for k, stream in enumerate(streams):
         ratio = _ratio(charge_levels, k)
-        verdict = Vetted(data[k].source, True, "", agreement[k], charge_ratio=ratio)
-        if (left := judged[k]) is not None:
+        vetted = Vetted(data[k].source, True, "", agreement[k], charge_ratio=ratio)
+        if (left := alone[k]) is not None:
             rng = np.random.default_rng(stream)
-            verdict = _by_itself(verdict, left, separation_mas, alpha, null_draws, limits, rng)
-        verdicts.append(_decided(verdict, k in dropped, alpha))
-    return Vetting(tuple(verdicts), alpha)
+            vetted = _by_itself(vetted, left, separation_mas, alpha, null_draws, limits, rng)
+        calibrators_tested.append(_decided(vetted, k in dropped, alpha))
+    return Vetting(tuple(calibrators_tested), alpha)
 
 
 def _ratio(charge_levels: Sequence[float] | None, k: int) -> float | None:
@@ -233,7 +233,7 @@ def _chance(left: Observables, n_others: int) -> float:
 
 
 def _by_itself(
-    verdict: Vetted,
+    vetted: Vetted,
     data: Observables,
     separation_mas: tuple[float, float] | None,
     alpha: float,
@@ -246,11 +246,11 @@ def _by_itself(
     likelihood = Likelihood(data, BinaryModel(diameter_mas="free" if free else 0.0))
     found = search(likelihood, separation_mas)
     # Neither test takes the size of the stated errors for known.
-    weight = significance(statistic_of(found), null_draws, rng, alpha)
-    limit = detection_limit(found, weight, rng) if limits else None
-    verdict = replace(verdict, companion=found, significance=weight, limit=limit)
+    found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
+    limit = detection_limit(found, found_by_noise, rng) if limits else None
+    vetted = replace(vetted, companion=found, significance=found_by_noise, limit=limit)
     if not data.n_vis2:
-        return verdict
+        return vetted
     disc = Likelihood(data, BinaryModel(diameter_mas="free"))
     best, _ = fit_single(disc)
     chi2 = float(single_likelihood(disc).chi2(best)[0])
@@ -258,33 +258,33 @@ def _by_itself(
     # A diameter cannot be negative: half of the χ² distribution of one degree of freedom.
     gain = Ratio.scale_free(data.n_independent)(np.array([max(point - chi2, 0.0)]), point)
     probability = 0.5 * float(stats.chi2.sf(gain[0], 1))
-    return replace(verdict, diameter_mas=float(best[0]), diameter_probability=probability)
+    return replace(vetted, diameter_mas=float(best[0]), diameter_probability=probability)
 
 
-def _decided(verdict: Vetted, disagrees: bool, alpha: float) -> Vetted:
+def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
     reasons = []
     if disagrees:
-        reasons.append(f"disagrees with the other calibrators (p = {verdict.agreement:.2g})")
-    weight, found = verdict.significance, verdict.companion
-    if weight is not None and found is not None and weight.probability < alpha:
+        reasons.append(f"disagrees with the other calibrators (p = {vetted.agreement:.2g})")
+    tested, found = vetted.significance, vetted.companion
+    if tested is not None and found is not None and tested.probability < alpha:
         c = found.companion
         reasons.append(
             f"companion of {c.delta_mag:.1f} mag at {c.separation_mas:.1f} mas, "
-            f"PA {c.position_angle_deg:.0f} deg (false-alarm probability {weight.probability:.2g})"
+            f"PA {c.position_angle_deg:.0f} deg (false-alarm probability {tested.probability:.2g})"
         )
-    elif verdict.diameter_probability is not None and verdict.diameter_probability < alpha:
+    elif vetted.diameter_probability is not None and vetted.diameter_probability < alpha:
         reasons.append(
-            f"resolved: {verdict.diameter_mas:.2f} mas (p = {verdict.diameter_probability:.2g})"
+            f"resolved: {vetted.diameter_mas:.2f} mas (p = {vetted.diameter_probability:.2g})"
         )
-    return replace(verdict, kept=not reasons, reason="; ".join(reasons))
+    return replace(vetted, kept=not reasons, reason="; ".join(reasons))
 
 
-def doubts(vetted: Vetted, alpha: float) -> list[str]:
+def notes(vetted: Vetted, alpha: float) -> list[str]:
     """Say what does not drop a calibrator and should be known."""
-    said = []
+    found = []
     if vetted.kept and vetted.agreement is not None and vetted.agreement < alpha:
-        said.append("disagrees with the only other calibrator left: either may be wrong")
+        found.append("disagrees with the only other calibrator left: either may be wrong")
     ratio = vetted.charge_ratio
     if ratio is not None and not 1.0 / CHARGE_FACTOR <= ratio <= CHARGE_FACTOR:
-        said.append(f"its charge level is {ratio:.2g} times the target's")
-    return said
+        found.append(f"its charge level is {ratio:.2g} times the target's")
+    return found

@@ -11,7 +11,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.whiteness import channel_correlation
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.pipeline.vetting import Vetting, doubts
+from amibayes.pipeline.vetting import Vetting, notes
 from amibayes.posterior.ensemble import Posterior, modes_to_sample
 from amibayes.posterior.grid import integrable
 from amibayes.posterior.priors import Prior
@@ -53,9 +53,9 @@ def vetting_cautions(vetting: Vetting | None) -> list[str]:
         f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
     ]
     return dropped + [
-        f"calibrator {v.path} {doubt}"
+        f"calibrator {v.path} {note}"
         for v in vetting.calibrators
-        for doubt in doubts(v, vetting.alpha)
+        for note in notes(v, vetting.alpha)
     ]
 
 

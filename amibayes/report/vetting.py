@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from amibayes.pipeline.vetting import Vetted, Vetting, doubts
+from amibayes.pipeline.vetting import Vetted, Vetting, notes
 from amibayes.plots.calibration import columns_of
 from amibayes.plots.style import GREY, marker_of, new_figure, styled
 from amibayes.report import limits_json, number
@@ -30,7 +30,7 @@ def _entry(vetted: Vetted, alpha: float) -> Json:
         "path": vetted.path,
         "kept": vetted.kept,
         "reason": vetted.reason,
-        "doubts": doubts(vetted, alpha),
+        "notes": notes(vetted, alpha),
         "agreement_probability": vetted.agreement,
         "companion": _companion(vetted),
         "diameter_mas": vetted.diameter_mas,
@@ -63,7 +63,7 @@ def vetting_table(vetting: Vetting) -> list[str]:
         weight = None if v.significance is None else v.significance.probability
         numbers = " ".join(_cell(p) for p in (v.agreement, weight, v.diameter_probability))
         lines.append(f"{name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
-        lines += [f"    {text}" for text in [v.reason, *doubts(v, vetting.alpha)] if text]
+        lines += [f"    {text}" for text in [v.reason, *notes(v, vetting.alpha)] if text]
     lines.append(
         f"probabilities of chance; below {vetting.alpha:g} a calibrator is dropped "
         f"(good ones: {vetting.false_drop_rate:.1%} of the time)"

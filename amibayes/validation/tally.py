@@ -1,7 +1,7 @@
 """What many trials say: ranks, coverage, false alarms and completeness, each with its chance.
 
-Every check is a statement that holds for a sound programme, and the probability that a
-sound programme does as badly. References: Talts et al. (2018, arXiv:1804.06788) for the
+Every check is a statement that holds for a correct implementation, and the probability that a
+correct implementation does as badly. References: Talts et al. (2018, arXiv:1804.06788) for the
 ranks; coverage and false alarms are binomial, completeness a sum of unequal coin tosses.
 """
 
@@ -22,7 +22,7 @@ FEWEST = 8
 """Trials below which a check says nothing."""
 
 SURPRISING = 1e-3
-"""A sound programme fails a check with this probability."""
+"""A correct implementation fails a check with this probability."""
 
 KOLMOGOROV = np.array([0.868731, 0.260333])
 """Mean and standard deviation of √n times the statistic, for many numbers."""
@@ -42,9 +42,9 @@ class Check:
     n : int
         Trials it rests on.
     measured, expected, error : float
-        Error: Monte Carlo, 1σ, of a sound programme. NaN where there is no such number.
+        Error: Monte Carlo, 1σ, of a correct implementation. NaN where there is no such number.
     p_value : float
-        Probability that a sound programme does as badly.
+        Probability that a correct implementation does as badly.
     """
 
     group: str
@@ -57,7 +57,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether a sound programme may well have done the same."""
+        """Whether a correct implementation may well have done the same."""
         return self.p_value >= SURPRISING
 
 
@@ -159,7 +159,7 @@ def _alarm_checks(probability: FloatArray, null_draws: int) -> Iterable[Check]:
 def _completeness_checks(found: FloatArray, expected: FloatArray) -> Iterable[Check]:
     known = np.isfinite(expected)
     chance, hit = expected[known], found[known]
-    yield unequal("completeness", "companions found, of those the limits speak of", hit, chance)
+    yield unequal("completeness", "companions found within the range of the limits", hit, chance)
     near = (chance > 0.05) & (chance < 0.95)
     yield unequal("completeness", "the same, near the limit", hit[near], chance[near])
 
