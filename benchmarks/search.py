@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from amibayes import Likelihood, join, point_source, read_oifits, write_oifits
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.observables import Observables
 from amibayes.detection.statistic import make_statistic
 from amibayes.likelihood.likelihood import single_likelihood

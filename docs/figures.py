@@ -14,8 +14,8 @@ import numpy as np
 from scipy import stats
 
 import amibayes as ab
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import make_grid
 from amibayes.data.closure import closure_matrix
 from amibayes.plots.maps import detection_map
 from amibayes.plots.style import (

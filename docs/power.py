@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from amibayes import BinaryModel, Likelihood, Observables, TemplateBank, load_instrument
-from amibayes.companion_search.template_bank import make_grid
+from amibayes.companion_search.grid import make_grid
 from amibayes.data.point_source import point_source
 from amibayes.detection.false_alarm import clopper_pearson
 from amibayes.detection.statistic import make_statistic

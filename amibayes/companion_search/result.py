@@ -10,7 +10,7 @@ from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
-from amibayes.companion_search.template_bank import Grid
+from amibayes.companion_search.grid import Grid
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.likelihood.likelihood import Likelihood

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from amibayes.companion_search.joint_bank import bank_of, rates_per_axis
+from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import fit_single, global_check, refine
 from amibayes.companion_search.result import Mode, SearchResult, companions_of
 from amibayes.companion_search.scan import ScanResult
-from amibayes.companion_search.template_bank import Grid, make_grid
+from amibayes.companion_search.template_bank import TemplateBank, rates_per_axis
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
@@ -111,7 +111,7 @@ def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
     likelihood = result.likelihood
     # A moving companion is looked for at rest there: a first look has no time for more.
     still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0))
-    bank = bank_of(still, grid, result.single_theta)
+    bank = TemplateBank(still, grid, result.single_theta)
     residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
     gain = bank.survey(residuals).gain
     best = int(gain.argmax())
@@ -154,7 +154,7 @@ def search(
     box = Box(inner, outer, resolution_mas(likelihood))
     grid = _grid(likelihood, box)
     single, deviance_single = fit_single(likelihood)
-    bank = bank_of(likelihood, grid, single)
+    bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
     seeds = _seeds(likelihood, grid, survey, single, box)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.companion_search.joint_bank import bank_of
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import Companion, Mode, SearchResult, companions_of, mode_of
 from amibayes.companion_search.search import MODE_LIMIT, peaks, resolution_mas
@@ -76,7 +75,7 @@ def search_second(result: SearchResult) -> TwoCompanions:
             source=two.observables.source,
             remedy="ask for fewer companions",
         )
-    bank = bank_of(one, result.grid, result.single_theta)
+    bank = TemplateBank(one, result.grid, result.single_theta)
     found: list[Mode] = []
     for first in result.modes[:FIRST_MODES]:
         found += _beside(result, bank, two, np.array(first.theta))

@@ -2,176 +2,57 @@
 
 At small contrast c a companion changes the whitened data by c·t(α, δ), so that with
 the residuals r of the fit without a companion the best contrast is t·r/t·t and it lowers
-χ² by (t·r)²/t·t. Three facts make the grid cheap: exp(−2πi(uα + vδ)) is a product of a
-factor for α and one for δ, a position and its mirror image share everything, and the
-whitening is folded into one sparse matrix before any position is looked at.
+χ² by (t·r)²/t·t. Where bands have contrasts of their own there is one template of each, and
+the gain is that of the best contrasts, none below zero; where a companion moves, rates are
+tried on a lattice and the largest gain counts. The statistic of the data and of null draws
+is the same.
+
+Three facts make the grid cheap: exp(−2πi(uα + vδ)) is a product of a factor for α and one
+for δ, a position and its mirror image share everything, and the whitening is folded into
+one sparse matrix before any position is looked at.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from amibayes.companion_search.grid import Grid
+from amibayes.companion_search.phasors import WIDTH, LatticePhasors
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
+from amibayes.companion_search.templates import (
+    BandTemplates,
+    DataRows,
+    MirroredTemplates,
+    Templates,
+    at_both,
+)
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
-from amibayes.models.uv_points import UVPoints
-from amibayes.units import MAS, FloatArray, IntArray
+from amibayes.units import MAS, FloatArray, IntArray, SingleArray
 
-WIDTH = 128
-"""Most positions that are worked on at once: what fits a processor's cache."""
-
-
-NUDGE = 1e-7
-"""Radians; keeps sin(x)/x away from 0/0 at a relative cost below 1e-8."""
-
-
-class LatticePhasors:
-    """Cosine and sine of 2π(uα + vδ) over rows of the lattice, damped by the channel's width.
-
-    Sums of angles become products of factors made once per axis. The half angles are moved
-    off zero by `NUDGE`, so that sin(x)/x needs no special case.
-
-    Parameters
-    ----------
-    samples : UVPoints
-    axis : (n,) float array
-        Coordinates of the lattice along east and along north, mas.
-    smearing : bool
-    turn : (n_samples,) float array, optional
-        Angle added to every position's, such as that of a motion since a date.
-    """
-
-    def __init__(
-        self,
-        samples: UVPoints,
-        axis: FloatArray,
-        smearing: bool,
-        turn: FloatArray | None = None,
-    ) -> None:
-        self._smearing = smearing
-        angles = [2.0 * np.pi * MAS * np.outer(f, axis) for f in (samples.u, samples.v)]
-        if turn is not None:
-            angles[1] += turn[:, None]
-        self._east, self._north = [(np.cos(a), np.sin(a)) for a in angles]
-        half = [0.5 * samples.relative_band[:, None] * a for a in angles]
-        half[1] += NUDGE
-        self._half_east, self._half_north = [(h, np.cos(h), np.sin(h)) for h in half]
-        self._work = np.empty((4, len(samples) * min(WIDTH, len(axis))))
-
-    def __call__(self, columns: slice, row: int) -> tuple[FloatArray, FloatArray]:
-        """Cosine and sine, (n_samples, n_columns) each; overwritten by the next call."""
-        width = columns.stop - columns.start
-        shape = (4, len(self._half_east[0]), width)
-        cosine, sine, damping, spare = self._work[:, : shape[1] * width].reshape(shape)
-        (ca, sa), (cb, sb) = self._east, self._north
-        _cosine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], cosine, spare)
-        _sine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], sine, spare)
-        if self._smearing:
-            (xa, ca, sa), (xb, cb, sb) = self._half_east, self._half_north
-            _sine_of_sum(ca[:, columns], sa[:, columns], cb[:, [row]], sb[:, [row]], damping, spare)
-            np.add(xa[:, columns], xb[:, [row]], out=spare)
-            damping /= spare
-            cosine *= damping
-            sine *= damping
-        return cosine, sine
-
-
-def _cosine_of_sum(
-    ca: FloatArray,
-    sa: FloatArray,
-    cb: FloatArray,
-    sb: FloatArray,
-    out: FloatArray,
-    spare: FloatArray,
-) -> None:
-    np.multiply(ca, cb, out=out)
-    np.multiply(sa, sb, out=spare)
-    out -= spare
-
-
-def _sine_of_sum(
-    ca: FloatArray,
-    sa: FloatArray,
-    cb: FloatArray,
-    sb: FloatArray,
-    out: FloatArray,
-    spare: FloatArray,
-) -> None:
-    np.multiply(sa, cb, out=out)
-    np.multiply(ca, sb, out=spare)
-    out += spare
-
+RATE_STEPS_PER_FRINGE = 4
+"""Steps in rate per λ/B_max of the place at the date farthest from the reference date."""
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """Positions on a square lattice inside an annulus, symmetric about the star.
-
-    Parameters
-    ----------
-    step_mas : float
-        Spacing of the lattice.
-    inner_mas, outer_mas : float
-        Range of separations.
-    columns, rows : (n,) int array
-        Lattice coordinates, east = column·step, north = row·step. The first half of the
-        positions is one half plane, the second half its mirror image in the same order.
-    """
-
-    step_mas: float
-    inner_mas: float
-    outer_mas: float
-    columns: IntArray
-    rows: IntArray
-
-    def __len__(self) -> int:
-        return len(self.columns)
-
-    @property
-    def east_mas(self) -> FloatArray:
-        """East offsets, (n,)."""
-        return np.asarray(self.columns * self.step_mas, dtype=float)
-
-    @property
-    def north_mas(self) -> FloatArray:
-        """North offsets, (n,)."""
-        return np.asarray(self.rows * self.step_mas, dtype=float)
-
-    @property
-    def half_width(self) -> int:
-        """Number of lattice points from the star to the edge of the map."""
-        return int(self.outer_mas / self.step_mas)
-
-    def image(self, values: FloatArray) -> FloatArray:
-        """Lay values (n,) out as a map [north, east], NaN outside the annulus."""
-        n = 2 * self.half_width + 1
-        out = np.full((n, n), np.nan)
-        out[self.rows + self.half_width, self.columns + self.half_width] = values
-        return out
+def rates_per_axis(likelihood: Likelihood) -> int:
+    """Number of rates that are tried along east, and along north."""
+    model, samples = likelihood.model, likelihood.samples
+    if not model.moves:
+        return 1
+    fringe = 1.0 / samples.frequency.max() / MAS
+    farthest = float(np.abs(samples.years(model.reference_mjd)).max())
+    return 2 * int(np.ceil(RATE_STEPS_PER_FRINGE * model.fastest_mas_yr * farthest / fringe)) + 1
 
 
-def make_grid(inner_mas: float, outer_mas: float, step_mas: float) -> Grid:
-    """Fill the annulus inner ≤ separation ≤ outer with a lattice (the star itself left out)."""
-    n = int(outer_mas / step_mas)
-    axis = np.arange(-n, n + 1)
-    columns, rows = np.meshgrid(axis, axis[n:])
-    radius = np.hypot(columns, rows) * step_mas
-    upper = (rows > 0) | (columns > 0)
-    inside = upper & (radius >= inner_mas) & (radius <= outer_mas)
-    columns, rows = columns[inside], rows[inside]
-    return Grid(
-        step_mas,
-        inner_mas,
-        outer_mas,
-        np.concatenate([columns, -columns]),
-        np.concatenate([rows, -rows]),
-    )
+def trial_rates(likelihood: Likelihood) -> FloatArray:
+    """Rates along east and north that are tried, mas/yr, (n, 2), symmetric about 0."""
+    fastest, n = likelihood.model.fastest_mas_yr, rates_per_axis(likelihood)
+    axis = np.linspace(-fastest, fastest, n) if n > 1 else np.zeros(1)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 class TemplateBank:
@@ -180,13 +61,20 @@ class TemplateBank:
     Parameters
     ----------
     likelihood : Likelihood
-        With any model; its disc, background and smearing are used.
+        With any model: its disc, background and smearing are used, and whether bands have
+        contrasts of their own or companions move.
     grid : Grid
+        Of places, at the reference date where companions move.
     nuisance : (n_nuisance,) float array
         Values of the free parameters that are not a companion's (diameter, background).
     beside : (n_dim,) float array, optional
         Parameters of the likelihood's model whose companion is there already: what it and the
         nuisance parameters can do is projected out.
+
+    Notes
+    -----
+    `scan`, `scan_at`, `templates_at` and `chunks` are those of a companion at rest, alike in
+    every band; `survey`, `largest_gain`, `matched_filter` and `by_band` those of the model.
     """
 
     def __init__(
@@ -197,11 +85,14 @@ class TemplateBank:
         *,
         beside: FloatArray | None = None,
     ) -> None:
+        model, samples = likelihood.model, likelihood.samples
         self.grid = grid
         self.n_data = likelihood.n_independent
-        self.n_contrasts = likelihood.model.n_contrasts
-        self._samples = likelihood.samples
-        self._smearing = likelihood.model.smearing
+        self.n_contrasts = model.n_contrasts
+        self.rates_mas_yr = trial_rates(likelihood)
+        self._samples, self._smearing, self._moves = samples, model.smearing, model.moves
+        self._bands = [samples.band[:, None] == b for b in range(model.n_contrasts)]
+        self._years = samples.years(model.reference_mjd) if model.moves else np.zeros(len(samples))
         self._even, self._odd, self._primary = linear_response(likelihood, nuisance)
         self._offset = np.asarray(self._even.matrix @ self._primary)
         both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
@@ -211,11 +102,13 @@ class TemplateBank:
         else:
             self.nuisance_basis = np.asarray(np.linalg.qr(likelihood.jacobian(beside))[0])
 
-    joint = False
-    """Whether contrasts of bands, or rates, are free."""
-
     def __len__(self) -> int:
         return len(self.grid)
+
+    @property
+    def joint(self) -> bool:
+        """Whether contrasts of bands, or rates, are free."""
+        return self.n_contrasts > 1 or self._moves
 
     @property
     def n_nuisance(self) -> int:
@@ -240,23 +133,35 @@ class TemplateBank:
         contrast, sigma : (n_positions,) float array
             t·r/t·t and 1/√(t·t), t the template without its nuisance part.
         """
-        data = self.project(residuals)
-        match, norm = np.empty(len(self)), np.empty(len(self))
-        for index, even, odd in self._halves():
-            match[index] = _both(data[self._even.rows] @ even, data[self._odd.rows] @ odd)
-            norm[index] = self._norm(even, odd)
-        return match / norm, 1.0 / np.sqrt(norm)
+        rows = self._rows(self.project(residuals)[:, None])
+        contrast, sigma = np.empty(len(self)), np.empty(len(self))
+        for index, _, templates in self._at_rest():
+            sigma[index] = templates.sigma[0]
+            contrast[index] = templates.match(rows)[0][0] * templates.sigma[0]
+        return contrast, sigma
 
     def survey(self, residuals: FloatArray) -> ScanResult:
-        """Scan whitened residuals (n_data,): contrasts and the largest gain everywhere."""
+        """Scan whitened residuals (n_data,): contrasts, rates and the largest gain everywhere."""
         contrast, sigma = self.scan(residuals)
-        gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
-        return ScanResult(contrast, sigma, gain, contrast[:, None])
+        if not self.joint:
+            gain = np.where(contrast > 0, (contrast / sigma) ** 2, 0.0)
+            return ScanResult(contrast, sigma, gain, contrast[:, None])
+        rows, n = self._rows(self.project(residuals)[:, None]), self.n_contrasts
+        gain, tail = np.zeros(len(self)), np.zeros((len(self), n + 2 * self._moves))
+        for index, rate, templates in self.pieces():
+            units, found = templates.best([m[0] for m in templates.match(rows)])
+            better = found > gain[index]
+            at = index[better]
+            gain[at] = found[better]
+            tail[at, :n] = (units * templates.sigma)[:, better].T
+            if self._moves:
+                tail[at, n:] = rate[better]
+        return ScanResult(contrast, sigma, gain, tail, n)
 
     def largest_gain(
-        self, data: NDArray[np.float32], weights: GroupWeights | None = None
+        self, data: SingleArray, weights: GroupWeights | None = None
     ) -> tuple[FloatArray, IntArray]:
-        """Search many data sets: largest gain in χ² over the bank, for positive contrast.
+        """Search many data sets: largest gain in χ² over the bank, for positive contrasts.
 
         Parameters
         ----------
@@ -271,49 +176,34 @@ class TemplateBank:
         position : (n,) int array
             Where on the grid.
         """
-        highest = RunningMaximum(data.shape[1])
-        data_even = np.ascontiguousarray(data[self._even.rows].T)
-        data_odd = np.ascontiguousarray(data[self._odd.rows].T)
-        for index, even, odd in self._halves():
-            scale = self._inverse_length(even, odd, weights)
-            a, b = data_even @ even.astype(np.float32), data_odd @ odd.astype(np.float32)
-            for half, match in zip(np.split(np.arange(len(index)), 2), (a + b, a - b), strict=True):
-                match *= scale[..., half]
-                highest.update(index[half], match)
-        return np.asarray(highest.score, dtype=float) ** 2, highest.position
-
-    def _inverse_length(
-        self, even: FloatArray, odd: FloatArray, weights: GroupWeights | None
-    ) -> NDArray[np.float32]:
-        """1/√(t·t) of templates, (2m,), or with weights of each data set, (n, 2m)."""
-        if weights is None:
-            return np.asarray(1.0 / np.sqrt(self._norm(even, odd)), dtype=np.float32)
-        return np.asarray(1.0 / np.sqrt(weights.sums(self._both_laid_out(even, odd) ** 2)))
-
-    def _laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
-        """Templates (n_data, m) of their two parts, nuisance directions taken out."""
-        templates = np.zeros((self.n_data, even.shape[1]))
-        templates[self._even.rows] = even
-        templates[self._odd.rows] += odd
-        return self.project(templates)
-
-    def _both_laid_out(self, even: FloatArray, odd: FloatArray) -> FloatArray:
-        """Templates (n_data, 2m) of positions and, after them, of their mirror images."""
-        return np.hstack([self._laid_out(even, odd), self._laid_out(even, -odd)])
+        highest, rows = RunningMaximum(data.shape[1]), self._rows(data)
+        for index, _, templates in self.pieces():
+            match = templates.match(rows)
+            if weights is None:
+                _, gain = templates.best(match)
+            else:
+                gain = templates.weighted_gain(weights, match)
+            highest.update(index, gain)
+        return np.asarray(highest.score, dtype=float), highest.position
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
-        """Make a function (east, north in mas) → (best contrast, gain in χ²), off the lattice.
+        """Make a function (east, north in mas) → (contrasts and rates, gain), off the lattice.
 
         Contrasts below zero gain nothing.
         """
-        data = self.project(residuals)
-        data_even, data_odd = data[self._even.rows], data[self._odd.rows]
+        rows = self._rows(self.project(residuals)[:, None])
 
         def best(position: FloatArray) -> tuple[FloatArray, float]:
-            even, odd = self._parts_at(position[:1], position[1:])
-            match = float(data_even @ even[:, 0] + data_odd @ odd[:, 0])
-            norm = float(self._norm(even, odd)[0])
-            return np.array([match / norm]), max(match, 0.0) ** 2 / norm
+            templates = self._at(position)
+            match = [m[0] for m in templates.match(rows)]
+            if not self.joint:
+                signed = float(match[0][0])
+                contrast = signed * templates.sigma[:, 0]
+                return contrast, max(signed, 0.0) ** 2
+            units, gain = templates.best(match)
+            top = int(gain.argmax())
+            rate = self.rates_mas_yr[top] if self._moves else np.empty(0)
+            return np.concatenate([(units * templates.sigma)[:, top], rate]), float(gain[top])
 
         return best
 
@@ -321,30 +211,72 @@ class TemplateBank:
         self, residuals: FloatArray, east_mas: FloatArray, north_mas: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """As `scan`, at any positions (m,), on the lattice or off it."""
-        data = self.project(residuals)
-        even, odd = self._parts_at(east_mas, north_mas)
-        match = data[self._even.rows] @ even + data[self._odd.rows] @ odd
-        norm = self._norm(even, odd)[: len(east_mas)]
-        return match / norm, 1.0 / np.sqrt(norm)
+        rows = self._rows(self.project(residuals)[:, None])
+        templates, m = self._mirrored(*self._waves_at(east_mas, north_mas)), len(east_mas)
+        sigma = templates.sigma[0, :m]
+        return templates.match(rows)[0][0, :m] * sigma, sigma
 
     def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
         """Templates of unit norm (n_data, m) at any positions, on the lattice or off it."""
-        even, odd = self._parts_at(east_mas, north_mas)
-        templates = self._laid_out(even, odd)
+        templates = self._mirrored(*self._waves_at(east_mas, north_mas)).laid_out()
         return np.asarray(templates / np.linalg.norm(templates, axis=0))
 
-    def _parts_at(
+    def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
+        for index, _, templates in self._at_rest():
+            yield index, templates.unit[0]
+
+    def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""
+        for index, _, templates in self.pieces():
+            yield index, templates.unit
+
+    def _rows(self, data: FloatArray | SingleArray) -> DataRows:
+        """Data sets (n_data, n) as rows."""
+        every = np.ascontiguousarray(data.T)
+        parts = (np.ascontiguousarray(data[p.rows].T) for p in (self._even, self._odd))
+        return DataRows(every, *parts)
+
+    def pieces(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
+        """Yield positions (2m,), rates (2m, 2) and their templates in all bands."""
+        if not self.joint:
+            yield from self._at_rest()
+            return
+        half = len(self.grid) // 2
+        for rate in self.rates_mas_yr:
+            drift = (self._years * rate[0], self._years * rate[1]) if self._moves else None
+            for index, cosine, sine in self._half_plane(drift):
+                # The mirror image of a moving place moves the other way.
+                rates = np.repeat([rate, -rate], len(index), axis=0)
+                both = np.concatenate([index, index + half])
+                yield both, rates, self._in_bands(cosine, sine, mirrored=True)
+
+    def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
+        """Yield the same of companions at rest, alike in every band."""
+        half, still = len(self.grid) // 2, np.zeros((1, 2))
+        for index, cosine, sine in self._half_plane():
+            yield np.concatenate([index, index + half]), still, self._mirrored(cosine, sine)
+
+    def _at(self, position: FloatArray) -> Templates:
+        """Templates of one place at all rates."""
+        if not self.joint:
+            return self._mirrored(*self._waves_at(position[:1], position[1:]))
+        moved = position[:, None, None] + self.rates_mas_yr.T[:, None] * self._years[:, None]
+        return self._in_bands(*self._waves_at(*moved), mirrored=False)
+
+    def _waves_at(
         self, east_mas: FloatArray, north_mas: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        u, v = 2.0 * np.pi * MAS * self._samples.u, 2.0 * np.pi * MAS * self._samples.v
-        angle = np.outer(u, east_mas) + np.outer(v, north_mas)
+        """Cosine and sine, (n_samples, m), of places (m,) or of moving ones (n_samples, m)."""
+        u, v = self._samples.u[:, None], self._samples.v[:, None]
+        angle = 2.0 * np.pi * MAS * (u * east_mas + v * north_mas)
         cosine, sine = np.cos(angle), np.sin(angle)
         if self._smearing:
             damping = np.sinc((0.5 / np.pi) * self._samples.relative_band[:, None] * angle)
             cosine *= damping
             sine *= damping
         self._let_through(cosine, sine, east_mas, north_mas)
-        return self._even.matrix @ cosine - self._offset[:, None], self._odd.matrix @ sine
+        return cosine, sine
 
     def _let_through(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
@@ -359,27 +291,6 @@ class TemplateBank:
         turned = (cosine - 1j * sine) * fringe
         cosine[...] = turned.real - (flux - 1.0) * self._primary[:, None]
         sine[...] = -turned.imag
-
-    def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
-        for index, even, odd in self._halves():
-            yield index, self._both_laid_out(even, odd) / np.sqrt(self._norm(even, odd))
-
-    def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""
-        for index, templates in self.chunks():
-            yield index, templates[None]
-
-    def _halves(self) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Yield positions and their mirror images (2m,) with the parts that they share.
-
-        The template is even + odd at a position and even − odd opposite the star; only the
-        data that a part touches are kept, (n_rows, m).
-        """
-        half = len(self.grid) // 2
-        for index, cosine, sine in self._half_plane():
-            even = self._even.matrix @ cosine - self._offset[:, None]
-            yield np.concatenate([index, index + half]), even, self._odd.matrix @ sine
 
     def _half_plane(
         self, drift: tuple[FloatArray, FloatArray] | None = None
@@ -404,19 +315,34 @@ class TemplateBank:
             self._let_through(cosine, sine, east, north)
             yield index, cosine, sine
 
+    def _mirrored(self, cosine: FloatArray, sine: FloatArray) -> MirroredTemplates:
+        """Templates of one contrast at places and at their mirror images."""
+        even = self._even.matrix @ cosine - self._offset[:, None]
+        odd = self._odd.matrix @ sine
+        rows = self._even.rows, self._odd.rows
+        return MirroredTemplates(even, odd, *rows, self._norm(even, odd), self.nuisance_basis)
+
     def _norm(self, even: FloatArray, odd: FloatArray) -> FloatArray:
         """t·t at positions and their mirror images, (2m,), without the nuisance part."""
         norm = np.einsum("dm,dm->m", even, even) + np.einsum("dm,dm->m", odd, odd)
         i, j = self._even_shared, self._odd_shared
         cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(i) else 0.0 * norm
-        both = _both(norm, cross)
+        both = at_both(norm, cross)
         if self.nuisance_basis.size:
             basis = self.nuisance_basis
-            along = _both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
+            along = at_both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
             both -= (along**2).sum(axis=0)
         return both
 
-
-def _both(even: FloatArray, odd: FloatArray) -> FloatArray:
-    """Values at positions and at their mirror images, one after the other."""
-    return np.concatenate([even + odd, even - odd], axis=-1)
+    def _in_bands(self, cosine: FloatArray, sine: FloatArray, *, mirrored: bool) -> BandTemplates:
+        """Templates of each band at places and, with ``mirrored``, at their mirror images."""
+        signs = np.array([1.0, -1.0] if mirrored else [1.0])
+        out = np.zeros((len(self._bands), self.n_data, len(signs) * cosine.shape[1]))
+        change = cosine - self._primary[:, None]
+        for template, here in zip(out, self._bands, strict=True):
+            even = self._even.matrix @ np.where(here, change, 0.0)
+            odd = self._odd.matrix @ np.where(here, sine, 0.0)
+            template[self._even.rows] = np.tile(even, len(signs))
+            template[self._odd.rows] += np.hstack([sign * odd for sign in signs])
+        along = np.einsum("dk,bdm->bkm", self.nuisance_basis, out)
+        return BandTemplates(out - np.einsum("dk,bkm->bdm", self.nuisance_basis, along))

@@ -14,10 +14,10 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from amibayes.companion_search.joint_bank import bank_of
+from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult, null_likelihood
 from amibayes.companion_search.scan import scale_groups
-from amibayes.companion_search.template_bank import Grid, TemplateBank
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.treatments import (
     ErrorTreatment,
@@ -328,7 +328,7 @@ def make_statistic(
     beside : (n_dim,) float array, optional
         Parameters with a companion that is there already.
     """
-    bank = bank_of(likelihood, grid, single, beside=beside)
+    bank = TemplateBank(likelihood, grid, single, beside=beside)
     left = single_likelihood(likelihood).residuals(single)
     observed = (left if beside is None else likelihood.residuals(beside))[:, 0]
     treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)

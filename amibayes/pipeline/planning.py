@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.grid import make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import dense_covariance
 from amibayes.data.observables import Observables

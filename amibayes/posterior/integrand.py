@@ -14,8 +14,9 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.special import logsumexp
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single, refine
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.posterior.priors import Prior

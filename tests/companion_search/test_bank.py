@@ -7,8 +7,9 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel

@@ -12,12 +12,12 @@ from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
-from amibayes.companion_search.joint_bank import JointBank, bank_of, trial_rates
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import resolution_mas, search
 from amibayes.companion_search.second_companion import search_second
-from amibayes.companion_search.template_bank import make_grid
+from amibayes.companion_search.template_bank import TemplateBank, trial_rates
 from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
 from amibayes.data.covariance import DiagonalCovariance, dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
@@ -199,7 +199,7 @@ def test_joint_bank_against_least_squares_at_its_own_derivatives(off_axis, nuisa
     model = BinaryModel(background="free") if nuisance else BinaryModel()
     likelihood = joint_likelihood(Likelihood(data, model), motion=True, fastest_mas_yr=40.0)
     single, _ = fit_single(likelihood)
-    bank = JointBank(likelihood, make_grid(100.0, 200.0, 25.0), single)
+    bank = TemplateBank(likelihood, make_grid(100.0, 200.0, 25.0), single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey, chi2 = bank.survey(residuals), (bank.project(residuals) ** 2).sum()
     rates, checked = trial_rates(likelihood), 0
@@ -285,8 +285,8 @@ def test_one_band_at_rest_is_the_plain_model_to_the_bit(rng) -> None:
     assert joint.model == plain.model
     theta = np.array([[110.0, -80.0, 0.02], [60.0, 20.0, 0.5]])
     np.testing.assert_array_equal(plain.log_prob(theta), joint.log_prob(theta))
-    bank = bank_of(joint, make_grid(*FIELD, 25.0), np.empty(0))
-    assert type(bank) is not JointBank
+    bank = TemplateBank(joint, make_grid(*FIELD, 25.0), np.empty(0))
+    assert not bank.joint
 
 
 def null_data(sheets, rng, n: int) -> np.ndarray:
@@ -328,7 +328,7 @@ def test_reported_probability_of_a_joint_null_is_uniform(name, stated_errors) ->
     likelihood = free(join(sheets), **options)
     grid = make_grid(*FIELD, 30.0)
     test = make_statistic(likelihood, grid, np.empty(0), stated_errors=stated_errors)
-    assert isinstance(test.bank, JointBank)
+    assert test.bank.joint
     null = np.sort(test.draw_null(8000, rng))
     white = likelihood.observables.covariance.whiten(null_data(sheets, rng, 500))
     statistic = test.evaluate(white)
@@ -387,7 +387,7 @@ def test_local_probability_of_two_bands_is_the_chance_at_one_place() -> None:
         bank = test.bank
         white = rng.standard_normal((bank.n_data, 40_000))
         data = bank.project(white)
-        first = next(iter(bank._all_templates()))[2]
+        first = next(iter(bank.pieces()))[2]
         _, gain = first.best([data.T @ unit for unit in first.unit])
         gain = test.ratio(gain[:, 0], (data**2).sum(axis=0))
         for at in (1.0, 4.0, 9.0):

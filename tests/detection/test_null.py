@@ -12,8 +12,9 @@ from noise_maker import Recipe
 from scipy import linalg, stats
 from scipy.sparse import csr_array
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.scan import scale_groups
-from amibayes.companion_search.template_bank import TemplateBank, make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import dense_covariance, sparse_covariance
 from amibayes.data.degrees_of_freedom import Freedom

@@ -7,9 +7,9 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import make_grid
 from amibayes.detection.false_alarm import (
     Significance,
     clopper_pearson,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers import NIRISS_HOLES
 
-from amibayes.companion_search.joint_bank import bank_of
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits
-from amibayes.companion_search.template_bank import make_grid
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.companion_search.with_extra_noise import fit_noise
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
@@ -88,8 +88,8 @@ def likelihood_of(data: Observables, bank: str) -> Likelihood:
 
 
 def theta_of(likelihood: Likelihood, companions: int = 1) -> np.ndarray:
-    one = likelihood.model.tied(TRUTH[None])[0]
-    other = likelihood.model.tied(np.array([[-100.0, 70.0, 0.01]]))[0]
+    one = likelihood.model.at_rest(TRUTH[None])[0]
+    other = likelihood.model.at_rest(np.array([[-100.0, 70.0, 0.01]]))[0]
     return np.concatenate([one, other][:companions])
 
 
@@ -158,7 +158,7 @@ def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
 def bank_statistic_is_finite(fitted: Likelihood, theta: np.ndarray, companions: int) -> None:
     grid = make_grid(100.0, 160.0, 30.0)
     beside = theta if companions == 2 else None
-    bank = bank_of(fitted, grid, np.empty(0), beside=beside)
+    bank = TemplateBank(fitted, grid, np.empty(0), beside=beside)
     left = fitted.residuals(theta) if companions == 2 else single_likelihood(fitted).residuals([[]])
     assert np.isfinite(bank.survey(left[:, 0]).gain).all()
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.template_bank import make_grid
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic, statistic_of

@@ -10,10 +10,10 @@ from helpers import niriss, simulated
 from scipy import integrate, stats
 from weighted_draws import ranks_of
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.robust import RobustFits, search_robust
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import make_grid
 from amibayes.companion_search.with_extra_noise import fit_noise
 from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom

@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.stats import binomtest
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import make_grid
 from amibayes.data.covariance import DiagonalCovariance
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance

@@ -8,7 +8,6 @@ import numpy as np
 import sizes
 
 LONGER = {
-    "companion_search/template_bank.py": 445,
     "limits/completeness.py": 515,
     "limits/injection.py": 515,
     "posterior/ensemble.py": 530,

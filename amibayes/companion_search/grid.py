@@ -1,0 +1,74 @@
+"""Positions of a search: a lattice inside an annulus, symmetric about the star."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.units import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Positions on a square lattice inside an annulus, symmetric about the star.
+
+    Parameters
+    ----------
+    step_mas : float
+        Spacing of the lattice.
+    inner_mas, outer_mas : float
+        Range of separations.
+    columns, rows : (n,) int array
+        Lattice coordinates, east = column·step, north = row·step. The first half of the
+        positions is one half plane, the second half its mirror image in the same order.
+    """
+
+    step_mas: float
+    inner_mas: float
+    outer_mas: float
+    columns: IntArray
+    rows: IntArray
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    @property
+    def east_mas(self) -> FloatArray:
+        """East offsets, (n,)."""
+        return np.asarray(self.columns * self.step_mas, dtype=float)
+
+    @property
+    def north_mas(self) -> FloatArray:
+        """North offsets, (n,)."""
+        return np.asarray(self.rows * self.step_mas, dtype=float)
+
+    @property
+    def half_width(self) -> int:
+        """Number of lattice points from the star to the edge of the map."""
+        return int(self.outer_mas / self.step_mas)
+
+    def image(self, values: FloatArray) -> FloatArray:
+        """Lay values (n,) out as a map [north, east], NaN outside the annulus."""
+        n = 2 * self.half_width + 1
+        out = np.full((n, n), np.nan)
+        out[self.rows + self.half_width, self.columns + self.half_width] = values
+        return out
+
+
+def make_grid(inner_mas: float, outer_mas: float, step_mas: float) -> Grid:
+    """Fill the annulus inner ≤ separation ≤ outer with a lattice (the star itself left out)."""
+    n = int(outer_mas / step_mas)
+    axis = np.arange(-n, n + 1)
+    columns, rows = np.meshgrid(axis, axis[n:])
+    radius = np.hypot(columns, rows) * step_mas
+    upper = (rows > 0) | (columns > 0)
+    inside = upper & (radius >= inner_mas) & (radius <= outer_mas)
+    columns, rows = columns[inside], rows[inside]
+    return Grid(
+        step_mas,
+        inner_mas,
+        outer_mas,
+        np.concatenate([columns, -columns]),
+        np.concatenate([rows, -rows]),
+    )

@@ -1,0 +1,180 @@
+"""Templates of some positions, and what many data sets make of them.
+
+Where a companion has one contrast its template at a position and at the mirror image are
+even + odd and even − odd: both are searched with half of the work. Where bands have
+contrasts of their own there is one template of each band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes.companion_search.scan import GroupWeights, best_positive, weighted_gain
+from amibayes.units import FloatArray, IntArray
+
+UNCOUPLED = 1e-6
+"""Correlation of templates below which bands are each for themselves."""
+
+
+@dataclass(frozen=True, eq=False)
+class DataRows:
+    """Data sets without nuisance directions, one a row, (n, n_data), and parts of them.
+
+    Cut once for all positions: ``even`` and ``odd`` are the data that the two parts of a
+    template touch.
+    """
+
+    every: NDArray[Any]
+    even: NDArray[Any]
+    odd: NDArray[Any]
+
+
+Match = Sequence[NDArray[Any]] | NDArray[Any]
+"""Products of templates of unit length with data, (n_bands, …, m)."""
+
+
+class Templates(Protocol):
+    """Templates of m positions, nuisance directions taken out."""
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Error of each contrast by itself, 1/length, (n_bands, m)."""
+        ...
+
+    @property
+    def unit(self) -> FloatArray:
+        """Templates of unit length, (n_bands, n_data, m)."""
+        ...
+
+    def match(self, data: DataRows) -> Match:
+        """Products with data sets, (n_bands, n, m), in their precision."""
+        ...
+
+    def best(self, match: Match) -> tuple[FloatArray, FloatArray]:
+        """Contrasts that gain most, none below zero, and what they gain.
+
+        Returns
+        -------
+        contrasts : (n_bands, …, m) array
+            In units of their errors.
+        gain : (…, m) array
+            In χ².
+        """
+        ...
+
+    def weighted_gain(self, weights: GroupWeights, match: Match) -> FloatArray:
+        """Gain in weighted χ², (n, m)."""
+        ...
+
+
+class BandTemplates:
+    """One template of each band.
+
+    Parameters
+    ----------
+    templates : (n_bands, n_data, m) float array
+    """
+
+    def __init__(self, templates: FloatArray) -> None:
+        length = np.maximum(np.linalg.norm(templates, axis=1), 1e-300)
+        self._unit: FloatArray = templates / length[:, None]
+        self._sigma: FloatArray = 1.0 / length
+        n = len(templates)
+        pairs = [(a, b) for b in range(n) for a in range(b)]
+        shared = {(a, b): np.einsum("dm,dm->m", self._unit[a], self._unit[b]) for a, b in pairs}
+        self._shared = {p: s for p, s in shared.items() if np.abs(s).max() > UNCOUPLED}
+
+    @property
+    def unit(self) -> FloatArray:
+        """Templates of unit length, (n_bands, n_data, m)."""
+        return self._unit
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Error of each contrast by itself, (n_bands, m)."""
+        return self._sigma
+
+    def match(self, data: DataRows) -> Match:
+        """Products with data sets."""
+        return [data.every @ unit.astype(data.every.dtype) for unit in self._unit]
+
+    def best(self, match: Match) -> tuple[FloatArray, FloatArray]:
+        """Contrasts that gain most, none below zero, by coordinate descent."""
+        return best_positive(match, self._shared)
+
+    def weighted_gain(self, weights: GroupWeights, match: Match) -> FloatArray:
+        """Gain in weighted χ²."""
+        return weighted_gain(weights, self._unit, list(match))
+
+
+@dataclass(frozen=True, eq=False)
+class MirroredTemplates:
+    """One template at positions and, after them, at their mirror images.
+
+    Parameters
+    ----------
+    even, odd : (n_rows, m) float array
+        Of the data that each part touches; nuisance directions are still in them.
+    even_rows, odd_rows : (n_rows,) int array
+        Those data.
+    norm : (2m,) float array
+        Length squared, without the nuisance directions.
+    basis : (n_data, k) float array
+        The nuisance directions.
+    """
+
+    even: FloatArray
+    odd: FloatArray
+    even_rows: IntArray
+    odd_rows: IntArray
+    norm: FloatArray
+    basis: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Error of the contrast, 1/length, (1, 2m)."""
+        return np.asarray(1.0 / np.sqrt(self.norm))[None]
+
+    def laid_out(self, sign: float = 1.0) -> FloatArray:
+        """Templates (n_data, m) at the positions, or with −1 at the mirror images."""
+        templates = np.zeros((len(self.basis), self.even.shape[1]))
+        templates[self.even_rows] = self.even
+        templates[self.odd_rows] += sign * self.odd
+        return templates - self.basis @ (self.basis.T @ templates)
+
+    @cached_property
+    def both(self) -> FloatArray:
+        """Templates (n_data, 2m) of positions and mirror images."""
+        return np.hstack([self.laid_out(), self.laid_out(-1.0)])
+
+    @property
+    def unit(self) -> FloatArray:
+        """Templates of unit length, (1, n_data, 2m)."""
+        return np.asarray(self.both / np.sqrt(self.norm))[None]
+
+    def match(self, data: DataRows) -> Match:
+        """Products with data sets."""
+        kind = data.even.dtype
+        product = at_both(data.even @ self.even.astype(kind), data.odd @ self.odd.astype(kind))
+        product *= self.sigma[0].astype(kind)
+        return [product]
+
+    def best(self, match: Match) -> tuple[FloatArray, FloatArray]:
+        """Contrast that gains most, not below zero."""
+        return best_positive(match, {})
+
+    def weighted_gain(self, weights: GroupWeights, match: Match) -> FloatArray:
+        """Gain in weighted χ²."""
+        ratio = self.norm.astype(match[0].dtype) / weights.sums(self.both**2)
+        return np.asarray(np.maximum(match[0], 0.0) ** 2 * ratio)
+
+
+def at_both(even: NDArray[Any], odd: NDArray[Any]) -> NDArray[Any]:
+    """Values at positions and at their mirror images, one after the other."""
+    return np.concatenate([even + odd, even - odd], axis=-1)
