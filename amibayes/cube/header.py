@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -79,15 +81,44 @@ def orientation_of(header: Header, source: str) -> Orientation:
     return Orientation(float(np.arctan2(matrix[0, 1], matrix[1, 1])), int(parity))
 
 
-def pixel_scale_of(header: Header, source: str) -> float | None:
-    """Read the side of a pixel (rad): ``PIXELSCL`` (arcsec), else a celestial WCS."""
-    scale = number(header, "PIXELSCL", source)
-    if scale is not None:
-        if not 1e-5 < scale < 10.0:
+PIXEL_SCALES = ("PIXELSCL", "PIXSCL", "PIXSCALE", "PIXSCAL", "PIXSCAL1", "SECPIX", "SECPIX1")
+"""Keywords for the side of a pixel, in the order of preference."""
+
+PIXEL_UNITS = (
+    (r"\bmas\b|milli-?\s?arc-?sec", MAS),
+    (r"\bmarcsec\b", MAS),
+    (r"\bmicro-?arcsec|\buas\b", 1e-3 * MAS),
+    (r"arc-?sec|\bas\b|''|\"", 1e3 * MAS),
+    (r"\bdeg", DEGREE),
+    (r"\brad", 1.0),
+)
+"""What the comment of such a keyword says of its unit; without a word it is arcsec."""
+
+
+def pixel_scale_of(
+    header: Header, source: str, comments: Mapping[str, str] = MappingProxyType({})
+) -> float | None:
+    """Read the side of a pixel (rad) from one of `PIXEL_SCALES`, else a celestial WCS.
+
+    Parameters
+    ----------
+    comments : mapping of str to str
+        Of the keywords, where programs write the unit.
+    """
+    for key in PIXEL_SCALES:
+        scale = number(header, key, source)
+        if scale is None:
+            continue
+        comment = comments.get(key, "")
+        unit = next((u for p, u in PIXEL_UNITS if re.search(p, comment, re.IGNORECASE)), None)
+        side = scale * (1e3 * MAS if unit is None else unit)
+        if not 1e-2 * MAS < side < 1e4 * MAS:
             raise DataError(
-                f"keyword PIXELSCL = {scale:g} is no pixel scale in arcsec", source=source
+                f"keyword {key} = {scale:g} is no pixel scale in {comment or 'arcsec'}",
+                source=source,
+                remedy="give --pixel-scale",
             )
-        return scale * 1000.0 * MAS
+        return side
     matrix = wcs_matrix(header, source)
     return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix))))
 

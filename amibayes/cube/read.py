@@ -137,7 +137,7 @@ def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile:
     _check_complete(hdus, source)
     header = _merged(hdus, science)
     keys.check_mask(header, source)
-    template = _template(header, science, given, source)
+    template = _template(header, science, given, source, _comments(hdus, science))
     n = science.shape[0] if len(science.shape) == 3 else 1
     return CubeFile(template, n, chosen, _mid_times(hdus, n, header, source))
 
@@ -214,12 +214,24 @@ def _merged(hdus: Any, science: Any) -> dict[str, Any]:
     return merged
 
 
-def _template(header: dict[str, Any], science: Any, given: dict[str, Any], source: str) -> Cube:
+def _comments(hdus: Any, science: Any) -> dict[str, str]:
+    """What the headers say beside the keywords of `_merged`."""
+    cards = [card for hdu in (hdus[0], science) for card in hdu.header.cards]
+    return {card.keyword: str(card.comment) for card in cards}
+
+
+def _template(
+    header: dict[str, Any],
+    science: Any,
+    given: dict[str, Any],
+    source: str,
+    comments: dict[str, str],
+) -> Cube:
     angle = given["position_angle_deg"]
     orientation = keys.orientation_of(header, source)
     if angle is not None:
         orientation = Orientation(angle * DEGREE, orientation.parity)
-    scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source)
+    scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source, comments)
     instrument = given["instrument"] or keys.text(header, "INSTRUME")
     filter_ = given["filter"] or keys.text(header, "FILTER")
     for value, option in ((instrument, "instrument"), (filter_, "filter")):

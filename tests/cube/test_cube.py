@@ -165,6 +165,26 @@ def test_option_wins_over_the_header(tmp_path: Path) -> None:
     assert read_cube(path, pixel_scale_rad=1.0 * MAS).pixel_scale_rad == 1.0 * MAS
 
 
+@pytest.mark.parametrize(
+    ("keyword", "value", "comment", "mas"),
+    [
+        ("PIXSCL", 12.255, "[mas/pixel] plate scale", 12.255),
+        ("PIXSCAL", 0.0123, "pixel scale in arcsec", 12.3),
+        ("PIXSCALE", 0.0123, "", 12.3),
+        ("SECPIX1", 0.01432, "arcsec/pixel", 14.32),
+        ("PIXELSCL", 65.6, "milliarcseconds per pixel", 65.6),
+        ("PIXSCALE", 3.4e-6, "[deg] per pixel", 12.24),
+        ("PIXSCALE", 6.0e-8, "[rad]", 12.376),
+    ],
+)
+def test_pixel_scales_have_the_unit_of_their_comment(
+    tmp_path: Path, keyword: str, value: float, comment: str, mas: float
+) -> None:
+    path = write_plain(tmp_path / "a.fits", (2, 9, 9), INSTRUME="X", FILTER="Y")
+    fits.setval(path, keyword, value=value, comment=comment)
+    assert read_cube(path).pixel_scale_rad == pytest.approx(mas * MAS, rel=1e-4)
+
+
 def test_wcs_gives_scale_and_orientation(tmp_path: Path) -> None:
     angle, step = np.radians(20.0), 0.05 / 3600
     path = write_plain(
