@@ -75,7 +75,7 @@ def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str
     if not arguments.fix:
         return {}
     paths = [a.oifits.path for a in audits if any(f.certain for f in a.findings)]
-    names = {path: Path(path).name.removesuffix(".gz") for path in paths}
+    names = {path: Path(path).name for path in paths}
     if len(set(names.values())) < len(names):
         raise UsageError(
             "two files have the same name", source="--fix", remedy="audit them one by one"

@@ -59,7 +59,7 @@ def stations_of_rows(
         groups.setdefault(key, []).append(table)
     out: dict[int, TableStations] = {}
     for group in groups.values():
-        fault = next((f for t in group if (f := _fault(oifits, t, chosen[t.number]))), "")
+        fault = next((f for t in group if (f := station_fault(oifits, t, chosen[t.number]))), "")
         out |= _by_uv(oifits, group, chosen, fault) if fault else _by_index(oifits, group, tables)
     return out
 
@@ -81,8 +81,14 @@ def _index(oifits: OIFits, table: OITable) -> IntArray:
     return integers(oifits, table, "STA_INDEX", 1 + len(KINDS[table.name].u))
 
 
-def _fault(oifits: OIFits, table: OITable, rows: IntArray) -> str:
-    """Why STA_INDEX does not tell the rows of a table apart; empty where it does."""
+def station_fault(oifits: OIFits, table: OITable, rows: IntArray) -> str:
+    """Why STA_INDEX does not tell the rows of a table apart; empty where it does.
+
+    Parameters
+    ----------
+    rows : int array
+        Of one target.
+    """
     if "STA_INDEX" not in table.columns:
         return f"{table.label} has no STA_INDEX"
     if not len(rows):

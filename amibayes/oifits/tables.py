@@ -44,6 +44,8 @@ class OITable:
         TUNIT of each column, empty where there is none.
     image : array, optional
         Of an image extension.
+    n_null : int
+        Bytes of FLAG that are NULL, neither T nor F.
     """
 
     name: str
@@ -53,6 +55,7 @@ class OITable:
     columns: Mapping[str, NDArray[Any]]
     units: Mapping[str, str] = field(default_factory=dict)
     image: NDArray[Any] | None = None
+    n_null: int = 0
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
@@ -128,7 +131,7 @@ def open_oifits(path: str | Path) -> OIFits:
     DataError
         Where the file is missing, empty, cut short, no FITS file or holds no OIFITS table.
     """
-    raw = _fits_bytes(Path(path))
+    raw = fits_bytes(Path(path))
     with reporting_damage(path):
         content = _content(str(path), raw)
     if not any(table.name.startswith("OI_") for table in content.tables):
@@ -138,7 +141,14 @@ def open_oifits(path: str | Path) -> OIFits:
     return content
 
 
-def _fits_bytes(path: Path) -> bytes:
+def fits_bytes(path: Path) -> bytes:
+    """The bytes of a FITS file, unpacked where it is gzipped.
+
+    Raises
+    ------
+    DataError
+        Where there are none, or they are of no FITS file.
+    """
     if path.is_dir():
         raise DataError("is a folder", source=path, remedy="give the OIFITS file in it")
     try:
@@ -191,11 +201,15 @@ def _table(hdu: Any, number: int) -> OITable:
     if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
         columns: dict[str, NDArray[Any]] = {}
         units: dict[str, str] = {}
+        n_null = 0
         for i, column in enumerate(hdu.columns):
             key = plain(column.name).upper()
             if key not in columns:
                 columns[key] = _native(hdu.data.field(i))
                 units[key] = plain(column.unit or "")
+                if key == "FLAG" and column.format.endswith("L"):
+                    # What astropy gives has lost the difference of NULL and F.
+                    n_null = int((np.asarray(hdu.data.view(np.ndarray)[column.name]) == 0).sum())
         return OITable(
             name,
             extver,
@@ -203,6 +217,7 @@ def _table(hdu: Any, number: int) -> OITable:
             _parsed(hdu.header),
             MappingProxyType(columns),
             MappingProxyType(units),
+            n_null=n_null,
         )
     image = None if hdu.data is None else _native(hdu.data)
     return OITable(name, extver, number, _parsed(hdu.header), MappingProxyType({}), {}, image)

@@ -71,10 +71,15 @@ def column(table: OITable, name: str) -> FloatArray | None:
     return np.asarray(values.reshape(len(table), -1), dtype=float)
 
 
-def radians(table: OITable, name: str, like: str = "") -> FloatArray | None:
-    """A column of angles in radians; its unit, or that of column ``like``, or degrees."""
-    values = column(table, name)
-    unit = table.units.get(name, "") or table.units.get(like, "")
+def unit_in_use(table: OITable, name: str) -> str:
+    """Unit of a column as the reader takes it: an error without one has that of its value."""
+    unit = table.units.get(name, "")
+    return unit or (table.units.get(name[:-3], "") if name.endswith("ERR") else "")
+
+
+def radians(table: OITable, name: str) -> FloatArray | None:
+    """A column of angles in radians; its unit, or that of its value, or degrees."""
+    values, unit = column(table, name), unit_in_use(table, name)
     return None if values is None else values * scale_of(unit, ANGLE, "deg")[0]
 
 

@@ -10,8 +10,13 @@ import numpy as np
 
 from amibayes.data.closure import canonical
 from amibayes.data.observables import Measurements, Observables, closure_sets
+from amibayes.errors import DataError
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
-from amibayes.oifits.tables import OIFits
+from amibayes.oifits.columns import coordinates
+from amibayes.oifits.row_stations import station_fault
+from amibayes.oifits.rows import channel_count
+from amibayes.oifits.setups import channels_of, wavelength_table
+from amibayes.oifits.tables import OIFits, OITable
 from amibayes.oifits.uv_stations import common_factor
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -29,11 +34,38 @@ ONE_NON_CLOSING = 36.0
 """… and χ² of a single one (6σ)."""
 
 
+def stations_not_given(oifits: OIFits) -> Findings:
+    """STA_INDEX that is absent, the same everywhere or repeated: (u, v) has to tell."""
+    for table, _ in data_tables(oifits):
+        fault = stations_fault(oifits, table)
+        if fault:
+            yield Finding(
+                "error",
+                "stations",
+                table.label,
+                fault.removeprefix(f"{table.label}: "),
+                "baselines and triangles can be told apart by their (u, v) alone",
+                "number the stations by (u, v), as is done here on reading",
+                certain=True,
+            )
+
+
+def stations_fault(oifits: OIFits, table: OITable) -> str:
+    """Why STA_INDEX does not tell the rows of a table apart, for any of its targets."""
+    ids = column(table, "TARGET_ID")
+    target = np.zeros(len(table)) if ids is None else ids[:, 0]
+    parts = [np.flatnonzero(target == t) for t in np.unique(target)]
+    try:
+        return next((f for rows in parts if (f := station_fault(oifits, table, rows))), "")
+    except DataError:
+        return ""  # a column of another shape is a finding of its own
+
+
 def repeated_stations(oifits: OIFits) -> Findings:
     """Baselines or triangles that name a station twice."""
     for table, _ in data_tables(oifits):
         stations = column(table, "STA_INDEX")
-        if stations is None:
+        if stations is None or stations_fault(oifits, table):
             continue
         twice = (np.diff(np.sort(stations, axis=1), axis=1) == 0).any(axis=1)
         if twice.any():
@@ -44,6 +76,28 @@ def repeated_stations(oifits: OIFits) -> Findings:
                 f"{count(int(twice.sum()), 'row')} name a station twice",
                 "closure phases cannot be tied to baselines",
                 "write the stations of each row",
+            )
+
+
+def uv_in_wavelengths(oifits: OIFits) -> Findings:
+    """(u, v) that are no metres."""
+    for table, kind in data_tables(oifits):
+        try:
+            channels = wavelength_table(oifits, table, channel_count(oifits, table))
+            wavelength = channels_of(oifits, channels)[0]
+            notes = coordinates(oifits, table, (*kind.u, *kind.v), wavelength)[1]
+            what, certain = "; ".join(n for n in notes if "wavelengths" in n), True
+        except DataError as error:
+            what, certain = error.what if "is in wavelengths" in error.what else "", False
+        if what:
+            yield Finding(
+                "error",
+                "uv-in-wavelengths",
+                table.label,
+                what.replace(f"{table.label}: ", "").replace(": converted to metres", ""),
+                "OIFITS has (u, v) in metres: other programs take these for metres",
+                "multiply them by the wavelength",
+                certain=certain,
             )
 
 
@@ -253,7 +307,7 @@ def _turned(sums: list[FourTriangles]) -> list[str]:
     return []
 
 
-CHECKS = (repeated_stations,)
+CHECKS = (stations_not_given, repeated_stations, uv_in_wavelengths)
 DATA_CHECKS = (
     uv_against_stations,
     baselines_longer_than_the_array,

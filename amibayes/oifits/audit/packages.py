@@ -101,7 +101,7 @@ def phase_errors_times_amplitude(oifits: OIFits) -> Findings:
     for table, kind in data_tables(oifits):
         pair = value_and_error(table, kind) if kind.is_angle else None
         amplitude, sigma = column(table, "T3AMP"), column(table, "T3AMPERR")
-        across = radians(table, "T3PHIERR", "T3PHI")
+        across = radians(table, "T3PHIERR")
         if pair is None or amplitude is None or sigma is None or across is None:
             continue
         if amplitude.shape != across.shape or sigma.shape != across.shape:

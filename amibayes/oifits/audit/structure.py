@@ -10,8 +10,16 @@ from collections import Counter
 
 import numpy as np
 
-from amibayes.oifits.audit.finding import DATA_TABLES, Finding, Findings, column, listed
+from amibayes.oifits.audit.finding import (
+    DATA_TABLES,
+    Finding,
+    Findings,
+    column,
+    listed,
+    unit_in_use,
+)
 from amibayes.oifits.columns import same
+from amibayes.oifits.rows import KINDS
 from amibayes.oifits.scales import ANGLE
 from amibayes.oifits.standard import PRIMARY_KEYWORDS, TABLES, ColumnRule
 from amibayes.oifits.tables import OIFits, OITable, plain
@@ -20,6 +28,8 @@ NEEDED = {"TARGET_ID", "TARGET", "STA_INDEX", "EFF_WAVE", "MJD", "FLAG", "UCOORD
 NEEDED |= {"U1COORD", "V1COORD", "U2COORD", "V2COORD", "IINDX", "JINDX", "CORR"}
 NEEDED |= {"VIS2DATA", "VIS2ERR", "T3PHI", "T3PHIERR", "VISAMP", "VISPHI"}
 """Columns without which numbers have no meaning; others are the standard's formalities."""
+
+ANGLES = ("T3PHI", "T3PHIERR", "VISPHI", "VISPHIERR")
 
 READERS = "programs that follow the standard may not read it, or read it wrongly"
 
@@ -112,18 +122,32 @@ def columns(oifits: OIFits) -> Findings:
             continue
         rules = rule.columns_of(oifits.version)
         absent = [r.name for r in rules if not r.optional and r.name not in table.columns]
-        if absent:
-            yield Finding(
-                "error" if NEEDED & set(absent) else "warning",
-                "column-missing",
-                table.label,
-                f"has no column {listed(absent)}",
-                READERS,
-                "write the file again with the program that made it",
-            )
+        certain = [name for name in absent if _is_known(oifits, table, name)]
+        for names in (certain, [name for name in absent if name not in certain]):
+            if names:
+                yield Finding(
+                    "error" if NEEDED & set(names) else "warning",
+                    "column-missing",
+                    table.label,
+                    f"has no column {listed(names)}",
+                    READERS,
+                    "add what it can only hold"
+                    if names is certain
+                    else "write the file again with the program that made it",
+                    certain=names is certain,
+                )
         present = [r for r in rules if r.name in table.columns]
         yield from _formats(oifits, table, present)
         yield from _units(table, present)
+
+
+def _is_known(oifits: OIFits, table: OITable, name: str) -> bool:
+    """Whether there is one thing that a column of V² or closure phases can hold."""
+    if table.name not in KINDS:
+        return False
+    targets = [column(t, "TARGET_ID") for t in oifits.named("OI_TARGET")]
+    single = len(targets) == 1 and targets[0] is not None and targets[0].size == 1
+    return name == "FLAG" or (name == "TARGET_ID" and single)
 
 
 def _formats(oifits: OIFits, table: OITable, rules: list[ColumnRule]) -> Findings:
@@ -165,11 +189,22 @@ def _units(table: OITable, rules: list[ColumnRule]) -> Findings:
     """Units that are absent, spelled in another way, or other units."""
     spelled: list[str] = []
     other: list[str] = []
+    angles: list[str] = []
     for rule in rules:
-        unit = table.units[rule.name]
-        if rule.unit and unit != rule.unit and not (rule.unit == "day" and unit == "d"):
-            known = not unit or standard_unit(unit) == rule.unit
-            (spelled if known else other).append(f"{rule.name} {unit or 'none'} (for {rule.unit})")
+        unit = unit_in_use(table, rule.name)
+        if (
+            not rule.unit
+            or table.units[rule.name] == rule.unit
+            or (rule.unit, unit) == ("day", "d")
+        ):
+            continue
+        text = f"{rule.name} {unit or 'none'} (for {rule.unit})"
+        if not unit or standard_unit(unit) == rule.unit:
+            spelled.append(text)
+        elif rule.name in ANGLES and unit.lower() in ANGLE:
+            angles.append(text)
+        else:
+            other.append(text)
     if spelled:
         yield Finding(
             "warning",
@@ -180,17 +215,32 @@ def _units(table: OITable, rules: list[ColumnRule]) -> Findings:
             "write them as the standard does",
             certain=True,
         )
-    if other:
-        angular = all(o.split()[0] in ("T3PHI", "T3PHIERR", "VISPHI", "VISPHIERR") for o in other)
-        yield Finding(
-            "error",
-            "unit",
-            table.label,
-            f"other units than the standard's: {listed(other)}",
-            "most programs do not look at the unit and read the numbers wrongly",
-            "convert the numbers",
-            certain=angular and all(o.split()[1].lower() in ANGLE for o in other),
-        )
+    for found, certain in ((angles, True), (other, False)):
+        if found:
+            yield Finding(
+                "error",
+                "unit",
+                table.label,
+                f"other units than the standard's: {listed(found)}",
+                "most programs do not look at the unit and read the numbers wrongly",
+                "convert the numbers",
+                certain=certain,
+            )
+
+
+def null_flags(oifits: OIFits) -> Findings:
+    """Bytes of FLAG that are neither T nor F."""
+    for table in oifits.tables:
+        if table.n_null:
+            yield Finding(
+                "warning",
+                "flag-null",
+                table.label,
+                f"{table.n_null} value(s) of FLAG are NULL, neither T nor F",
+                "some programs take them for flags, others for none",
+                "write F (they are taken for no flags here)",
+                certain=True,
+            )
 
 
 def references(oifits: OIFits) -> Findings:
@@ -307,6 +357,7 @@ CHECKS = (
     primary_keywords,
     table_keywords,
     columns,
+    null_flags,
     references,
     repeated_names,
     numbers_below_one,

@@ -31,7 +31,7 @@ ALL_WAVELENGTHS_M = (1e-7, 1e-3)
 def value_and_error(table: OITable, kind: Kind) -> tuple[FloatArray, FloatArray] | None:
     """Values and errors, (rows, channels), in SI and radians; None where shapes do not fit."""
     if kind.is_angle:
-        value, error = radians(table, kind.value), radians(table, kind.error, kind.value)
+        value, error = radians(table, kind.value), radians(table, kind.error)
     else:
         value, error = column(table, kind.value), column(table, kind.error)
     if value is None or error is None or value.shape != error.shape:
@@ -73,6 +73,7 @@ def dates(oifits: OIFits) -> Findings:
                 note.split(": ")[1],
                 "programs that go by MJD mix up the exposures",
                 "write the full date into MJD",
+                certain=not note.endswith("no date"),
             )
         night = table.keyword("DATE-OBS")
         written = mjd_of_date(night)
