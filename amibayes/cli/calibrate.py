@@ -102,9 +102,11 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from amibayes.calibration import calibrate
+    from amibayes.extraction.reading import check_together
     from amibayes.oifits import write_oifits
     from amibayes.support.atomic_files import output_folder
 
+    check_together(arguments.targets, arguments.cal)
     calibrators = _prepared(arguments.cal, arguments, target=None, one_star=False)
     targets = _prepared(arguments.targets, arguments, target=arguments.target)
     if arguments.merge_epochs:

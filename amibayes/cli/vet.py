@@ -59,13 +59,14 @@ def run(arguments: argparse.Namespace) -> int:
             f"needs {1 + len(arguments.calibrators)} numbers, the target's first",
             source="--charge-levels",
         )
-    from amibayes.extraction.reading import read_observations
+    from amibayes.extraction.reading import check_together, read_observations
     from amibayes.pipeline.vetting import vet
     from amibayes.plots.style import save
     from amibayes.report.vetting import vetting_json, vetting_picture, vetting_table
     from amibayes.support.atomic_files import output_folder, write_json
 
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
+    check_together([], arguments.calibrators)
     data = read_observations(
         arguments.calibrators,
         common.image_options_of(arguments),

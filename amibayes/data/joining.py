@@ -10,6 +10,9 @@ from amibayes.data.observables import Measurements, Observables
 from amibayes.errors import UsageError
 from amibayes.units import FloatArray
 
+SEPARATOR = ", "
+"""Between the names of files that are exposures of one."""
+
 
 def in_order(parts: Sequence[Observables]) -> list[Observables]:
     """Files by date, wavelength and name: a result does not depend on the order given."""
@@ -92,4 +95,4 @@ def different_targets(parts: Sequence[Observables]) -> tuple[str, ...]:
     return (f"targets of different names are fitted as one: {', '.join(names)}",)
 
 
-__all__ = ["different_targets", "in_order", "refuse_twice", "unused"]
+__all__ = ["SEPARATOR", "different_targets", "in_order", "refuse_twice", "unused"]

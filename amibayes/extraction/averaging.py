@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.extraction.cleaning import TO_SIGMA
-from amibayes.extraction.frames import Frames, look_elsewhere
-from amibayes.units import BoolArray, ComplexArray, FloatArray, IntArray
+from amibayes.extraction.frames import Frames
+from amibayes.units import ComplexArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +51,3 @@ def average(frames: Frames, pointed: ComplexArray, triangles: IntArray) -> Avera
     total = bispectrum.mean(axis=0)
     by_closure = (bispectrum / total).imag
     return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))
-
-
-def outlying(deviation: FloatArray, expected: FloatArray, limit: float) -> BoolArray:
-    """Integrations whose observables are outliers, on a robust scale, (n,).
-
-    The statistic is the largest deviation over all observables in units of its scatter,
-    and the limit allows for how many there are. The scatter of a few integrations may be
-    small by chance: it is not taken below what the observables have on average, in units
-    of the ``expected`` standard deviations (m,).
-    """
-    if len(deviation) < 5:
-        return np.zeros(len(deviation), dtype=bool)
-    middle = np.median(deviation, axis=0)
-    scatter = TO_SIGMA * np.median(np.abs(deviation - middle), axis=0)
-    # A robust scatter of few integrations is uncertain itself.
-    slack = 1.0 + 3.0 / np.sqrt(len(deviation))
-    scatter = np.maximum(scatter, expected * np.median(scatter / expected))
-    off = np.abs(deviation - middle) / np.maximum(scatter, 1e-300)
-    return np.asarray(off.max(axis=1) > slack * look_elsewhere(limit, deviation.size))

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from amibayes.cube import Cube
 from amibayes.cube.source import Source
+from amibayes.data.outliers import TO_SIGMA
 from amibayes.errors import DataError
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.noise import NoiseModel, noise_model
@@ -26,9 +27,6 @@ ALWAYS_BAD = 0.5
 
 OUTLIER = 7.0
 """Pixels of the sample that are outliers by more standard deviations are left out of it."""
-
-TO_SIGMA = 1.4826
-"""From the median absolute deviation to a standard deviation."""
 
 
 @dataclass(frozen=True, eq=False)

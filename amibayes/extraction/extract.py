@@ -13,16 +13,18 @@ from scipy.sparse import csr_array
 from amibayes.cube import Cube
 from amibayes.cube.source import opened
 from amibayes.data.covariance import Block
+from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.outliers import outlying
+from amibayes.data.shrinkage import Shrunk, shrunk_covariance
 from amibayes.errors import DataError
-from amibayes.extraction.averaging import Average, average, outlying
+from amibayes.extraction.averaging import Average, average
 from amibayes.extraction.frames import Frames, concatenated, measure_file, select
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
-from amibayes.extraction.shrinkage import Shrunk, shrunk_covariance
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.support.options import ExtractionMethod
@@ -33,10 +35,6 @@ NYQUIST = 0.5
 
 MAX_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
-
-
-SEPARATOR = ", "
-"""Between the names of files that are exposures of one."""
 
 
 @dataclass(frozen=True, eq=False)

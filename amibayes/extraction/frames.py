@@ -6,11 +6,11 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
 from amibayes.cube import Cube
 from amibayes.cube.source import Source
-from amibayes.extraction.cleaning import MAX_BAD, TO_SIGMA
+from amibayes.data.outliers import TO_SIGMA, look_elsewhere
+from amibayes.extraction.cleaning import MAX_BAD
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.image_plane import FringeFit, shift_of
 from amibayes.extraction.operator import ExtractionOperator
@@ -220,8 +220,3 @@ def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
     lit = np.maximum(frames.flux, 0.0)
     middle = float(np.median(lit[frames.used])) if frames.used.any() else 0.0
     return [("flux", lit, 1e-3 * middle), ("shape", frames.misfit, 0.02)]
-
-
-def look_elsewhere(limit: float, n: int) -> float:
-    """The limit that one of ``n`` exceeds as rarely as a single one exceeds ``limit``."""
-    return float(-ndtri(ndtr(-limit) / max(n, 1)))

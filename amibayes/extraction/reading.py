@@ -8,13 +8,26 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 from astropy.io import fits
 
+from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables
-from amibayes.extraction.extract import SEPARATOR, extract_all
+from amibayes.errors import DataError
+from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.oifits import OIFits, observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
+from amibayes.oifits.products import (
+    FITS_MODEL,
+    Given,
+    is_product_header,
+    open_products,
+    read_products,
+    refuse_calibrating_again,
+    refuse_twice,
+    uncalibrated,
+)
 from amibayes.support.fits_errors import UNREADABLE
 
 
@@ -47,12 +60,15 @@ class Contents:
         EXTNAME of every HDU, in capitals.
     shapes : tuple of (int, ...)
         Shape of every HDU that is an image; empty for others.
+    columns : frozenset of str
+        Names of the columns of all tables, in capitals.
     """
 
     path: str
     header: Mapping[str, Any]
     names: tuple[str, ...]
     shapes: tuple[tuple[int, ...], ...]
+    columns: frozenset[str] = frozenset()
 
     @property
     def has_oifits(self) -> bool:
@@ -69,7 +85,14 @@ def contents_of(path: str | Path) -> Contents:
         with fits.open(path, memmap=False, lazy_load_hdus=False) as hdus:
             names = tuple(hdu.name.upper() for hdu in hdus)
             shapes = tuple(tuple(hdu.shape) if hdu.is_image else () for hdu in hdus)
-            return Contents(str(path), MappingProxyType(dict(hdus[0].header)), names, shapes)
+            columns = frozenset(
+                str(value).strip().upper()
+                for hdu in hdus
+                for key, value in hdu.header.items()
+                if key.startswith("TTYPE")
+            )
+            header = MappingProxyType(dict(hdus[0].header))
+            return Contents(str(path), header, names, shapes, columns)
     except UNREADABLE:
         return Contents(str(path), MappingProxyType({}), (), ())
 
@@ -117,7 +140,45 @@ def _with_errors(oifits: OIFits, **options: Any) -> Observables:
     return replace(found, notes=(*found.notes, *errors_in(oifits, found)))
 
 
+def _is_product(contents: Contents) -> bool:
+    return is_product_header(contents.header, contents.names)
+
+
+def _products(
+    paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
+) -> list[Observables]:
+    return read_products(open_products(paths), **options)
+
+
+def _is_fitted_image(contents: Contents) -> bool:
+    return str(contents.header.get("DATAMODL", "")) == FITS_MODEL
+
+
+def _fitted_images(
+    paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
+) -> list[Observables]:
+    """Refuse the images that `ami_analyze` fitted, with what its fit leaves of them."""
+    raise DataError(
+        f"holds images and their fits (jwst amilg{residual_share(paths[0])}), no observables",
+        source=paths[0],
+        remedy="give the ami-oi or amimulti-oi product, or the image cube (calints)",
+    )
+
+
+def residual_share(path: str) -> str:
+    """Say how much of the images an ``amilg`` file's fits leave, rms; empty if it does not say."""
+    with fits.open(path, memmap=False) as hdus:
+        there = {hdu.name: hdu.data for hdu in hdus if hdu.is_image and hdu.data is not None}
+    if not {"CTRD", "RESID"} <= set(there):
+        return ""
+    image, residual = (np.nan_to_num(np.asarray(there[k], float)) for k in ("CTRD", "RESID"))
+    share = float(np.sqrt((residual**2).sum() / max(float((image**2).sum()), 1e-300)))
+    return f", whose fits leave {100.0 * share:.1f} % of the image"
+
+
 FORMATS: tuple[InputFormat, ...] = (
+    InputFormat("JWST stage-3 product", _is_product, _products),
+    InputFormat("fitted images", _is_fitted_image, _fitted_images),
     InputFormat("image cube", _is_cube, _extracted),
     InputFormat("OIFITS", lambda contents: True, _oifits),
 )
@@ -174,3 +235,29 @@ def _first(part: Observables, paths: list[str]) -> int:
     """Place among the paths of the first file that some observables come from."""
     own = {name for s in part.setups for name in s.source.split(SEPARATOR)}
     return next((k for k, path in enumerate(paths) if path in own), len(paths))
+
+
+def check_together(
+    targets: Sequence[str | Path], calibrators: Sequence[str | Path] = ()
+) -> tuple[str, ...]:
+    """Refuse files that must not be used together, and warn of what is missing.
+
+    Returns
+    -------
+    tuple of str
+        Warnings.
+
+    Raises
+    ------
+    UsageError
+        Where two files are of one exposure, or what is calibrated is given calibrators.
+    """
+    ours, theirs = ([_given(path) for path in paths] for paths in (targets, calibrators))
+    refuse_calibrating_again(ours, theirs)
+    refuse_twice([*ours, *theirs])
+    return uncalibrated(ours, theirs)
+
+
+def _given(path: str | Path) -> Given:
+    contents = contents_of(path)
+    return Given(contents.path, contents.header, contents.names, contents.columns)

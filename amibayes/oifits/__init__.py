@@ -1,6 +1,7 @@
 """OIFITS, versions 1 and 2, both ways, with every correlation."""
 
-from amibayes.oifits.reader import observables_of, read_oifits
+from amibayes.oifits.products.reading import read_oifits
+from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits, OITable, open_oifits
 from amibayes.oifits.writer import write_oifits
 

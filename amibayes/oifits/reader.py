@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -24,45 +23,9 @@ from amibayes.oifits.setups import (
     wavelength_table,
 )
 from amibayes.oifits.stated import Column, Content, stated_covariance
-from amibayes.oifits.tables import OWN_KEY, OIFits, OITable, open_oifits
+from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance
 from amibayes.units import IntArray
-
-
-def read_oifits(
-    path: str | Path,
-    *,
-    insname: str | None = None,
-    target: str | None = None,
-    closure_covariance: ClosureCovariance = "assumed",
-) -> Observables:
-    """Read the squared visibilities and closure phases of an OIFITS file.
-
-    Parameters
-    ----------
-    path : str or path
-        Version 1 or 2, plain or gzipped.
-    insname : str, optional
-        Only the data of this instrument table; all are joined otherwise.
-    target : str, optional
-        Which target, where the file holds data of several.
-    closure_covariance : {"assumed", "diagonal"}
-        What errors without correlations mean: independent baseline phases, which triangles
-        share, or independent closure phases. "diagonal" also sets aside correlations that
-        the file gives.
-
-    Returns
-    -------
-    Observables
-
-    Raises
-    ------
-    DataError
-        Where the file cannot be read or holds no usable V² or closure phase.
-    """
-    return observables_of(
-        open_oifits(path), insname=insname, target=target, closure_covariance=closure_covariance
-    )
 
 
 def observables_of(
@@ -72,7 +35,10 @@ def observables_of(
     target: str | None = None,
     closure_covariance: ClosureCovariance = "assumed",
 ) -> Observables:
-    """Take the squared visibilities and closure phases from an opened file; see `read_oifits`."""
+    """Take the squared visibilities and closure phases from an opened file, as they are.
+
+    The options, what comes out and the errors are those of `amibayes.oifits.read_oifits`.
+    """
     tables = _data_tables(oifits, insname)
     name, targets = _chosen_target(oifits, tables, target)
     setups, parts = _parts(oifits, tables, targets, name)

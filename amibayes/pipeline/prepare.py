@@ -14,7 +14,7 @@ from amibayes.calibration import Calibration, calibrate
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
-from amibayes.extraction.reading import read_observations
+from amibayes.extraction.reading import check_together, read_observations
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.vetting import Vetting, vet
 from amibayes.pipeline.warnings import calibration_cautions, vetting_cautions
@@ -83,11 +83,13 @@ def prepare(
     """
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
+    together = check_together(targets, calibrators)
     with clock.stage("read"):
         parts = read(targets, options)
         references = read(calibrators, options, one_star=False)
     parts = in_order(parts)
     joined = (
+        *together,
         *refuse_twice(parts),
         *unused(parts, options.observables),
         *different_targets(parts),

@@ -26,8 +26,8 @@ from amibayes.data.degrees_of_freedom import (
 )
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.shrinkage import shrunk_covariance
 from amibayes.errors import DataError
-from amibayes.extraction.shrinkage import shrunk_covariance
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel

@@ -19,10 +19,10 @@ from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import dense_covariance, sparse_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
+from amibayes.data.shrinkage import shrunk_covariance
 from amibayes.detection.false_alarm import significance
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.statistic import BankStatistic, make_statistic
-from amibayes.extraction.shrinkage import shrunk_covariance
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 

@@ -12,9 +12,9 @@ from scipy import stats
 from amibayes.calibration import calibrate
 from amibayes.companion_search.search import search
 from amibayes.cube import Cube
+from amibayes.data.shrinkage import lag_one, shrunk_covariance
 from amibayes.extraction import Extraction, ExtractOptions, extract_all
 from amibayes.extraction.image_plane import fringe_sampling
-from amibayes.extraction.shrinkage import lag_one, shrunk_covariance
 from amibayes.instrument import load_instrument
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.optics import psf

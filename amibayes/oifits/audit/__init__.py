@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
-from amibayes.oifits.audit import geometry, noise, packages, structure, values
+from amibayes.oifits.audit import geometry, jwst, noise, packages, structure, values
 from amibayes.oifits.audit.finding import Finding, Severity
 from amibayes.oifits.audit.repair import repair
 from amibayes.oifits.columns import integers
+from amibayes.oifits.products import product_of
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.setups import DATA_TABLES, targets_of
 from amibayes.oifits.tables import OIFits, open_oifits
@@ -22,7 +23,6 @@ FILE_CHECKS = (
     *values.CHECKS,
     *geometry.CHECKS,
     *noise.CHECKS,
-    *packages.CHECKS,
 )
 DATA_CHECKS = (*geometry.DATA_CHECKS, *noise.DATA_CHECKS)
 
@@ -70,7 +70,12 @@ def audit(path: str | Path | OIFits) -> Audit:
         Where the file cannot be read at all.
     """
     oifits = path if isinstance(path, OIFits) else open_oifits(path)
-    found = [finding for check in FILE_CHECKS for finding in check(oifits)]
+    product = product_of(oifits)
+    # A product has the errors of its package for certain; elsewhere numbers have to tell.
+    own = packages.CHECKS if product is None else ()
+    found = [finding for check in (*FILE_CHECKS, *own) for finding in check(oifits)]
+    if product is not None:
+        found = _of_product(found, jwst.findings_of(product))
     names = _targets(oifits)
     found += list(noise.unusable(oifits, names))
     parts = [p for p in (_part(oifits, name) for name in names) if p is not None]
@@ -87,7 +92,7 @@ def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
     observables : Observables
         What was read of it.
     """
-    found = [finding for check in FILE_CHECKS for finding in check(oifits)]
+    found = [finding for check in (*FILE_CHECKS, *packages.CHECKS) for finding in check(oifits)]
     found += [f for check in geometry.DATA_CHECKS for f in check(oifits, [observables])]
     groups: dict[str, list[Finding]] = {}
     for finding in found:
@@ -99,6 +104,12 @@ def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
 def _line(group: list[Finding]) -> str:
     first, more = group[0], f" (and {len(group) - 1} more like it)" if len(group) > 1 else ""
     return f"{first.where}: {first.what}{more}: {first.why} (amibayes audit)"
+
+
+def _of_product(general: list[Finding], own: list[Finding]) -> list[Finding]:
+    """Findings of a product; a copy mends all or, where it cannot be written, nothing."""
+    fixable = any(f.certain for f in own)
+    return own + [replace(f, certain=f.certain and fixable) for f in general]
 
 
 def _targets(oifits: OIFits) -> list[str]:

@@ -20,6 +20,7 @@ from amibayes.oifits.audit.structure import ANGLES, standard_unit
 from amibayes.oifits.audit.values import value_and_error
 from amibayes.oifits.columns import coordinates
 from amibayes.oifits.dates import first_date
+from amibayes.oifits.products import product_of, write_repaired
 from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import KINDS, channel_count, times_of, unusable
 from amibayes.oifits.scales import ANGLE
@@ -51,6 +52,10 @@ def repair(oifits: OIFits, findings: list[Finding], path: str | Path) -> list[Fi
         Those that were mended.
     """
     mended = [f for f in findings if f.certain]
+    product = product_of(oifits)
+    if product is not None and mended:
+        write_repaired(product, path)
+        return mended
     raw = fits_bytes(Path(oifits.path))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

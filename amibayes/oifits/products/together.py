@@ -1,0 +1,89 @@
+"""Which files may be given together: no exposure twice, and nothing calibrated twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from amibayes.errors import UsageError
+from amibayes.oifits.products.recognise import exposure_of, is_normalized, is_product_header
+
+
+@dataclass(frozen=True)
+class Given:
+    """A file on the command line, as far as its headers tell.
+
+    Parameters
+    ----------
+    path : str
+    header : mapping
+        Of the primary HDU.
+    names : tuple of str
+        EXTNAME of every HDU.
+    columns : frozenset of str
+        Names of the columns of all tables.
+    """
+
+    path: str
+    header: Mapping[str, Any]
+    names: tuple[str, ...]
+    columns: frozenset[str] = frozenset()
+
+    @property
+    def is_product(self) -> bool:
+        """Whether it is a stage-3 product."""
+        return is_product_header(self.header, self.names)
+
+    @property
+    def is_normalized(self) -> bool:
+        """Whether the pipeline has calibrated it."""
+        return self.is_product and is_normalized(self.header, self.columns)
+
+
+def refuse_twice(files: Sequence[Given]) -> None:
+    """Refuse a product together with another file of its exposure.
+
+    Raises
+    ------
+    UsageError
+        Naming both.
+    """
+    for k, one in enumerate(files):
+        exposure = exposure_of(one.header)
+        for other in files[k + 1 :]:
+            if not (one.is_product or other.is_product) or exposure is None:
+                continue
+            if exposure_of(other.header) == exposure:
+                raise UsageError(
+                    f"is of the same exposure as {one.path}",
+                    source=other.path,
+                    remedy="give one of them: the images, else amimulti-oi, else ami-oi",
+                )
+
+
+def refuse_calibrating_again(targets: Sequence[Given], calibrators: Sequence[Given]) -> None:
+    """Refuse calibrators for what the pipeline has calibrated already.
+
+    Raises
+    ------
+    UsageError
+        Naming the file.
+    """
+    normalized = [f for f in (*targets, *calibrators) if f.is_normalized]
+    if normalized and calibrators:
+        raise UsageError(
+            "is calibrated already (jwst aminorm-oi)",
+            source=normalized[0].path,
+            remedy="give it without --cal, or the ami-oi or amimulti-oi of target and calibrators",
+        )
+
+
+def uncalibrated(targets: Sequence[Given], calibrators: Sequence[Given]) -> tuple[str, ...]:
+    """Name the products that nobody has calibrated."""
+    if calibrators:
+        return ()
+    raw = [f.path for f in targets if f.is_product and not f.is_normalized]
+    if not raw:
+        return ()
+    return (f"{', '.join(raw)}: not calibrated (jwst); give its calibrators with --cal",)
