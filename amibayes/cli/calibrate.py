@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import common, data_options
-from amibayes.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration
@@ -40,13 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_method(group: argparse._ArgumentGroup) -> None:
     data_options.add_calibration(group)
-    group.add_argument(
-        "--calibrator-diameters",
-        metavar="LIST|TABLE",
-        help="uniform-disc diameters in mas, in the order of --cal, as 0.31:0.02,0.4 "
-        "(value:error); or a table (ECSV, CSV, FITS) with columns name, diameter_mas, error_mas, "
-        "whose name is that of the file or of its target",
-    )
+    data_options.add_calibrator_diameters(group)
     group.add_argument(
         "--charge-levels",
         type=common.numbers,
@@ -67,32 +60,7 @@ def _add_data(group: argparse._ArgumentGroup) -> None:
     data_options.add_closure_covariance(group)
     data_options.add_insname(group)
     group.add_argument("--target", metavar="NAME", help="use one target of the target's files")
-    group.add_argument(
-        "--flag",
-        action="append",
-        default=[],
-        metavar="RULE",
-        help="flag data of target and calibrators, as 'vis2>1.1', 'cp_error_deg>20' or "
-        "'station=A1'; may be given again",
-    )
-    group.add_argument(
-        "--average-polarisations",
-        action="store_true",
-        help="average instrument tables that differ in a last P1, P2",
-    )
-    group.add_argument(
-        "--bin-channels",
-        type=common.positive_integer,
-        default=1,
-        metavar="N",
-        help="average N adjacent channels",
-    )
-    group.add_argument(
-        "--merge-epochs",
-        type=common.positive_float,
-        metavar="DAYS",
-        help="average the target's exposures within this time, while (u, v) stays",
-    )
+    data_options.add_reduction(group)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -101,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     import numpy as np
 
-    from amibayes.calibration import calibrate
+    from amibayes.calibration import calibrate, diameters_of
     from amibayes.extraction.reading import check_together
     from amibayes.oifits import write_oifits
     from amibayes.support.atomic_files import output_folder
@@ -109,17 +77,13 @@ def run(arguments: argparse.Namespace) -> int:
     check_together(arguments.targets, arguments.cal)
     calibrators = _prepared(arguments.cal, arguments, target=None, one_star=False)
     targets = _prepared(arguments.targets, arguments, target=arguments.target)
-    if arguments.merge_epochs:
-        from amibayes.calibration import merge_epochs
-
-        targets = [merge_epochs(target, arguments.merge_epochs) for target in targets]
     folder = output_folder(arguments.out, [RESULT], overwrite=arguments.overwrite)
     found = calibrate(
         targets,
         calibrators,
         method=arguments.calibration,
         clip=arguments.clip,
-        diameters_mas=_diameters(arguments, calibrators),
+        diameters_mas=diameters_of(arguments.calibrator_diameters, calibrators),
         window_days=arguments.time_window,
         charge_levels=arguments.charge_levels,
         rng=np.random.default_rng(arguments.seed),
@@ -138,7 +102,7 @@ def _prepared(
     one_star: bool = True,
 ) -> list[Observables]:
     """Read files, flag, average."""
-    from amibayes.calibration import average_polarisations, bin_channels, flag_by_rule
+    from amibayes.calibration import reduce_data
     from amibayes.extraction.reading import read_observations
 
     found = read_observations(
@@ -149,69 +113,10 @@ def _prepared(
         target=target,
         closure_covariance=arguments.closure_covariance,
     )
-    if arguments.flag:
-        found = [flag_by_rule(each, arguments.flag) for each in found]
-    if arguments.average_polarisations:
-        found = [average_polarisations(each) for each in found]
-    if arguments.bin_channels > 1:
-        found = [bin_channels(each, arguments.bin_channels) for each in found]
-    return found
-
-
-def _diameters(
-    arguments: argparse.Namespace, calibrators: list[Observables]
-) -> list[tuple[float, float]] | None:
-    """Diameter and error of each calibrator, from the list or the table."""
-    given = arguments.calibrator_diameters
-    if given is None:
-        return None
-    if Path(given).is_file():
-        return _from_table(given, calibrators)
-    try:
-        pairs = [tuple(float(x) for x in word.split(":")) for word in given.split(",")]
-        found = [(p[0], p[1] if len(p) > 1 else 0.0) for p in pairs]
-    except ValueError:
-        raise UsageError(
-            f"{given!r} is neither a table nor a list of diameters",
-            source="--calibrator-diameters",
-            remedy="give mas, as 0.31:0.02,0.4",
-        ) from None
-    if len(found) != len(calibrators):
-        raise UsageError(
-            f"{len(found)} diameters for {len(calibrators)} calibrators",
-            source="--calibrator-diameters",
-            remedy="give one for each, in the order of --cal",
-        )
-    return found
-
-
-def _from_table(path: str, calibrators: list[Observables]) -> list[tuple[float, float]]:
-    from astropy.table import Table
-
-    try:
-        table = Table.read(path)
-        names = [str(name).strip().casefold() for name in table["name"]]
-        values = [float(x) for x in table["diameter_mas"]]
-        errors = [float(x) for x in table["error_mas"]] if "error_mas" in table.colnames else []
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(
-            "is no table of diameters",
-            source=path,
-            remedy="give columns name, diameter_mas and, if known, error_mas",
-        ) from error
-    out = []
-    for calibrator in calibrators:
-        file = Path(calibrator.source)
-        known = {file.name, file.stem, str(file), calibrator.setups[0].target}
-        rows = [i for i, name in enumerate(names) if name in {k.casefold() for k in known}]
-        if not rows:
-            raise DataError(
-                f"has no line for {calibrator.source} ({calibrator.setups[0].target})",
-                source=path,
-                remedy="name the file or its target",
-            )
-        out.append((values[rows[0]], errors[rows[0]] if errors else 0.0))
-    return out
+    reduction = data_options.reduction_of(arguments)
+    if not one_star:  # calibrators are averaged key by key, whenever they were observed
+        reduction["epochs_days"] = None
+    return [reduce_data(each, **reduction) for each in found]
 
 
 def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> dict[str, object]:

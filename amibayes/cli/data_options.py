@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from amibayes.cli import common
@@ -31,6 +32,76 @@ def add_calibration(group: argparse._ActionsContainer) -> None:
         metavar="SIGMA",
         help="leave out values that are outliers among the calibrators (default: %(default)s)",
     )
+
+
+def add_calibrator_diameters(group: argparse._ActionsContainer) -> None:
+    """Add ``--calibrator-diameters``."""
+    group.add_argument(
+        "--calibrator-diameters",
+        metavar="LIST|TABLE",
+        help="uniform-disc diameters in mas, in the order of the calibrators, as 0.31:0.02,0.4 "
+        "(value:error); or a table (ECSV, CSV, FITS) with columns name, diameter_mas, error_mas, "
+        "whose name is that of the file or of its target",
+    )
+
+
+def add_reduction(group: argparse._ActionsContainer) -> None:
+    """Add what may be flagged and averaged before anything else."""
+    group.add_argument(
+        "--flag",
+        action="append",
+        default=[],
+        metavar="RULE|FILE",
+        help="flag data of target and calibrators, as 'vis2>1.1', 'cp_error_deg>20' or "
+        "'station=A1', or by a file of such rules, one a line; may be given again",
+    )
+    group.add_argument(
+        "--average-polarisations",
+        action="store_true",
+        help="average instrument tables that differ in a last P1, P2",
+    )
+    group.add_argument(
+        "--bin-channels",
+        type=common.positive_integer,
+        default=1,
+        metavar="N",
+        help="average N adjacent channels",
+    )
+    group.add_argument(
+        "--merge-epochs",
+        type=common.positive_float,
+        metavar="DAYS",
+        help="average the target's exposures within this time, while (u, v) stays",
+    )
+
+
+def reduction_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what `add_reduction` says, as `reduce_data` takes it."""
+    return {
+        "flag": tuple(rule for given in arguments.flag for rule in _rules(given)),
+        "polarisations": arguments.average_polarisations,
+        "channels": arguments.bin_channels,
+        "epochs_days": arguments.merge_epochs,
+    }
+
+
+def _rules(given: str) -> list[str]:
+    """A rule, or those of a file: one a line, # begins a comment.
+
+    Raises
+    ------
+    UsageError
+        Where the file is no text.
+    """
+    if not Path(given).is_file():
+        return [given]
+    try:
+        lines = Path(given).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(
+            "is no file of rules", source=given, remedy="give text, a rule in each line"
+        ) from error
+    return [rule for line in lines if (rule := line.split("#")[0].strip())]
 
 
 def add_closure_covariance(group: argparse._ActionsContainer) -> None:
@@ -136,7 +207,17 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         raise UsageError("needs a motion", source="--fastest", remedy="give --motion")
     if arguments.calibration and not arguments.cal:
         raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
+    if arguments.calibrator_diameters and not arguments.cal:
+        raise UsageError(
+            "needs calibrators", source="--calibrator-diameters", remedy="give --cal FILES"
+        )
+    reduction = reduction_of(arguments)
     return {
+        "flag": reduction["flag"],
+        "average_polarisations": reduction["polarisations"],
+        "bin_channels": reduction["channels"],
+        "merge_epochs_days": reduction["epochs_days"],
+        "calibrator_diameters": arguments.calibrator_diameters,
         "separation_mas": arguments.separation,
         "diameter": arguments.diameter,
         "background": arguments.background,
@@ -173,8 +254,10 @@ def add_observables(
 
 def add_data(group: argparse._ActionsContainer) -> None:
     """Add how data are read, calibrated and believed."""
+    add_reduction(group)
     add_closure_covariance(group)
     add_calibration(group)
+    add_calibrator_diameters(group)
     group.add_argument(
         "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
     )

@@ -44,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     data_options.add_closure_covariance(group)
     data_options.add_insname(group)
+    data_options.add_reduction(group)
+    data_options.add_calibrator_diameters(group)
     common.add_seed_option(group)
     common.add_image_options(parser)
     common.add_output_options(parser, "vet")
@@ -59,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"needs {1 + len(arguments.calibrators)} numbers, the target's first",
             source="--charge-levels",
         )
+    from amibayes.calibration import diameters_of, reduce_data, without_disc
     from amibayes.extraction.reading import check_together, read_observations
     from amibayes.pipeline.vetting import vet
     from amibayes.plots.style import save
@@ -74,6 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
         insname=arguments.insname,
         closure_covariance=arguments.closure_covariance,
     )
+    data = [reduce_data(each, **data_options.reduction_of(arguments)) for each in data]
+    diameters = diameters_of(arguments.calibrator_diameters, data)
+    if diameters is not None:
+        data = [without_disc(d, size) for d, (size, _) in zip(data, diameters, strict=True)]
     vetting = vet(
         data,
         calibrated=arguments.calibrated,

@@ -300,6 +300,26 @@ def sparse_covariance(covariance: Covariance) -> csr_array:
     return coo_array(entries, shape=shape).tocsr()
 
 
+def scaled(covariance: Covariance, factors: FloatArray) -> Covariance:
+    """Covariance of data that are multiplied by numbers, one for each.
+
+    Parameters
+    ----------
+    factors : (size,) float array
+        None of them zero.
+    """
+    if isinstance(covariance, BlockCovariance):
+        blocks = []
+        for block in covariance.blocks:
+            f = factors[block.index]
+            basis = block.basis
+            if basis is not None and not (f == f[0]).all():
+                basis = np.linalg.qr(f[:, None] * basis)[0]
+            blocks.append(Block(block.index, f[:, None] * block.matrix * f, basis))
+        return BlockCovariance(covariance.size, blocks)
+    return DiagonalCovariance(covariance.variance * factors**2)
+
+
 def stack_covariances(parts: Sequence[Covariance]) -> Covariance:
     """Covariance of independent data vectors laid end to end."""
     if all(isinstance(part, DiagonalCovariance) for part in parts):

@@ -48,6 +48,17 @@ class SearchOptions:
         Use all calibrators, whatever vetting would say of them.
     insname, target : str, optional
         One instrument, one target of a file that holds several.
+    flag : tuple of str
+        Rules of `amibayes.flag_by_rule`, for targets and calibrators.
+    average_polarisations : bool
+        Average instrument tables that differ in a last P1, P2.
+    bin_channels : int
+        Adjacent channels that are averaged.
+    merge_epochs_days : float, optional
+        Average the targets' exposures within this time, while (u, v) stays.
+    calibrator_diameters : str, optional
+        Uniform discs, as ``0.31:0.02,0.4`` in mas, or a table; see
+        `amibayes.calibration.diameters_of`.
     null_draws : int
         0 leaves the false-alarm probability out.
     alpha : float
@@ -90,6 +101,11 @@ class SearchOptions:
     keep_all: bool = False
     insname: str | None = None
     target: str | None = None
+    flag: tuple[str, ...] = ()
+    average_polarisations: bool = False
+    bin_channels: int = 1
+    merge_epochs_days: float | None = None
+    calibrator_diameters: str | None = None
     null_draws: int = NULL_DRAWS
     alpha: float = ALPHA
     contrast: ContrastSharing | None = None

@@ -10,7 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.calibration import Calibration, calibrate
+from amibayes.calibration import (
+    Calibration,
+    calibrate,
+    diameters_of,
+    reduce_data,
+    without_disc,
+)
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
@@ -103,7 +109,7 @@ def read(
     paths: Sequence[str | Path], options: SearchOptions, *, one_star: bool = True
 ) -> list[Observables]:
     """Read files of any format, one table for each exposure, as the options say."""
-    return read_observations(
+    found = read_observations(
         paths,
         options.images,
         one_star=one_star,
@@ -111,6 +117,17 @@ def read(
         target=options.target,
         closure_covariance=options.closure_covariance,
     )
+    return [
+        reduce_data(
+            each,
+            flag=options.flag,
+            polarisations=options.average_polarisations,
+            channels=options.bin_channels,
+            # Calibrators are averaged key by key, whenever they were observed.
+            epochs_days=options.merge_epochs_days if one_star else None,
+        )
+        for each in found
+    ]
 
 
 def _calibrated(
@@ -124,10 +141,12 @@ def _calibrated(
     if not references:
         return None, None, join(parts)
     vetting, believed = None, references
+    diameters = diameters_of(options.calibrator_diameters, references)
+    sizes = diameters or [(0.0, 0.0)] * len(references)
     if len(references) >= MIN_TO_VET and not options.keep_all:
         with clock.stage("vet"):
             vetting = vet(
-                references,
+                [without_disc(r, size) for r, (size, _) in zip(references, sizes, strict=True)],
                 separation_mas=options.separation_mas,
                 null_draws=VETTING_DRAWS,
                 limits=False,
@@ -135,9 +154,15 @@ def _calibrated(
                 seed=options.seed,
             )
             believed = _believed(references, vetting)
+    kept = {id(reference) for reference in believed}
     with clock.stage("calibrate"):
         calibration = calibrate(
-            parts, believed, method=options.calibration, clip=options.clip, rng=rng
+            parts,
+            believed,
+            method=options.calibration,
+            clip=options.clip,
+            diameters_mas=[d for r, d in zip(references, sizes, strict=True) if id(r) in kept],
+            rng=rng,
         )
     return vetting, calibration, calibration.observables
 
