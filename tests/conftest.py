@@ -7,12 +7,16 @@ import os
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers import niriss, simulated
 from hypothesis import settings
+
+from amibayes.oifits import write_oifits
 
 # The same examples every time: a failure that nobody can repeat helps nobody.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -73,3 +77,26 @@ def data() -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20201211)
+
+
+TRUTH = (110.0, -75.0, 0.02)
+"""East and north in mas, and contrast, of the companion of `target`."""
+
+
+def _written(folder: Path, theta: Sequence[float]) -> Path:
+    path = folder / "target.oifits"
+    data = simulated(niriss(), list(theta), np.random.default_rng(1))
+    write_oifits(path, data, overwrite=True)
+    return path
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    """A file of a star with a companion."""
+    return _written(tmp_path, TRUTH)
+
+
+@pytest.fixture(scope="session")
+def star(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of a star by itself."""
+    return _written(tmp_path_factory.mktemp("star"), (0.0, 0.0, 0.0))

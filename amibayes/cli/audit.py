@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from amibayes.cli import common
 from amibayes.errors import UsageError
+from amibayes.support.terminal import shortened
 
 if TYPE_CHECKING:
     from amibayes.oifits.audit import Audit, Finding
 
 RESULT = "audit.json"
-MAX_LINES = 20
 
 EXAMPLES = """examples:
   amibayes audit target.oifits
@@ -110,10 +110,7 @@ def _summary(
             said += f", {len(mended)} mended in {folder / copies[a.oifits.path]}"
         lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {said}")
         lines += [_line(group) for group in _alike(a.findings)]
-    if len(lines) > MAX_LINES - 1:
-        left = len(lines) - (MAX_LINES - 2)
-        lines = [*lines[: MAX_LINES - 2], f"and {left} lines more"]
-    return [*lines, f"explained in {folder / RESULT}"]
+    return shortened(lines, [f"explained in {folder / RESULT}"])
 
 
 def _alike(findings: tuple[Finding, ...]) -> list[list[Finding]]:

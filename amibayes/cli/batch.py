@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import copy
 import importlib
-import json
 import logging
 import sys
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from amibayes.support.atomic_files import output_locks
 
 if TYPE_CHECKING:
     from amibayes.pipeline.batch import SurveyTarget
-    from amibayes.report.survey import Outcome
+    from amibayes.report.survey import Outcome, Status
 
 NOT_OF_A_ROW = {
     "--batch", "--cal", "--debug", "--help", "--json", "--out", "--overwrite", "--quiet",
@@ -66,18 +65,15 @@ class Job:
     arguments: argparse.Namespace | None
     error: str = ""
 
-    def key(self) -> str:
+    def request(self) -> str:
         """Digest of the options and of the files' content; empty where a file is missing."""
-        from amibayes.parallel import digest
-
         if self.arguments is None:
             return ""
-        files = [[Path(p) for p in paths] for paths in _paths(self.arguments)]
-        if not all(path.is_file() for paths in files for path in paths):
+        command = importlib.import_module(f"amibayes.cli.{self.arguments.command}")
+        try:
+            return str(command.request(self.arguments))
+        except AmibayesError:  # what is wrong is told when its turn comes
             return ""
-        apart = {flag.removeprefix("--") for flag in NOT_OF_A_ROW} | {"targets", "words"}
-        options = {k: v for k, v in vars(self.arguments).items() if k not in apart}
-        return digest(options, files)
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
@@ -130,10 +126,6 @@ def _folder(arguments: argparse.Namespace, jobs: list[Job]) -> Path:
 
 def _result_name(command: str) -> str:
     return str(importlib.import_module(f"amibayes.cli.{command}").RESULT)
-
-
-def _paths(arguments: argparse.Namespace) -> tuple[list[str], list[str]]:
-    return arguments.targets, arguments.cal
 
 
 class _RowParser(argparse.ArgumentParser):
@@ -212,33 +204,16 @@ def _finished_or_pending(
     arguments: argparse.Namespace, jobs: list[Job], folder: Path
 ) -> list[Outcome]:
     """Outcomes before anything is done: with ``--resume``, the jobs that are finished."""
-    from amibayes.report.survey import JSON_NAME, Outcome
+    from amibayes.report.survey import Outcome
+    from amibayes.support.request import answers
 
-    keys = _keys_of_done(folder / JSON_NAME) if arguments.resume else {}
     outcomes = []
     for job in jobs:
-        key = job.key()
-        content = None
-        if key and keys.get(job.name) == key:
-            content = _result(folder / job.name / _result_name(arguments.command))
-        outcomes.append(
-            Outcome(job.name, "pending" if content is None else "done", "", key, content)
-        )
+        path, key = folder / job.name / _result_name(arguments.command), job.request()
+        content = answers(path, key) if arguments.resume else None
+        status: Status = "pending" if content is None else "done"
+        outcomes.append(Outcome(job.name, status, "", key, content))
     return outcomes
-
-
-def _keys_of_done(path: Path) -> dict[str, str]:
-    content = _result(path) or {}
-    return {e["name"]: e["key"] for e in content.get("targets", []) if e["status"] == "done"}
-
-
-def _result(path: Path) -> dict[str, Any] | None:
-    """Read a result; None where there is none that can be read."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return content if isinstance(content, dict) else None
 
 
 def _carry_out(
@@ -261,12 +236,13 @@ def _carry_out(
 
 def _outcome(arguments: argparse.Namespace, job: Job, key: str, error: str) -> Outcome:
     from amibayes.report.survey import Outcome
+    from amibayes.support.request import read_answer
 
     if error:
         print(f"amibayes: {job.name}: {error}", file=sys.stderr)
         return Outcome(job.name, "failed", error, key)
     path = Path(arguments.out) / job.name / _result_name(arguments.command)
-    return Outcome(job.name, "done", "", key, _result(path))
+    return Outcome(job.name, "done", "", key, read_answer(path))
 
 
 def _one(command: str, job: Job) -> str:

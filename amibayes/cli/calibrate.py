@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import common, data_options
+from amibayes.support.terminal import row, shortened
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration
@@ -156,9 +157,7 @@ def _summary(found: Calibration, folder: Path) -> list[str]:
     if found.tau_closure_phase_deg is not None:
         tau = found.tau_closure_phase_deg
         lines.append(f"scatter     {tau:.3g} deg in closure phase between calibrators")
-    for use in found.calibrators[:10]:
+    for use in found.calibrators:
         state = "kept" if use.kept else "not used"
         lines.append(f"calibrator  {use.path}: {state}{', ' if use.reason else ''}{use.reason}")
-    if len(found.calibrators) > 10:
-        lines.append(f"calibrator  and {len(found.calibrators) - 10} more")
-    return [*lines, f"written     {folder / RESULT}"]
+    return shortened(lines, [row("written to", str(folder / RESULT))])

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
-    """Add ``--out``, ``--overwrite``, ``--json`` and how much is said."""
+    """Add ``--out``, ``--overwrite``, ``--json`` and how much is printed."""
     group = parser.add_argument_group("output")
     group.add_argument(
         "--out",
@@ -37,7 +37,7 @@ def add_output_options(parser: argparse.ArgumentParser, command: str) -> None:
 
 
 def add_speech_options(group: argparse._ActionsContainer) -> None:
-    """Add ``--json`` and how much is said."""
+    """Add ``--json`` and how much is printed."""
     group.add_argument(
         "--json",
         action="store_true",
@@ -45,7 +45,7 @@ def add_speech_options(group: argparse._ActionsContainer) -> None:
     )
     loudness = group.add_mutually_exclusive_group()
     loudness.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    loudness.add_argument("--verbose", action="store_true", help="say what is being done")
+    loudness.add_argument("--verbose", action="store_true", help="tell every stage and its seconds")
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
@@ -186,7 +186,7 @@ def stages_of(
     """Open one progress bar after the other for a job of several stages, unless ``--quiet``."""
     from amibayes.parallel import stage_bars
 
-    return stage_bars(unit=unit, quiet=arguments.quiet)
+    return stage_bars(unit=unit, quiet=arguments.quiet, verbose=arguments.verbose)
 
 
 def positive_integer(text: str) -> int:

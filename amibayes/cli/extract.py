@@ -10,6 +10,7 @@ from amibayes import __version__
 from amibayes.cli import common
 from amibayes.errors import UsageError
 from amibayes.support.options import CLIP_INTEGRATIONS, ExtractionCovariance, Geometry, choices
+from amibayes.support.terminal import shortened
 
 if TYPE_CHECKING:
     from amibayes.extraction import Extraction
@@ -161,7 +162,7 @@ def _summary(content: list[dict[str, Any]]) -> list[str]:
             f"{entry['sigma_closure_phase_physical_deg']:.3g} deg",
         ]
         lines += [f"  {note}" for note in entry["notes"]]
-    return lines if len(lines) <= 20 else [*lines[:19], f"and {len(lines) - 19} lines more"]
+    return shortened(lines)
 
 
 __all__ = ["add_arguments", "run"]

@@ -113,6 +113,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.support.atomic_files import output_folder
+    from amibayes.support.request import refuse_other
 
     options = _options(arguments)
     names = _names(options)
@@ -122,7 +123,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     content = _finished(folder, names, request) if arguments.resume else None
     if content is None:
         if arguments.resume and not arguments.overwrite:
-            _refuse_other_request(folder, request)
+            refuse_other(folder / RESULT, request, folder / JOURNAL)
         content = _measure(arguments, options, folder, request)
         for stale in {MAP} - set(names):
             (folder / stale).unlink(missing_ok=True)
@@ -136,47 +137,23 @@ def _names(options: LimitsOptions) -> list[str]:
     return [RESULT, TABLE, *limits_picture_names(options.criterion)]
 
 
-def _request(arguments: argparse.Namespace, options: LimitsOptions) -> str:
-    """Digest all that the answer depends on: the files' content, and the options."""
-    from amibayes.errors import DataError
-    from amibayes.parallel import digest
+def request(arguments: argparse.Namespace) -> str:
+    """Digest all that the answer depends on."""
+    return _request(arguments, _options(arguments))
 
-    files = [Path(p) for p in (*arguments.targets, *arguments.cal)]
-    try:
-        return digest(files, len(arguments.targets), options)
-    except OSError as error:
-        raise DataError(
-            f"cannot be read: {error.strerror or error}", source=error.filename
-        ) from error
+
+def _request(arguments: argparse.Namespace, options: LimitsOptions) -> str:
+    from amibayes.support.request import request_of
+
+    return request_of(arguments.targets, arguments.cal, options)
 
 
 def _finished(folder: Path, names: list[str], request: str) -> Any:
     """Give the content of a finished run of the same request; None where there is none."""
-    before = _read(folder / RESULT)
+    from amibayes.support.request import answers
+
     whole = all((folder / name).is_file() for name in names)
-    return before if whole and before.get("request") == request else None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    import json
-
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _refuse_other_request(folder: Path, request: str) -> None:
-    """Refuse to go on in a folder that holds the answer to something else, and no work on this."""
-    path = folder / RESULT
-    begun = (folder / JOURNAL / request).is_dir()
-    if path.is_file() and not begun and _read(path).get("request") != request:
-        raise UsageError(
-            "is the result of other data or options",
-            source=path,
-            remedy="give --overwrite or another --out",
-        )
+    return answers(folder / RESULT, request) if whole else None
 
 
 def _measure(

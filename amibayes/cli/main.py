@@ -10,6 +10,7 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
@@ -74,8 +75,8 @@ class Help(argparse.RawDescriptionHelpFormatter):
             self._action_max_length += self._indent_increment
 
 
-def build_parser(command: str | None) -> Parser:
-    """Build the parser of all commands; only the arguments of ``command`` are filled in."""
+def build_parser(*filled: str | None) -> Parser:
+    """Build the parser of all commands; only those named get their arguments."""
     parser = Parser(
         prog="amibayes",
         description="Bayesian inference for aperture masking interferometry.",
@@ -92,7 +93,7 @@ def build_parser(command: str | None) -> Parser:
             formatter_class=Help,
             allow_abbrev=False,
         )
-        if name == command:
+        if name in filled:
             importlib.import_module(f"amibayes.cli.{name}").add_arguments(child)
     return parser
 
@@ -130,8 +131,13 @@ def run_command(words: list[str]) -> int:
     command = next((word for word in words if word in COMMANDS), None)
     arguments = build_parser(command).parse_args(words, argparse.Namespace(words=words))
     run = importlib.import_module(f"amibayes.cli.{arguments.command}").run
+    begin = time.perf_counter()
     with output_locks():
-        return int(run(arguments))
+        status = int(run(arguments))
+    if getattr(arguments, "verbose", False):
+        took = time.perf_counter() - begin
+        print(f"amibayes: {command} took {took:.1f} s", file=sys.stderr)
+    return status
 
 
 def _report(error: Exception) -> int:

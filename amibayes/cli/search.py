@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
-from amibayes.errors import UsageError
 from amibayes.support.options import NULL_DRAWS, OBSERVABLES, EvidenceMethod, choices
 
 if TYPE_CHECKING:
+    from amibayes.parallel import Journals
     from amibayes.pipeline.options import SearchOptions
     from amibayes.pipeline.report_types import SearchReport
 
 RESULT, REPORT = "result.json", "report.html"
-CHAIN, CALIBRATED = "posterior.h5", "calibrated.oifits"
+CHAIN, CALIBRATED, JOURNAL = "posterior.h5", "calibrated.oifits", "search.journal"
 
 EXAMPLES = """examples:
   amibayes search target.oifits --cal cal*.oifits
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     stages.add_argument(
         "--resume",
         action="store_true",
-        help="go on with a posterior that was cut off; with --batch, leave finished targets",
+        help="go on with a run that was cut off; with --batch, leave finished targets",
     )
     common.add_seed_option(stages)
     common.add_parallel_options(parser)
@@ -92,19 +92,25 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     """Run the main job for one target and write its files, without a word."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
+    from amibayes.parallel import Journals
     from amibayes.support.atomic_files import output_folder
+    from amibayes.support.request import refuse_other
 
     options = _options(arguments)
     overwrite = arguments.overwrite or arguments.resume
     several = len(arguments.targets) > 1
     names = _names(options, calibrated=bool(arguments.cal), several=several)
     folder = output_folder(arguments.out, names, overwrite=overwrite)
+    asked = request(arguments)
     if arguments.resume and not arguments.overwrite:
-        _refuse_others(folder / RESULT, [*arguments.targets, *arguments.cal], options)
-    report = _search(arguments, options, folder)
+        refuse_other(folder / RESULT, asked, folder / JOURNAL)
+    journals = Journals(folder / JOURNAL, asked, resume=arguments.resume)
+    report = _search(arguments, options, folder, journals)
     for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
-    return report, folder, _write(arguments, report, folder)
+    content = _write(arguments, report, folder, asked)
+    journals.remove()
+    return report, folder, content
 
 
 def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[str]:
@@ -116,28 +122,16 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
     return [*names, CALIBRATED] if calibrated else names
 
 
-def _refuse_others(path: Path, inputs: list[str], options: SearchOptions) -> None:
-    """Refuse to go on in a folder whose result is that of other files or options."""
-    import json
+def request(arguments: argparse.Namespace) -> str:
+    """Digest all that the answer depends on."""
+    from amibayes.support.request import request_of
 
-    from amibayes.support.atomic_files import sha256
-
-    if not path.is_file():
-        return
-    try:
-        content = json.loads(path.read_text())
-        before = {entry["sha256"] for entry in content["inputs"]}, content["options"]
-    except (ValueError, KeyError, TypeError):
-        before = set(), {}
-    if before != ({sha256(p) for p in inputs if Path(p).is_file()}, options.to_json()):
-        raise UsageError(
-            "is the result of other data or options",
-            source=path,
-            remedy="give --overwrite or another --out",
-        )
+    return request_of(arguments.targets, arguments.cal, _options(arguments))
 
 
-def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path) -> SearchReport:
+def _search(
+    arguments: argparse.Namespace, options: SearchOptions, folder: Path, journals: Journals
+) -> SearchReport:
     from amibayes.pipeline.search import search_companion
 
     with (
@@ -150,6 +144,7 @@ def _search(arguments: argparse.Namespace, options: SearchOptions, folder: Path)
             options,
             chain=folder / CHAIN,
             resume=arguments.resume,
+            journals=journals,
             announce=progress.stage,
             progress=progress.update,
             executor=executor,
@@ -171,7 +166,9 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
     )
 
 
-def _write(arguments: argparse.Namespace, report: SearchReport, folder: Path) -> dict[str, object]:
+def _write(
+    arguments: argparse.Namespace, report: SearchReport, folder: Path, request: str
+) -> dict[str, object]:
     """Write everything but the chain; the result last, so that it stands for a whole run."""
     from amibayes.oifits import write_oifits
     from amibayes.plots.pictures import save_pictures
@@ -181,7 +178,7 @@ def _write(arguments: argparse.Namespace, report: SearchReport, folder: Path) ->
     if report.calibration is not None:
         write_oifits(folder / CALIBRATED, report.observables, overwrite=True)
     drawn = save_pictures(report, folder)
-    content = result_json(report)
+    content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
     write_page(folder / REPORT, search_page(content, figures, common.command_line(arguments)))
     write_json(folder / RESULT, content)

@@ -18,6 +18,7 @@ from amibayes.cli.common import (
     progress_of,
 )
 from amibayes.errors import UsageError
+from amibayes.support.terminal import shortened
 
 if TYPE_CHECKING:
     from amibayes.parallel import Executor, Journals, Progress
@@ -74,10 +75,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, Any]]:
     """Take and write the exposures; say what each one is."""
-    from amibayes.parallel import Journals, digest
+    from amibayes.parallel import Journals
     from amibayes.simulation.observe import ramp_path
     from amibayes.simulation.program import naming_source
     from amibayes.support.atomic_files import output_folder
+    from amibayes.support.request import digest
 
     names = [shot.file_name for shot in program.shots]
     names += [ramp_path(Path(n)).name for n in names if program.keeps_ramps]
@@ -148,4 +150,4 @@ def summary(done: list[dict[str, Any]]) -> list[str]:
         f"{entry['n_integrations']} integrations, {entry['total_photons']:.3g} photons"
         for entry in done
     ]
-    return lines if len(lines) <= 20 else [*lines[:19], f"and {len(lines) - 19} more"]
+    return shortened(lines)

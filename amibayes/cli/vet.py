@@ -94,5 +94,5 @@ def run(arguments: argparse.Namespace) -> int:
     content = vetting_json(vetting)
     save(vetting_picture(vetting), folder / PICTURE)
     write_json(folder / RESULT, content)
-    common.finish(arguments, content, lambda: [*vetting_table(vetting), f"written to {folder}"])
+    common.finish(arguments, content, lambda: vetting_table(vetting, [f"written to {folder}"]))
     return 0

@@ -15,7 +15,7 @@ from amibayes.parallel.job import (
     slices,
     spawn,
 )
-from amibayes.parallel.journal import Journal, Journals, digest
+from amibayes.parallel.journal import Journal, Journals
 from amibayes.parallel.processes import ProcessExecutor
 from amibayes.parallel.progress import Progress, StageBars, progress_bar, stage_bars
 
@@ -30,7 +30,6 @@ __all__ = [
     "SerialExecutor",
     "StageBars",
     "child_seeds",
-    "digest",
     "open_executor",
     "progress_bar",
     "run_job",

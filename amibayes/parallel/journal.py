@@ -6,21 +6,17 @@ everything that the job's answer depends on: a journal of other inputs is never 
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 import zipfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes import __version__
-from amibayes.support.atomic_files import atomic_path, cannot_write, sha256
+from amibayes.support.atomic_files import atomic_path, cannot_write
 
 Columns = dict[str, NDArray[Any]]
 """What a journalled piece returns: named arrays."""
@@ -34,7 +30,7 @@ class Journal:
     folder : path
         Where journals live; made if missing.
     key : str
-        Digest of the job's inputs (`digest`).
+        Digest of the job's inputs (`amibayes.support.request.digest`).
     resume : bool
         Keep the pieces that are there; otherwise start afresh.
 
@@ -108,62 +104,3 @@ def _forget(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.parent.rmdir()
-
-
-def digest(*inputs: Any) -> str:
-    """Hexadecimal digest of everything that a job's answer depends on.
-
-    Parameters
-    ----------
-    *inputs
-        Numbers, text, arrays, paths (the file's content counts, not its name), seeds,
-        frozen dataclasses, and lists, tuples and dictionaries of these. The version of
-        amibayes is always part of it.
-
-    Raises
-    ------
-    TypeError
-        For anything else, since a digest that misses an input would revive stale work.
-    """
-    running = hashlib.sha256(__version__.encode())
-    for item in inputs:
-        _feed(running, item)
-    return running.hexdigest()[:32]
-
-
-def _feed(running: Any, item: Any) -> None:
-    running.update(f"<{type(item).__name__}>".encode())
-    if isinstance(item, np.ndarray):
-        running.update(f"{item.dtype.str}{item.shape}".encode())
-        running.update(np.ascontiguousarray(item).tobytes())
-    elif isinstance(item, Path):
-        running.update(sha256(item).encode())
-    elif (parts := _parts(item)) is not None:
-        running.update(f"{len(parts)}".encode())
-        for part in parts:
-            _feed(running, part)
-    else:
-        running.update(_text(item).encode())
-
-
-def _parts(item: Any) -> list[Any] | None:
-    """Give the inputs that an input consists of; None for a single value."""
-    if is_dataclass(item) and not isinstance(item, type):
-        return [(field.name, getattr(item, field.name)) for field in fields(item)]
-    if isinstance(item, np.random.SeedSequence):
-        return [item.entropy, item.spawn_key, item.pool_size]
-    if isinstance(item, Mapping):
-        return sorted(item.items())
-    if isinstance(item, list | tuple):
-        return list(item)
-    return None
-
-
-def _text(item: Any) -> str:
-    if isinstance(item, np.generic):
-        item = item.item()
-    if isinstance(item, complex):
-        item = [item.real, item.imag]
-    if isinstance(item, bytes):
-        item = item.hex()
-    return json.dumps(item)

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from tqdm import tqdm
+
+
+def _tell(line: str) -> None:
+    """Write a line on standard error beside the bars."""
+    tqdm.write(line, file=sys.stderr)
+
 
 Progress = Callable[[int, int], None]
 """Called with (pieces done, pieces in all); the first call says where the run starts."""
@@ -42,15 +50,20 @@ def progress_bar(
 class StageBars:
     """One bar after the other, each for a stage; see `stage_bars`."""
 
-    def __init__(self, unit: str, scale: float, *, quiet: bool, leave: bool) -> None:
+    def __init__(
+        self, unit: str, scale: float, *, quiet: bool, leave: bool, verbose: bool = False
+    ) -> None:
         self._unit, self._scale, self._quiet, self._leave = unit, scale, quiet, leave
+        self._verbose, self._begun = verbose, 0.0
         self._name, self._counts = "", False
         self._bar: tqdm[None] | None = None
 
     def stage(self, name: str) -> None:
         """Begin a stage: its name, and a bar as soon as something is said of how far it is."""
-        self.close()
-        self._name, self._counts = name, False
+        self.end()
+        self._name, self._counts, self._begun = name, False, time.perf_counter()
+        if self._verbose:
+            _tell(f"amibayes: {name}")
         if not self._leave:
             self._bar = self._new(0, None, bar_format="{desc} …")
 
@@ -65,6 +78,13 @@ class StageBars:
         self._bar.update(now - self._bar.n)
         if grown:
             self._bar.refresh()
+
+    def end(self) -> None:
+        """End the stage, and tell how long it took where that is wanted."""
+        self.close()
+        if self._verbose and self._name:
+            _tell(f"amibayes: {self._name}: {time.perf_counter() - self._begun:.1f} s")
+        self._name = ""
 
     def close(self) -> None:
         """End the bar."""
@@ -87,11 +107,26 @@ class StageBars:
 
 @contextmanager
 def stage_bars(
-    *, unit: str = "piece", scale: float = 1.0, quiet: bool = False, leave: bool = False
+    *,
+    unit: str = "piece",
+    scale: float = 1.0,
+    quiet: bool = False,
+    leave: bool = False,
+    verbose: bool = False,
 ) -> Iterator[StageBars]:
-    """Draw the bars of a job of several stages; ``leave`` keeps each when it is done."""
-    bars = StageBars(unit, scale, quiet=quiet, leave=leave)
+    """Draw the bars of a job of several stages.
+
+    Parameters
+    ----------
+    unit, scale, quiet
+        As for `progress_bar`.
+    leave : bool
+        Keep each bar when its stage is done.
+    verbose : bool
+        Tell each stage as it begins, and its seconds as it ends, on standard error.
+    """
+    bars = StageBars(unit, scale, quiet=quiet, leave=leave, verbose=verbose)
     try:
         yield bars
     finally:
-        bars.close()
+        bars.end()

@@ -21,9 +21,10 @@ from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm
+from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.prepare import Clock, Prepared, Stage, prepare
-from amibayes.pipeline.search import search_field
+from amibayes.pipeline.prepare import Prepared, prepare
+from amibayes.pipeline.run import Announce, Run, silent
 from amibayes.pipeline.warnings import search_cautions
 from amibayes.support.options import (
     LIMITS_NULL_DRAWS,
@@ -110,23 +111,13 @@ class LimitsReport:
         return self.limits[0]
 
 
-@dataclass(frozen=True)
-class _Where:
-    """Where the work is done, and who is told."""
-
-    executor: Executor | None
-    journals: Journals | None
-    progress: Progress | None
-    clock: Clock
-
-
 def measure_limits(
     targets: Sequence[str | Path],
     calibrators: Sequence[str | Path] = (),
     options: LimitsOptions | None = None,
     *,
     journals: Journals | None = None,
-    announce: Stage = lambda name: None,
+    announce: Announce = silent,
     progress: Progress | None = None,
     executor: Executor | None = None,
 ) -> LimitsReport:
@@ -152,13 +143,13 @@ def measure_limits(
     options = options or LimitsOptions()
     _refuse(options)
     seeds = np.random.SeedSequence(options.search.seed).spawn(5 + len(KINDS))
-    where = _Where(executor, journals, progress, Clock(announce))
+    run = Run(announce, progress, executor, journals)
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
         # The fourth stream, as in the main job: the same calibration for the same seed.
         rng = np.random.default_rng(seeds[3])
-        ready = prepare(targets, calibrators, options.search, rng, where.clock)
-        limits, cautions = _all_limits(ready, options, seeds[5:], where)
+        ready = prepare(targets, calibrators, options.search, rng, run)
+        limits, cautions = _all_limits(ready, options, seeds[5:], run)
     return LimitsReport(
         options,
         tuple(str(p) for p in targets),
@@ -166,8 +157,8 @@ def measure_limits(
         ready.observables,
         ready.calibration,
         limits,
-        (*ready.cautions, *cautions),
-        where.clock.seconds,
+        (*ready.warnings, *cautions),
+        run.seconds,
     )
 
 
@@ -187,25 +178,25 @@ def _all_limits(
     ready: Prepared,
     options: LimitsOptions,
     seeds: Sequence[np.random.SeedSequence],
-    where: _Where,
+    run: Run,
 ) -> tuple[tuple[MeasuredLimit, ...], list[str]]:
     """Measure the main limit, then the others over the field and with the disc of the main one."""
     limits: list[MeasuredLimit] = []
-    said: list[str] = []
+    warnings: list[str] = []
     for kinds, seed in zip(_kinds(ready.observables, options), seeds, strict=False):
         search = replace(options.search, observables=kinds)
         if limits:
             search = _alike(search, limits[0].result)
         try:
-            limit, cautions = _one_limit(ready.observables, search, options, seed, where)
+            limit, cautions = _one_limit(ready.observables, search, options, seed, run)
         except DataError as error:
             if not limits:
                 raise
-            said.append(f"no limit from {' + '.join(kinds)} alone: {error.what}")
+            warnings.append(f"no limit from {' + '.join(kinds)} alone: {error.what}")
             continue
         limits.append(limit)
-        said += cautions if len(limits) == 1 else []
-    return tuple(limits), said
+        warnings += cautions if len(limits) == 1 else []
+    return tuple(limits), warnings
 
 
 def _kinds(data: Observables, options: LimitsOptions) -> list[Kinds]:
@@ -235,47 +226,47 @@ def _one_limit(
     search: SearchOptions,
     options: LimitsOptions,
     seed: np.random.SeedSequence,
-    where: _Where,
+    run: Run,
 ) -> tuple[MeasuredLimit, list[str]]:
     name = NAMES[search.observables]
-    journals = where.journals.under("-".join(search.observables)) if where.journals else None
+    run = run.under("-".join(search.observables))
     streams = [np.random.default_rng(k) for k in seed.spawn(2)]
-    with where.clock.stage(f"search {name}"):
-        result, noise, widened = search_field(data, search)
-    weight = None
+    with run.stage(f"search {name}"):
+        found = search_field(data, search)
+    tested = None
     if search.null_draws:
-        with where.clock.stage(f"null searches {name}"):
-            journal = journals.of("null") if journals else None
-            weight = false_alarm(
-                result, search, streams[0], where.executor, where.progress, journal=journal
-            )
-    with where.clock.stage(f"limits {name}"):
-        limit = _limit(result, weight, options, streams[1], journals, where)
-    measured = MeasuredLimit(search.observables, result, noise, weight, limit)
-    return measured, [*widened, *search_cautions(data, result, noise, weight, None)]
+        with run.stage(f"null searches {name}"):
+            tested = false_alarm(
+                found.result, search, streams[0], run.executor, run.progress,
+                journal=run.journal("null"),
+            )  # fmt: skip
+    with run.stage(f"limits {name}"):
+        limit = _limit(found.result, tested, options, streams[1], run)
+    measured = MeasuredLimit(search.observables, found.result, found.noise, tested, limit)
+    cautions = search_cautions(data, found.result, found.noise, tested, None)
+    return measured, [*found.warnings, *cautions]
 
 
 def _limit(
     result: SearchResult,
-    weight: Significance | None,
+    tested: Significance | None,
     options: LimitsOptions,
     rng: np.random.Generator,
-    journals: Journals | None,
-    where: _Where,
+    run: Run,
 ) -> Limit:
     if options.criterion != "injection":
-        remove = weight is not None and bool(weight.detected)
+        remove = tested is not None and bool(tested.detected)
         return analytic_limit(
             result, options.criterion, n_separations=options.n_separations, remove=remove
         )
-    assert weight is not None
+    assert tested is not None
     return detection_limit(
         result,
-        weight,
+        tested,
         rng,
         n_separations=options.n_separations,
         trials_per_cell=options.trials_per_cell,
-        executor=where.executor,
-        progress=where.progress,
-        journals=journals,
+        executor=run.executor,
+        progress=run.progress,
+        journals=run.journals,
     )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,31 +20,14 @@ from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import check_together, read_observations
 from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
 from amibayes.pipeline.warnings import calibration_cautions, vetting_cautions
-
-Stage = Callable[[str], None]
 
 MIN_TO_VET = 3
 """Of two calibrators that disagree nothing says which is the bad one."""
 
 VETTING_DRAWS = 1000
-
-
-class Clock:
-    """Times the stages and announces them."""
-
-    def __init__(self, announce: Stage) -> None:
-        self.seconds: dict[str, float] = {}
-        self._announce = announce
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Announce a stage and time it."""
-        self._announce(name)
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +42,14 @@ class Prepared:
         Each calibrator as read.
     calibration : Calibration, optional
     vetting : Vetting, optional
-    cautions : tuple of str
+    warnings : tuple of str
     """
 
     observables: Observables
     references: tuple[Observables, ...] = ()
     calibration: Calibration | None = None
     vetting: Vetting | None = None
-    cautions: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def prepare(
@@ -76,7 +57,7 @@ def prepare(
     calibrators: Sequence[str | Path],
     options: SearchOptions,
     rng: np.random.Generator,
-    clock: Clock,
+    run: Run,
 ) -> Prepared:
     """Read every file, vet the calibrators and calibrate all targets together.
 
@@ -90,7 +71,7 @@ def prepare(
     if not targets:
         raise UsageError("no target given", remedy="name at least one file")
     together = check_together(targets, calibrators)
-    with clock.stage("read"):
+    with run.stage("read"):
         parts = read(targets, options)
         references = read(calibrators, options, one_star=False)
     parts = in_order(parts)
@@ -100,9 +81,9 @@ def prepare(
         *unused(parts, options.observables),
         *different_targets(parts),
     )
-    vetting, calibration, observables = _calibrated(parts, references, options, rng, clock)
-    cautions = (*vetting_cautions(vetting), *calibration_cautions(calibration), *joined)
-    return Prepared(observables, tuple(references), calibration, vetting, cautions)
+    vetting, calibration, observables = _calibrated(parts, references, options, rng, run)
+    warnings = (*vetting_cautions(vetting), *calibration_cautions(calibration), *joined)
+    return Prepared(observables, tuple(references), calibration, vetting, warnings)
 
 
 def read(
@@ -135,16 +116,16 @@ def _calibrated(
     references: list[Observables],
     options: SearchOptions,
     rng: np.random.Generator,
-    clock: Clock,
+    run: Run,
 ) -> tuple[Vetting | None, Calibration | None, Observables]:
     """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
     if not references:
         return None, None, join(parts)
-    vetting, believed = None, references
+    vetting, serving = None, references
     diameters = diameters_of(options.calibrator_diameters, references)
     sizes = diameters or [(0.0, 0.0)] * len(references)
     if len(references) >= MIN_TO_VET and not options.keep_all:
-        with clock.stage("vet"):
+        with run.stage("vet"):
             vetting = vet(
                 [without_disc(r, size) for r, (size, _) in zip(references, sizes, strict=True)],
                 separation_mas=options.separation_mas,
@@ -153,12 +134,12 @@ def _calibrated(
                 fewest=MIN_TO_VET,
                 seed=options.seed,
             )
-            believed = _believed(references, vetting)
-    kept = {id(reference) for reference in believed}
-    with clock.stage("calibrate"):
+            serving = _kept(references, vetting)
+    kept = {id(reference) for reference in serving}
+    with run.stage("calibrate"):
         calibration = calibrate(
             parts,
-            believed,
+            serving,
             method=options.calibration,
             clip=options.clip,
             diameters_mas=[d for r, d in zip(references, sizes, strict=True) if id(r) in kept],
@@ -167,7 +148,7 @@ def _calibrated(
     return vetting, calibration, calibration.observables
 
 
-def _believed(references: list[Observables], vetting: Vetting) -> list[Observables]:
+def _kept(references: list[Observables], vetting: Vetting) -> list[Observables]:
     """The calibrators that vetting kept.
 
     Raises

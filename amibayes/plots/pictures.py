@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from matplotlib.figure import Figure
 
 from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import resolution_mas
-from amibayes.detection.false_alarm import Significance
 from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport
 from amibayes.pipeline.options import SearchOptions
@@ -37,63 +37,128 @@ from amibayes.support.atomic_files import short_names
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
 MAPS = "maps.fits"
+"""The numbers of the maps, beside the pictures."""
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What a run holds, known before it begins: which pictures there will be.
+
+    Parameters
+    ----------
+    several : bool
+        Whether several files are fitted together.
+    calibrated : bool
+        Whether calibrators were given.
+    significance, posterior, limits : bool
+        Whether these stages are run.
+    """
+
+    several: bool = False
+    calibrated: bool = False
+    significance: bool = False
+    posterior: bool = False
+    limits: bool = False
+
+    @classmethod
+    def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Stages:
+        """Those of a run that has yet to begin."""
+        tested = options.null_draws > 0
+        limits = options.limits and tested
+        return cls(several, calibrated, tested, options.posterior, limits)
+
+    @classmethod
+    def of(cls, report: SearchReport) -> Stages:
+        """Those of a run that has ended."""
+        return cls(
+            len(report.targets) > 1,
+            report.calibration is not None,
+            report.significance is not None,
+            report.posterior is not None,
+            report.limits is not None,
+        )
+
+
+def always(run: Stages) -> bool:
+    """Hold for every run."""
+    return True
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report, and all that is known of it.
+
+    Parameters
+    ----------
+    name : str
+        Of its file, without the ending.
+    title : str
+        What it shows, in a few words.
+    text : str
+        What it shows, for those who cannot see it.
+    section : str
+        Of the report, a key of `amibayes.report.search_page.SECTIONS`.
+    draw : callable
+        Draws it of a `SearchReport`.
+    when : callable
+        Tells from the `Stages` of a run whether it is drawn.
+    """
+
+    name: str
+    title: str
+    text: str
+    section: str
+    draw: Callable[[SearchReport], Figure]
+    when: Callable[[Stages], bool] = always
+
+    @property
+    def file(self) -> str:
+        """Name of its file."""
+        return f"{self.name}.png"
 
 
 def picture_names(options: SearchOptions, *, calibrated: bool, several: bool = False) -> list[str]:
     """List the files that `save_pictures` will write for a job."""
-    names = ["map.png", "nsigma.png", "fit.png", "coverage.png", "correlation.png", MAPS]
-    names += ["null.png", "false_alarm.png"] if options.null_draws else []
-    names += ["corner.png", "chains.png"] if options.posterior else []
-    names += ["limits.png", "completeness.png"] if options.limits and options.null_draws else []
-    names += ["files.png"] if several else []
-    return names + (["calibrators.png"] if calibrated else [])
+    run = Stages.asked(options, calibrated=calibrated, several=several)
+    return [*(p.file for p in PICTURES if p.when(run)), MAPS]
 
 
 def save_pictures(report: SearchReport, folder: Path) -> list[Path]:
     """Draw every picture of a report into a folder."""
     drawn = []
-    for name, draw in pictures(report).items():
-        save(draw(), folder / name)
-        drawn.append(folder / name)
+    for picture in pictures_of(report):
+        save(picture.draw(report), folder / picture.file)
+        drawn.append(folder / picture.file)
     save_maps_fits(folder / MAPS, report.result, _probabilities(report))
     return drawn
 
 
+def pictures_of(report: SearchReport) -> list[Picture]:
+    """List the pictures that a report has."""
+    run = Stages.of(report)
+    return [picture for picture in PICTURES if picture.when(run)]
+
+
 def _probabilities(report: SearchReport) -> dict[str, FloatArray]:
     """False-alarm probabilities per position, by the name of their FITS extension."""
-    weight = report.significance
-    if weight is None or weight.field is None:
+    found = report.significance
+    if found is None or found.field is None:
         return {}
-    return {f"FAP_{name}": p for name, p in probability_maps(weight).items()}
+    return {f"FAP_{name}": p for name, p in probability_maps(found).items()}
 
 
-def pictures(report: SearchReport) -> dict[str, Callable[[], Figure]]:
-    """Name the pictures of a report and the functions that draw them."""
-    result = report.result
-    out: dict[str, Callable[[], Figure]] = {
-        "map.png": lambda: detection_map(result, quantity="delta_chi2", contrast="positive"),
-        "nsigma.png": lambda: sky_map(
-            result, local_n_sigma(result), "CANDID nσ of the best companion at each position (σ)"
-        ),
-        "fit.png": lambda: fit_plot(result),
-        "coverage.png": lambda: coverage_plot(result.likelihood.observables),
-        "correlation.png": lambda: correlation_plot(result.likelihood.observables),
-    }
-    if len(report.targets) > 1:
-        out["files.png"] = lambda: file_residuals_plot(file_residuals(result))
-    if report.calibration is not None:
-        out["calibrators.png"] = lambda: _calibrators(report)
-    weight = report.significance
-    if weight is not None:
-        out["null.png"] = lambda: _null(weight)
-        out["false_alarm.png"] = lambda: false_alarm_map(result, weight)
-    if report.posterior is not None:
-        out["corner.png"] = lambda: _corner(report)
-        out["chains.png"] = lambda: _chains(report)
-    if report.limits is not None:
-        out["limits.png"] = lambda: _limits(report)
-        out["completeness.png"] = lambda: _completeness(report)
-    return out
+def _map(report: SearchReport) -> Figure:
+    return detection_map(report.result, quantity="delta_chi2", contrast="positive")
+
+
+def _nsigma(report: SearchReport) -> Figure:
+    label = "CANDID nσ of the best companion at each position (σ)"
+    return sky_map(report.result, local_n_sigma(report.result), label)
+
+
+def _false_alarm(report: SearchReport) -> Figure:
+    assert report.significance is not None
+    return false_alarm_map(report.result, report.significance)
 
 
 def _calibrators(report: SearchReport) -> Figure:
@@ -101,7 +166,9 @@ def _calibrators(report: SearchReport) -> Figure:
     return calibrator_plot(report.references, kept, short_names(report.calibrators))
 
 
-def _null(weight: Significance) -> Figure:
+def _null(report: SearchReport) -> Figure:
+    weight = report.significance
+    assert weight is not None
     label = (
         "Largest 2Δln L anywhere in the field, scale of the noise free"
         if weight.test is not None and weight.test.label != "Δχ²"
@@ -157,6 +224,118 @@ def _limits(report: SearchReport) -> Figure:
 def _completeness(report: SearchReport) -> Figure:
     assert report.limits is not None
     return completeness_picture(report.limits)
+
+
+PICTURES = (
+    Picture(
+        "map",
+        "Detection map",
+        "Improvement of the fit by a companion at every position of the field, north up and "
+        "east left, with the best position and the other local maxima marked.",
+        "search",
+        _map,
+    ),
+    Picture(
+        "fit",
+        "Data and model",
+        "Squared visibilities and closure phases with their errors, the best binary model, "
+        "and the residuals in units of the errors.",
+        "search",
+        lambda report: fit_plot(report.result),
+    ),
+    Picture(
+        "files",
+        "Residuals of each file",
+        "Reduced χ² of the V² and of the closure phases of each file under the joint fit, "
+        "with the companion and without.",
+        "search",
+        lambda report: file_residuals_plot(file_residuals(report.result)),
+        lambda run: run.several,
+    ),
+    Picture(
+        "coverage",
+        "Coverage",
+        "Spatial frequencies that the data sample; they set which positions can be told apart.",
+        "data",
+        lambda report: coverage_plot(report.result.likelihood.observables),
+    ),
+    Picture(
+        "correlation",
+        "Correlations",
+        "Correlation of every pair of data, as the fit uses them.",
+        "data",
+        lambda report: correlation_plot(report.result.likelihood.observables),
+    ),
+    Picture(
+        "calibrators",
+        "Calibrators",
+        "Squared visibilities and closure phases of every calibrator beside each other, those "
+        "that were dropped marked.",
+        "data",
+        _calibrators,
+        lambda run: run.calibrated,
+    ),
+    Picture(
+        "null",
+        "Null distribution",
+        "Best statistic of each simulated data set without a companion, the threshold of a "
+        "detection, and the value of the data.",
+        "significance",
+        _null,
+        lambda run: run.significance,
+    ),
+    Picture(
+        "false_alarm",
+        "False-alarm probability",
+        "Probability that noise alone gives as good a companion at each position, and "
+        "anywhere in the field.",
+        "significance",
+        _false_alarm,
+        lambda run: run.significance,
+    ),
+    Picture(
+        "nsigma",
+        "CANDID's nσ",
+        "CANDID's number of sigma of the best companion at every position; it is not a "
+        "false-alarm rate.",
+        "significance",
+        _nsigma,
+    ),
+    Picture(
+        "corner",
+        "Posterior",
+        "Marginal distributions of every parameter and of every pair, with the best fit marked.",
+        "posterior",
+        _corner,
+        lambda run: run.posterior,
+    ),
+    Picture(
+        "chains",
+        "Chains",
+        "Every walker's path through every parameter, with the part that was thrown away.",
+        "posterior",
+        _chains,
+        lambda run: run.posterior,
+    ),
+    Picture(
+        "limits",
+        "Detection limits",
+        "Magnitude difference at which an injected companion is recovered, against separation.",
+        "limits",
+        _limits,
+        lambda run: run.limits,
+    ),
+    Picture(
+        "completeness",
+        "Completeness",
+        "Share of injected companions that the search recovers, for each separation and "
+        "magnitude difference.",
+        "limits",
+        _completeness,
+        lambda run: run.limits,
+    ),
+)
+"""The pictures of a search, in the order of the report: a new one is one more line here."""
 
 
 def completeness_picture(limits: Limit) -> Figure:

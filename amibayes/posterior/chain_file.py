@@ -2,40 +2,16 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
 from pathlib import Path
 
 import emcee
 import h5py
 
-from amibayes import __version__
 from amibayes.errors import DataError
-from amibayes.likelihood.likelihood import Likelihood
-from amibayes.posterior.priors import Prior
 from amibayes.support.atomic_files import atomic_path
-from amibayes.units import FloatArray
 
 GROUP = "mcmc"
 """Name of the HDF5 group, as emcee's own backend has it."""
-
-
-def digest_of(
-    likelihood: Likelihood,
-    prior: Prior,
-    start: FloatArray,
-    seed: int,
-    region: FloatArray,
-    *,
-    leaps: bool,
-) -> str:
-    """Say in short which data, noise, model, prior, start, region and moves a chain belongs to."""
-    noise = likelihood.noise
-    # The noise in numbers: another covariance or average is another chain.
-    kind = (type(noise).__name__, noise.parameters, noise.degrees, noise.log_norm)
-    versions = __version__, emcee.__version__
-    text = repr((kind, likelihood.model, prior, seed, leaps, versions)).encode()
-    arrays = likelihood.observables.data, noise.covariance.variance, start, region
-    return sha256(text + b"".join(a.tobytes() for a in arrays)).hexdigest()
 
 
 def save_chain(sampler: emcee.EnsembleSampler, path: str | Path, digest: str) -> None:

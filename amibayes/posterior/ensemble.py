@@ -23,10 +23,11 @@ from amibayes.companion_search.search import resolution_mas
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.posterior.chain_file import digest_of, load_chain, save_chain
+from amibayes.posterior.chain_file import load_chain, save_chain
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.priors import Prior
+from amibayes.support import request
 from amibayes.support.ensemble_moves import along_others
 from amibayes.units import (
     BoolArray,
@@ -364,12 +365,16 @@ def sample(
     likelihood, region = result.likelihood, Region.of(result)
     start = _start(result, prior, region, rng)
     seed = int(rng.integers(2**32))
-    digest = digest_of(likelihood, prior, start, seed, region.places, leaps=grid is not None)
+    log_prob = _log_posterior(likelihood, prior, region)
+    # All of data, covariance, noise and model are in the values at the start.
+    digest = request.digest(
+        start, log_prob(start), prior, seed, region.places, grid is not None, emcee.__version__
+    )
     backend = load_chain(path, digest) if path and resume else None
     sampler = emcee.EnsembleSampler(
         len(start),
         start.shape[1],
-        _log_posterior(likelihood, prior, region),
+        log_prob,
         vectorize=True,
         moves=_moves(grid, region),
         backend=backend,

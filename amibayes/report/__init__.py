@@ -1,6 +1,5 @@
 """What a run says: ``result.json``, ``limits.json``, summaries, and ``report.html``."""
 
-from amibayes.report.captions import captioned
 from amibayes.report.common import Json, number
 from amibayes.report.limits import (
     limits_json,
@@ -11,7 +10,7 @@ from amibayes.report.limits import (
 )
 from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table, write_page
 from amibayes.report.result import result_json
-from amibayes.report.search_page import search_page
+from amibayes.report.search_page import captioned, search_page
 from amibayes.report.summary import summary
 
 __all__ = [

@@ -7,7 +7,7 @@ from typing import Any
 from amibayes.detection.tails import MIN_PROBABILITY
 from amibayes.models.bands import band_name
 from amibayes.report.joint_sections import joint_tables
-from amibayes.report.page import Column, Fact, Figure, Section, Table
+from amibayes.report.page import Column, Fact, Section, Table
 from amibayes.report.statement import false_alarm, field
 from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
 
@@ -31,7 +31,7 @@ OPEN_DEG = 270.0
 """An interval of position angles wider than this leaves every direction open."""
 
 
-def search(content: Json, figures: tuple[Figure, ...]) -> Section:
+def search(content: Json) -> Section:
     """The best fit, χ² and the other local maxima."""
     fit = content["fit"]
     text = (
@@ -44,7 +44,6 @@ def search(content: Json, figures: tuple[Figure, ...]) -> Section:
         "Search",
         text,
         tables=(_fit(fit), *joint_tables(content), *_modes(content)),
-        figures=figures,
     )
 
 
@@ -85,7 +84,7 @@ def _modes(content: Json) -> tuple[Table, ...]:
     return (Table(caption, tuple(Column(c) for c in columns), rows),)
 
 
-def significance(content: Json, figures: tuple[Figure, ...]) -> Section:
+def significance(content: Json) -> Section:
     """Every number of significance, with what it means and what it does not."""
     s = content["significance"]
     facts = [_false_alarm(s), *_extrapolated(s), _local(content)]
@@ -113,7 +112,7 @@ def significance(content: Json, figures: tuple[Figure, ...]) -> Section:
             "for comparison with other papers. It is not a false-alarm rate.",
         ),
     ]
-    return Section("Significance", facts=tuple(facts), figures=figures)
+    return Section("Significance", facts=tuple(facts))
 
 
 def _false_alarm(s: Json) -> Fact:
@@ -161,7 +160,7 @@ def _local(content: Json) -> Fact:
     )
 
 
-def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
+def posterior(content: Json) -> Section | None:
     """Medians and intervals, and whether the chain has converged."""
     p = content["posterior"]
     if p is None:
@@ -182,9 +181,7 @@ def posterior(content: Json, figures: tuple[Figure, ...]) -> Section | None:
             "No companion was detected: these are the places and contrasts that the data leave to "
             "one, if there is one, and not a measurement.",
         )
-    return Section(
-        "Posterior", tuple(text), tables=(_intervals(p, content["fit"]),), figures=figures
-    )
+    return Section("Posterior", tuple(text), tables=(_intervals(p, content["fit"]),))
 
 
 def _intervals(p: Json, fit: Json) -> Table:
@@ -279,7 +276,7 @@ def _two(e: Json) -> tuple[Table, ...]:
     return (Table(caption, columns, rows),)
 
 
-def limits(content: Json, figures: tuple[Figure, ...]) -> Section | None:
+def limits(content: Json) -> Section | None:
     """What could have been seen."""
     found = content["limits"]
     if found is None:
@@ -308,4 +305,4 @@ def limits(content: Json, figures: tuple[Figure, ...]) -> Section | None:
         Column("Δmag, 50 % recovered"),
     )
     table = Table("Limit at each separation", columns, rows)
-    return Section("Detection limits", text, tables=(table,), figures=figures)
+    return Section("Detection limits", text, tables=(table,))

@@ -13,6 +13,7 @@ from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
 from amibayes.support.atomic_files import atomic_path
+from amibayes.support.terminal import row, with_warnings
 from amibayes.units import contrast_to_delta_mag
 
 
@@ -131,12 +132,7 @@ def limits_summary(content: Json, folder: Path) -> list[str]:
         *(_curve_line(curve) for curve in content["curves"]),
         *_marked_lines(content),
     ]
-    room = 19 - len(lines)
-    said = content["warnings"]
-    lines += [f"WARNING     {text}" for text in said[:room]]
-    if len(said) > room:
-        lines[-1] = f"WARNING     {len(said) - room + 1} more warnings in limits.json"
-    return [*lines, f"written to  {folder}"]
+    return with_warnings(lines, content["warnings"], row("written to", str(folder)), "limits.json")
 
 
 def _rate_lines(content: Json) -> list[str]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import re
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -83,6 +82,8 @@ class Figure:
         The PNG itself as a ``data:`` address.
     width, height : int
         Pixels.
+    section : str
+        Of the page, where the page sorts its pictures.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Figure:
     uri: str
     width: int
     height: int
+    section: str = ""
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ def write_page(path: str | Path, page: Page) -> None:
     write_text(path, page_html(page))
 
 
-def read_figure(path: str | Path, title: str, alt: str) -> Figure:
+def read_figure(path: str | Path, title: str, alt: str, section: str = "") -> Figure:
     """Take a PNG into a page.
 
     Raises
@@ -221,10 +223,4 @@ def read_figure(path: str | Path, title: str, alt: str) -> Figure:
         raise DataError("is no PNG", source=path)
     width, height = struct.unpack(">II", content[16:24])
     uri = "data:image/png;base64," + base64.b64encode(content).decode("ascii")
-    return Figure(Path(path).stem, title, alt, uri, width, height)
-
-
-def figures_named(figures: Sequence[Figure], *names: str) -> tuple[Figure, ...]:
-    """Those of the figures that have one of the names, in the order of the names."""
-    known = {figure.name: figure for figure in figures}
-    return tuple(known[name] for name in names if name in known)
+    return Figure(Path(path).stem, title, alt, uri, width, height, section)

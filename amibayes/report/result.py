@@ -40,12 +40,20 @@ QUANTITIES = (
 )
 
 
-def result_json(report: SearchReport) -> Json:
-    """Build the content of ``result.json``, whose keys scripts rely on."""
+def result_json(report: SearchReport, request: str = "") -> Json:
+    """Build the content of ``result.json``, whose keys scripts rely on.
+
+    Parameters
+    ----------
+    report : SearchReport
+    request : str
+        Digest of what was asked, for a run that is resumed.
+    """
     result = report.result
     return {
         "amibayes": __version__,
         "seed": report.options.seed,
+        "request": request,
         "options": report.options.to_json(),
         "inputs": inputs_json(report.targets, report.calibrators),
         "data": data_json(report.result),

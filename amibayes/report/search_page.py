@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from amibayes.plots.pictures import PICTURES
 from amibayes.report import fit_sections
 from amibayes.report.noise_section import noise
 from amibayes.report.page import (
@@ -17,7 +19,7 @@ from amibayes.report.page import (
     Page,
     Section,
     Table,
-    figures_named,
+    read_figure,
 )
 from amibayes.report.statement import false_alarm, field, sky_of, statement_of
 from amibayes.report.words import chance, count, fixed, measured, plain, sentence
@@ -30,23 +32,6 @@ COVARIANCE = {
     "given": "all correlations as the files give them",
     "estimated": "all correlations as estimated from the data",
 }
-
-PLACED = {
-    "map": "search",
-    "null": "significance",
-    "false_alarm": "significance",
-    "nsigma": "significance",
-    "fit": "search",
-    "files": "search",
-    "coverage": "data",
-    "correlation": "data",
-    "calibrators": "data",
-    "corner": "posterior",
-    "chains": "posterior",
-    "limits": "limits",
-    "completeness": "limits",
-}
-"""The section of each picture; one that is not named here stands at the end."""
 
 
 def search_page(content: Json, figures: Sequence[Figure] = (), command: str = "") -> Page:
@@ -63,16 +48,11 @@ def search_page(content: Json, figures: Sequence[Figure] = (), command: str = ""
     names = content["data"].get("targets") or [
         Path(i["path"]).name for i in content["inputs"] if i["role"] == "target"
     ]
+    found = {name: write(content) for name, write in SECTIONS.items()}
     sections = [
-        _data(content, _placed(figures, "data")),
-        fit_sections.search(content, _placed(figures, "search")),
-        noise(content),
-        fit_sections.significance(content, _placed(figures, "significance")),
-        fit_sections.posterior(content, _placed(figures, "posterior")),
-        fit_sections.evidence(content),
-        fit_sections.limits(content, _placed(figures, "limits")),
-        _others(figures),
-        _again(content, command),
+        replace(section, figures=tuple(f for f in figures if f.section == name))
+        for name, section in found.items()
+        if section is not None
     ]
     return Page(
         "amibayes search",
@@ -80,19 +60,37 @@ def search_page(content: Json, figures: Sequence[Figure] = (), command: str = ""
         _subtitle(content),
         statement_of(content),
         _tiles(content),
-        tuple(s for s in sections if s is not None),
+        (*sections, *_others(figures), _again(content, command)),
         sky_of(content),
         tuple(sentence(w) for w in content["warnings"]),
     )
 
 
-def _placed(figures: Sequence[Figure], section: str) -> tuple[Figure, ...]:
-    return figures_named(figures, *(name for name, where in PLACED.items() if where == section))
+def captioned(folder: str | Path, names: Sequence[str]) -> list[Figure]:
+    """Take the PNG files among ``names`` into figures; an unknown one is titled by its name.
+
+    Parameters
+    ----------
+    folder : path
+    names : sequence of str
+        File names; those that are no PNG are left out.
+    """
+    known = {picture.file: picture for picture in PICTURES}
+    figures = []
+    for name in names:
+        if not name.endswith(".png"):
+            continue
+        title = Path(name).stem.replace("_", " ").replace("-", " ").capitalize()
+        told = (title, f"Picture {name}.", "")
+        if name in known:
+            told = known[name].title, known[name].text, known[name].section
+        figures.append(read_figure(Path(folder) / name, *told))
+    return figures
 
 
-def _others(figures: Sequence[Figure]) -> Section | None:
-    left = tuple(figure for figure in figures if figure.name not in PLACED)
-    return Section("More pictures", figures=left) if left else None
+def _others(figures: Sequence[Figure]) -> list[Section]:
+    left = tuple(figure for figure in figures if figure.section not in SECTIONS)
+    return [Section("More pictures", figures=left)] if left else []
 
 
 def _subtitle(content: Json) -> str:
@@ -143,7 +141,7 @@ def _excluded(content: Json) -> Iterator[Fact]:
         )
 
 
-def _data(content: Json, figures: tuple[Figure, ...]) -> Section:
+def _data(content: Json) -> Section:
     data = content["data"]
     text = [
         f"{count(data['n_vis2'], 'squared visibility', 'squared visibilities')} and "
@@ -162,7 +160,6 @@ def _data(content: Json, figures: tuple[Figure, ...]) -> Section:
         "Data and calibration",
         tuple(text),
         tables=tuple(tables),
-        figures=figures,
     )
 
 
@@ -213,6 +210,22 @@ def _calibrators(calibration: Json) -> Table:
         "differ from them at least as much"
     )
     return Table(caption, columns, rows)
+
+
+SECTIONS: dict[str, Callable[[Json], Section | None]] = {
+    "data": _data,
+    "search": fit_sections.search,
+    "noise": noise,
+    "significance": fit_sections.significance,
+    "posterior": fit_sections.posterior,
+    "evidence": fit_sections.evidence,
+    "limits": fit_sections.limits,
+}
+"""The sections of the report in their order, by the name that `Picture.section` gives.
+
+A function makes a section of the content of ``result.json``, or None where there is nothing
+to tell; its pictures are put in afterwards. A new section is one more line.
+"""
 
 
 def _again(content: Json, command: str) -> Section:

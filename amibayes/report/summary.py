@@ -15,13 +15,14 @@ from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.result import upper_limit
+from amibayes.support.terminal import row, with_warnings
 
 EVEN = 0.5
-"""Probability that the stated errors are right above which nothing is said of extra noise."""
+"""Probability that the stated errors are correct, above which extra noise is left out."""
 
 
 def summary(report: SearchReport, folder: Path) -> list[str]:
-    """Say the result in at most 20 lines."""
+    """Write the result in at most 20 lines."""
     result, c = report.result, report.result.companion
     used = result.likelihood.observables
     lines = [
@@ -40,7 +41,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
         f"({result.ndof} dof: reduced {result.chi2_single / result.ndof:.3f} -> "
         f"{result.chi2_binary / result.ndof:.3f})",
-        f"strength    delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
+        f"detection   delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
     lines += [*joint_lines(report), *_nuisance_lines(result)]
@@ -53,19 +54,15 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         lines += _second_lines(report, report.evidence)
     if report.limits is not None:
         lines += _limit_lines(report.limits)
-    room = 19 - len(lines)
-    lines += [f"WARNING     {text}" for text in report.warnings[:room]]
-    if len(report.warnings) > room:
-        lines[-1] = f"WARNING     {len(report.warnings) - room + 1} more warnings in result.json"
-    return [*lines, f"written to  {folder}"]
+    return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")
 
 
 def _verdict(report: SearchReport) -> str:
     weight = report.significance
     if weight is None:
-        return "companion   not judged: no false-alarm probability was asked for"
+        return "companion   not tested: no false-alarm probability was asked for"
     if weight.detected is None:
-        return f"companion   not judged: {weight.n_draws} null draws are too few"
+        return f"companion   undecided: {weight.n_draws} null draws are too few"
     verdict = "DETECTED" if weight.detected else "not detected"
     return f"companion   {verdict}; {_chance(weight)}"
 
@@ -101,12 +98,12 @@ def _nuisance_lines(result: SearchResult) -> list[str]:
         name = parameters[k].name
         label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
         error = np.sqrt(result.theta_covariance[k, k])
-        lines.append(f"{label:<11} {result.theta[k]:.4f} +/- {error:.4f}{unit}")
+        lines.append(row(label, f"{result.theta[k]:.4f} +/- {error:.4f}{unit}"))
     return lines
 
 
 def _noise_lines(report: SearchReport) -> list[str]:
-    """What the posterior says of the extra noise, where it says there is some."""
+    """The posterior of the extra noise, where there is likely some."""
     found = report.noise_posterior or {}
     if all(noise.probability_none > EVEN for noise in found.values()):
         return []
@@ -121,7 +118,7 @@ def _noise_lines(report: SearchReport) -> list[str]:
         median, low, high = (unit * x for x in noise.interval())
         parts.append(
             f"{median:.2g} +{high - median:.1g} -{median - low:.1g} {label} "
-            f"(errors right: {noise.probability_none:.2g})"
+            f"(P(stated errors correct) = {noise.probability_none:.2g})"
         )
     return [f"extra noise {', '.join(parts)}"]
 

@@ -16,13 +16,12 @@ from amibayes import __version__
 from amibayes.plots.style import save
 from amibayes.plots.survey import Found, LimitCurve, survey_plot
 from amibayes.support.atomic_files import atomic_path, write_json
+from amibayes.support.terminal import row, shortened
 
 Json = dict[str, Any]
 Status = Literal["done", "failed", "pending"]
 
 JSON_NAME, TABLE_NAME, PICTURE_NAME = "summary.json", "summary.ecsv", "summary.png"
-
-MAX_LINES = 20
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("detected", "significance.detected", ""),
@@ -216,12 +215,10 @@ def summary_lines(content: Json, folder: Path) -> list[str]:
     entries = sorted(content["targets"], key=lambda e: e["status"] != "failed")
     width = max(len(e["name"]) for e in entries)
     lines = [f"{e['name']:<{width}}  {_said(e)}" for e in entries]
-    if len(lines) > MAX_LINES - 2:
-        left = len(lines) - (MAX_LINES - 3)
-        lines = [*lines[: MAX_LINES - 3], f"and {left} more in {TABLE_NAME}"]
     head = f"targets     {content['n_done']} of {content['n_targets']} done"
     head += f", {content['n_failed']} failed" if content["n_failed"] else ""
-    return [head, *lines, f"written to  {folder}"]
+    last = [row("written to", str(folder))]
+    return shortened([head, *lines], last, f"and {{}} more in {TABLE_NAME}")
 
 
 def _said(entry: Json) -> str:

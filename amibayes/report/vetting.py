@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from amibayes.plots.calibration import columns_of
 from amibayes.plots.style import GREY, marker_of, new_figure, styled
 from amibayes.report import limits_json, number
 from amibayes.support.atomic_files import short_names
+from amibayes.support.terminal import shortened
 
 Json = dict[str, Any]
 
@@ -56,19 +58,19 @@ def _companion(vetted: Vetted) -> Json | None:
     }
 
 
-def vetting_table(vetting: Vetting) -> list[str]:
-    """Say keep or drop, and why, one line each."""
+def vetting_table(vetting: Vetting, last: Sequence[str] = ()) -> list[str]:
+    """Write keep or drop, and why, one line each; ``last`` follows."""
     lines = [f"{'calibrator':<28} {'verdict':<7} {'agreement':>10} {'companion':>10} {'disc':>10}"]
     for name, v in _named(vetting):
         weight = None if v.significance is None else v.significance.probability
         numbers = " ".join(_cell(p) for p in (v.agreement, weight, v.diameter_probability))
         lines.append(f"{name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
         lines += [f"    {text}" for text in [v.reason, *notes(v, vetting.alpha)] if text]
-    lines.append(
+    rule = (
         f"probabilities of chance; below {vetting.alpha:g} a calibrator is dropped "
         f"(good ones: {vetting.false_drop_rate:.1%} of the time)"
     )
-    return lines
+    return shortened(lines, [rule, *last])
 
 
 def _named(vetting: Vetting) -> list[tuple[str, Vetted]]:

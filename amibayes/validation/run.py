@@ -13,9 +13,9 @@ from amibayes.parallel import (
     Progress,
     SerialExecutor,
     child_seeds,
-    digest,
     run_job,
 )
+from amibayes.support.request import digest
 from amibayes.validation.plan import QUICK, ValidationPlan
 from amibayes.validation.tally import Validation, tally
 from amibayes.validation.trial import run_trial

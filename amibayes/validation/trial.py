@@ -18,8 +18,8 @@ from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import at_its_place
 from amibayes.parallel import child_seeds
 from amibayes.pipeline.false_alarm import false_alarm
+from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.search import search_field
 from amibayes.posterior.grid import GridPosterior, grid_posterior
 from amibayes.posterior.priors import Prior
 from amibayes.scene.sources import Point, Scene
@@ -119,7 +119,7 @@ def _analysed(
     seeds: tuple[np.random.SeedSequence, np.random.SeedSequence],
 ) -> dict[str, Any]:
     options = SearchOptions(separation_mas=FIELD_MAS, alpha=plan.alpha, null_draws=plan.null_draws)
-    result, *_ = search_field(observables, options)
+    result = search_field(observables, options).result
     weight = false_alarm(result, options, np.random.default_rng(seeds[0]), None, None)
     answer: dict[str, Any] = {"false_alarm_probability": weight.probability}
     if truth is None:

@@ -15,20 +15,13 @@ import time
 from pathlib import Path
 
 import pytest
+from commands import run
 
-from amibayes.cli import main
-from amibayes.cli.completion import known_commands
+from amibayes.cli.completion import whole_parser
 from amibayes.cli.main import COMMANDS, EXAMPLES, build_parser, command_parsers
 from amibayes.support.environment import Checkup, Package, requirements
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def run(*words: str) -> int:
-    try:
-        return main(list(words))
-    except SystemExit as stop:
-        return int(stop.code or 0)
 
 
 def examples_of(command: str) -> list[str]:
@@ -94,7 +87,7 @@ def completed(script: Path, line: str, folder: Path) -> set[str]:
         source {script}
         COMP_WORDS=({" ".join(shlex.quote(w) for w in words)})
         COMP_CWORD={len(words) - 1}
-        _amibayes
+        _shtab_amibayes
         printf '%s\\n' "${{COMPREPLY[@]}}"
     """
     done = subprocess.run(
@@ -117,7 +110,7 @@ def test_bash_completes(script: Path, tmp_path: Path) -> None:
     files = tmp_path / "files"
     (files / "out").mkdir(parents=True)
     (files / "a star.oifits").touch()
-    assert completed(script, "amibayes ", files) == {*COMMANDS, "--help", "--version"}
+    assert completed(script, "amibayes ", files) == set(COMMANDS)
     assert completed(script, "amibayes ca", files) == {"calibrate"}
     assert completed(script, "amibayes search --null", files) == {"--null-draws"}
     assert completed(script, "amibayes search x --calibration ", files) == {
@@ -128,33 +121,9 @@ def test_bash_completes(script: Path, tmp_path: Path) -> None:
     assert completed(script, "amibayes search ", files) == {"out", "a star.oifits"}
     assert completed(script, "amibayes search x --cal a", files) == {"a star.oifits"}
     assert completed(script, "amibayes completion ", files) == {"bash", "fish", "zsh"}
-    for command in known_commands():
-        options = {flag for o in command.options for flag in o.flags}
-        assert completed(script, f"amibayes {command.name} -", files) == options
-        parser = command_parsers(build_parser(command.name))[command.name]
-        assert options == set(parser._option_string_actions)
-
-
-@pytest.mark.skipif(shutil.which("zsh") is None, reason="zsh is not installed")
-def test_zsh_takes_the_script(tmp_path: Path, capsys) -> None:
-    assert run("completion", "zsh") == 0
-    path = tmp_path / "_amibayes"
-    path.write_text(capsys.readouterr().out)
-    told = f"""
-        compdef() {{}}; _describe() {{ print -l -- $commands }}; _arguments() {{ print -l -- "$@" }}
-        source {path}
-        words=(amibayes ''); CURRENT=2; _amibayes
-        words=(amibayes search --calibration ''); CURRENT=4; _amibayes
-    """
-    done = subprocess.run(
-        ["zsh", "-f", "-c", told], capture_output=True, text=True, check=True, timeout=20
-    )
-    lines = done.stdout.splitlines()
-    assert done.stderr == ""
-    assert [line.split(":")[0] for line in lines[: len(COMMANDS)]] == list(COMMANDS)
-    assert any(line.endswith(":(weighted hierarchical)") for line in lines)
-    assert any(line.startswith("*--out[") and line.endswith(":DIR:_files -/") for line in lines)
-    assert "*:target:_files" in lines
+    for command, parser in command_parsers(whole_parser()).items():
+        options = set(parser._option_string_actions)
+        assert completed(script, f"amibayes {command} -", files) == options
 
 
 def typed_in_zsh(line: str, home: Path, awaited: str | None = None) -> str:
@@ -284,3 +253,13 @@ def test_demo_runs_the_loop_and_finds_the_truth(tmp_path: Path, capsys) -> None:
     page = Path(content["report"]).read_text()
     assert "Companion detected" in page
     assert run("demo", "--out", str(out)) == 2
+
+
+def test_verbose_tells_every_stage_and_its_seconds(target: Path, tmp_path: Path, capsys) -> None:
+    words = ("search", target, "--separation", "60:300", "--null-draws", 0, "--no-posterior")
+    assert run(*words, "--out", tmp_path / "out", "--verbose") == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "amibayes: read"
+    assert re.fullmatch(r"amibayes: read: \d+\.\d s", lines[1])
+    assert lines[2] == "amibayes: search"
+    assert re.fullmatch(r"amibayes: search took \d+\.\d s", lines[-1])

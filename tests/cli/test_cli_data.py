@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from commands import run
 
 from amibayes.calibration import calibrate
-from amibayes.cli import main
 from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.oifits import read_oifits, write_oifits
@@ -41,14 +41,6 @@ def files(rng: np.random.Generator, tmp_path: Path) -> list[str]:
     for path in paths:
         write_oifits(path, star(rng, path.stem.upper()))
     return [str(p) for p in paths]
-
-
-def run(*words: str) -> int:
-    """Run a command; argparse's own exit counts as one."""
-    try:
-        return main(list(words))
-    except SystemExit as leave:
-        return int(leave.code or 0)
 
 
 def test_calibrate_equals_the_function(files: list[str], tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]

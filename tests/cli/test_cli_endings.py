@@ -14,26 +14,16 @@ import time
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 from astropy.io import fits
-from helpers import niriss, simulated
 
 from amibayes.cli import main
 from amibayes.errors import UsageError
-from amibayes.oifits import write_oifits
 from amibayes.support.atomic_files import output_folder, output_locks
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = [110.0, -75.0, 0.02]
 QUICK = ("--separation", "50:400", "--null-draws", "0", "--no-limits")
-
-
-@pytest.fixture
-def target(tmp_path: Path) -> Path:
-    path = tmp_path / "target.oifits"
-    write_oifits(path, simulated(niriss(), TRUTH, np.random.default_rng(1)))
-    return path
 
 
 def start(

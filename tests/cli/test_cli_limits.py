@@ -8,31 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
-from helpers import error_of, niriss, simulated
-
-from amibayes.cli import main
-from amibayes.oifits import write_oifits
+from commands import run
+from helpers import error_of
 
 FAST = ("--separations", 4, "--trials", 20, "--null-draws", 8000, "--separation", "60:400")
 
 
-@pytest.fixture(scope="module")
-def target(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "target.oifits"
-    write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))
-    return path
-
-
-def run(*words: object) -> int:
-    try:
-        return main(["limits", *map(str, words)])
-    except SystemExit as stop:
-        return int(stop.code or 0)
-
-
-def test_whole_job(target: Path, tmp_path: Path, capsys) -> None:
+def test_whole_job(star: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
-    assert run(target, "--out", out, *FAST) == 0
+    assert run("limits", star, "--out", out, *FAST) == 0
     summary = capsys.readouterr().out.strip().split("\n")
     assert len(summary) <= 20
     assert {p.name for p in out.iterdir()} == {
@@ -55,9 +39,9 @@ def test_whole_job(target: Path, tmp_path: Path, capsys) -> None:
 
 
 @pytest.mark.parametrize("method", ["absil", "candid", "posterior", "closure-phase"])
-def test_closed_criteria(target: Path, tmp_path: Path, capsys, method: str) -> None:
+def test_closed_criteria(star: Path, tmp_path: Path, capsys, method: str) -> None:
     out = tmp_path / "out"
-    assert run(target, "--out", out, *FAST, "--criterion", method, "--json") == 0
+    assert run("limits", star, "--out", out, *FAST, "--criterion", method, "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["method"] == method
     assert content["completeness_map"] is None
@@ -66,15 +50,15 @@ def test_closed_criteria(target: Path, tmp_path: Path, capsys, method: str) -> N
     assert {p.name for p in out.iterdir()} == {"limits.json", "limits.ecsv", "limits.png"}
 
 
-def test_resume_starts_afresh_and_tells_a_finished_run_again(target, tmp_path, capsys) -> None:
-    words = (target, *FAST, "--observables", "cp", "--json", "--resume", "--out", tmp_path / "out")
-    assert run(*words) == 0
+def test_resume_starts_afresh_and_tells_a_finished_run_again(star, tmp_path, capsys) -> None:
+    words = (star, *FAST, "--observables", "cp", "--json", "--resume", "--out", tmp_path / "out")
+    assert run("limits", *words) == 0
     first = capsys.readouterr().out
     stamp = (tmp_path / "out" / "limits.json").stat().st_mtime_ns
-    assert run(*words) == 0
+    assert run("limits", *words) == 0
     assert capsys.readouterr().out == first == (tmp_path / "out" / "limits.json").read_text()
     assert (tmp_path / "out" / "limits.json").stat().st_mtime_ns == stamp
-    assert run(*words, "--seed", 2) == 2
+    assert run("limits", *words, "--seed", 2) == 2
     assert "other data or options" in error_of(capsys)
 
 
@@ -90,11 +74,11 @@ def test_resume_starts_afresh_and_tells_a_finished_run_again(target, tmp_path, c
         (("--trials", 0), 2, "not a positive number"),
     ],
 )
-def test_bad_requests_are_one_line(target, tmp_path, capsys, words, status, message) -> None:
-    assert run(target, "--out", tmp_path / "out", *words) == status
+def test_bad_requests_are_one_line(star, tmp_path, capsys, words, status, message) -> None:
+    assert run("limits", star, "--out", tmp_path / "out", *words) == status
     assert message in error_of(capsys)
 
 
 def test_missing_target_is_one_line(tmp_path, capsys) -> None:
-    assert run(tmp_path / "none.oifits", "--out", tmp_path / "out") == 3
+    assert run("limits", tmp_path / "none.oifits", "--out", tmp_path / "out") == 3
     assert "none.oifits" in error_of(capsys)

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from commands import run
 from helpers import error_of, niriss, simulated
 
-from amibayes.cli import main
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -23,6 +23,7 @@ from amibayes.parallel import spawn
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import prepare
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
+from amibayes.pipeline.run import Run
 from amibayes.pipeline.search import search_companion
 from amibayes.pipeline.warnings import search_cautions
 from amibayes.report.limits import limits_summary
@@ -32,13 +33,6 @@ from amibayes.report.summary import summary
 from amibayes.report.survey import summary_lines
 
 FIRST, SECOND = [110.0, -75.0, 0.05], [-60.0, 140.0, 0.03]
-
-
-def run(*words: object) -> int:
-    try:
-        return main([str(word) for word in words])
-    except SystemExit as stop:
-        return int(stop.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -93,11 +87,11 @@ def test_what_was_not_judged_is_said_to_be(report: SearchReport) -> None:
     assert "DETECTED" in line(report, "companion")
     unjudged = replace(report, significance=None)
     assert line(unjudged, "companion") == (
-        "companion   not judged: no false-alarm probability was asked for"
+        "companion   not tested: no false-alarm probability was asked for"
     )
     assert report.significance is not None
     few = replace(report, significance=few_draws(report.significance))
-    assert line(few, "companion") == "companion   not judged: 3 null draws are too few"
+    assert line(few, "companion") == "companion   undecided: 3 null draws are too few"
     said = search_cautions(report.observables, report.result, ExtraNoise(), few.significance, None)
     assert any("3 null draws cannot tell a false-alarm probability" in text for text in said)
 
@@ -128,9 +122,9 @@ def test_noise_that_the_data_ask_for_is_told_and_other_is_not(report: SearchRepo
         "vis2:a.fits": NoisePosterior(0.9, Amount()),  # type: ignore[arg-type]
     }
     said = line(replace(report, noise_posterior=found), "extra noise")
-    assert "0.005 +0.003 -0.003 V2 (errors right: 0.02)" in said
+    assert "0.005 +0.003 -0.003 V2 (P(stated errors correct) = 0.02)" in said
     assert f"{np.degrees(0.005):.2g} " in said
-    assert "deg closure phase of b.fits (errors right: 0.01)" in said
+    assert "deg closure phase of b.fits (P(stated errors correct) = 0.01)" in said
     assert "a.fits" not in said
     quiet = replace(report, noise_posterior={"vis2": NoisePosterior(0.9, Amount())})  # type: ignore[arg-type]
     assert not any(text.startswith("extra noise") for text in summary(quiet, Path("out")))
@@ -163,7 +157,7 @@ def test_a_run_without_calibrators_has_no_verdicts(report: SearchReport) -> None
 
 def test_nothing_to_read_is_refused() -> None:
     with pytest.raises(Exception, match=r"no target given \(name at least one file\)"):
-        prepare([], [], SearchOptions(), np.random.default_rng(1), None)  # type: ignore[arg-type]
+        prepare([], [], SearchOptions(), np.random.default_rng(1), Run())
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import NIRISS_HOLES
+from epochs import F430M, F480M, MJD, epoch, noisy
 from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
@@ -23,7 +23,6 @@ from amibayes.data.covariance import DiagonalCovariance, dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
-from amibayes.data.point_source import point_source
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.statistic import make_statistic
 from amibayes.errors import DataError, UsageError
@@ -43,52 +42,12 @@ from amibayes.posterior.priors import default_prior
 from amibayes.units import MAS
 
 FIELD = (60.0, 400.0)
-F430M, F480M = (4.286e-6, 0.213e-6), (4.817e-6, 0.302e-6)
 PIONIER = np.array([[0.0, 0.0], [60.0, 20.0], [10.0, 110.0], [-40.0, 70.0]])
-
-
-def epoch(
-    band=F480M,
-    mjd=60000.0,
-    source="a.oifits",
-    insname="NIRISS",
-    turn_deg=0.0,
-    stations=NIRISS_HOLES,
-    vis2_error=0.005,
-    closure_error_deg=0.3,
-) -> Observables:
-    """A noiseless point source in one band at one date, the mask turned on the sky."""
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    data = point_source(
-        stations @ np.array([[c, s], [-s, c]]),
-        *band,
-        vis2_error=vis2_error,
-        closure_error_rad=np.radians(closure_error_deg),
-        insname=insname,
-        mjd=mjd,
-    )
-    return replace(data, setups=(replace(data.setups[0], source=source),))
-
-
-def noisy(sheet: Observables, truth, rng) -> Observables:
-    """Data of a companion (east, north, contrast) of one epoch, by the model of one file."""
-    data = Likelihood(sheet).predict([truth])[:, 0]
-    if rng is not None:
-        data = data + sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [len(sheet.vis2)])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
 
 
 def two_filters(rng, contrasts=(0.01, 0.02), place=(120.0, -90.0)) -> Observables:
     sheets = epoch(F430M, source="a"), epoch(F480M, source="b")
     return join([noisy(s, [*place, c], rng) for s, c in zip(sheets, contrasts, strict=True)])
-
-
-MJD = (60000.0, 60200.0, 60500.0)
 
 
 def three_epochs(rng, truth=(120.0, -90.0, 0.02), rate=(20.0, -12.0)) -> Observables:

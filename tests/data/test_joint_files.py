@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from test_joint import F430M, F480M, MJD, epoch, noisy
+from commands import run
+from epochs import F430M, F480M, MJD, epoch, noisy
 
 from amibayes.calibration import calibrate
-from amibayes.cli import main
 from amibayes.data.joining import in_order, refuse_twice, unused
 from amibayes.data.observables import join
 from amibayes.errors import DataError, UsageError
@@ -26,13 +26,6 @@ from amibayes.report.words import measured
 from amibayes.support.atomic_files import to_json
 
 FAST = ("--separation", "60:400", "--no-posterior", "--no-limits", "--null-draws", "1000")
-
-
-def run(*words: object) -> int:
-    try:
-        return main(["search", *map(str, words)])
-    except SystemExit as stop:
-        return int(stop.code or 0)
 
 
 def found(paths: list[Path], cals: Sequence[Path] = (), **options: object) -> SearchReport:
@@ -68,7 +61,7 @@ def files(tmp_path: Path) -> list[Path]:
 
 
 def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path, capsys) -> None:
-    assert run(*files, *FAST, "--motion", "--json", "--out", tmp_path / "0") == 0
+    assert run("search", *files, *FAST, "--motion", "--json", "--out", tmp_path / "0") == 0
     results = [json.loads(capsys.readouterr().out)]
     paths = [files[i] for i in (2, 0, 1)]
     results.append(json.loads(to_json(result_json(found(paths, motion=True)))))
@@ -151,7 +144,7 @@ def test_tied_contrast_and_summary(files, tmp_path) -> None:
 @pytest.mark.slow
 def test_whole_joint_job_with_posterior_evidence_and_limits(files, tmp_path, capsys) -> None:
     words = (*files[:2], "--separation", "100:250", "--null-draws", "1000", "--json")
-    assert run(*words, "--companions", "0,1,2", "--out", tmp_path / "a") == 0
+    assert run("search", *words, "--companions", "0,1,2", "--out", tmp_path / "a") == 0
     result = json.loads(capsys.readouterr().out)
     posterior = result["posterior"]
     assert posterior["converged"]
@@ -182,13 +175,13 @@ def test_noise_of_each_file_is_in_the_result(files) -> None:
 def test_the_same_data_under_two_names_are_refused(files, tmp_path, capsys) -> None:
     copy = tmp_path / "copy.oifits"
     copy.write_bytes(files[0].read_bytes())
-    assert run(files[0], files[1], copy, *FAST, "--out", tmp_path / "a") == 2
+    assert run("search", files[0], files[1], copy, *FAST, "--out", tmp_path / "a") == 2
     line = one_line(capsys)
     assert "copy.oifits" in line
     assert "f430m.oifits" in line
     again = tmp_path / "again.oifits"
     write_oifits(again, read_oifits(files[0]))
-    assert run(files[0], again, *FAST, "--out", tmp_path / "a") == 2
+    assert run("search", files[0], again, *FAST, "--out", tmp_path / "a") == 2
     assert "holds the data of" in one_line(capsys)
 
 
@@ -223,7 +216,7 @@ def test_a_bad_file_among_several_is_named_in_one_line(fault, files, tmp_path, c
             for hdu in hdus:
                 if hdu.name in ("OI_VIS2", "OI_T3"):
                     hdu.data["FLAG"][:] = True
-    assert run(files[0], bad, files[1], *FAST, "--out", tmp_path / "a") == 3
+    assert run("search", files[0], bad, files[1], *FAST, "--out", tmp_path / "a") == 3
     line = one_line(capsys)
     assert f"{fault}.oifits" in line
     assert "f430m" not in line
@@ -237,12 +230,12 @@ def test_a_file_without_the_wanted_observables_is_named(files) -> None:
 
 
 def test_motion_options_that_make_no_sense(files, tmp_path, capsys) -> None:
-    assert run(files[0], *FAST, "--motion", "--out", tmp_path / "a") == 2
+    assert run("search", files[0], *FAST, "--motion", "--out", tmp_path / "a") == 2
     assert "all data are of one date" in one_line(capsys)
-    assert run(*files, *FAST, "--fastest", "5", "--out", tmp_path / "a") == 2
+    assert run("search", *files, *FAST, "--fastest", "5", "--out", tmp_path / "a") == 2
     assert "--fastest: needs a motion" in one_line(capsys)
     words = ("--motion", "--fastest", "1e6")
-    assert run(*files, *FAST, *words, "--out", tmp_path / "a") == 2
+    assert run("search", *files, *FAST, *words, "--out", tmp_path / "a") == 2
     assert "positions" in one_line(capsys)
 
 

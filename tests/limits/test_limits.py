@@ -20,9 +20,9 @@ from amibayes.limits.injection import recover
 from amibayes.limits.logistic import fit_logistic
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.false_alarm import false_alarm
+from amibayes.pipeline.field import search_field
 from amibayes.pipeline.limits import LimitsOptions, measure_limits
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.search import search_field
 from amibayes.units import offset
 
 
@@ -105,7 +105,7 @@ def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) 
         for angle in rng.uniform(0, 360, n):
             east, north = (float(x) for x in offset(limit.separation_mas[k], angle))
             data = simulated(niriss(), [east, north, contrast], rng)
-            result, _, _ = search_field(data, asked)
+            result = search_field(data, asked).result
             seen = statistic_of(result).value > limit.threshold
             c = result.companion
             found += bool(seen and np.hypot(c.east_mas - east, c.north_mas - north) < 94.0)
@@ -210,7 +210,7 @@ def test_robust_search_has_limits_of_its_own_statistic() -> None:
     asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=20_000, alpha=0.01, robust=True)
     found = []
     for data in (clean, spoilt):
-        result, _, _ = search_field(data, asked)
+        result = search_field(data, asked).result
         weight = false_alarm(result, asked, np.random.default_rng(2), None, None)
         rng = np.random.default_rng(3)
         limit = detection_limit(result, weight, rng, separation_mas=[200.0], trials_per_cell=300)

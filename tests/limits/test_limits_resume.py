@@ -5,16 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import niriss, simulated
+from commands import alive, start
 
 from amibayes.cli import main
-from amibayes.oifits import write_oifits
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("--separations", "4", "--trials", "300", "--null-draws", "8000", "--separation", "60:400")
@@ -22,17 +20,10 @@ FILES = ("limits.json", "limits.ecsv", "limits.png", "completeness.png")
 
 
 @pytest.fixture(scope="module")
-def target(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("data") / "target.oifits"
-    write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))
-    return path
-
-
-@pytest.fixture(scope="module")
-def whole(target: Path, tmp_path_factory) -> dict[str, bytes]:
+def whole(star: Path, tmp_path_factory) -> dict[str, bytes]:
     """Files of a run that nobody disturbed."""
     out = tmp_path_factory.mktemp("whole") / "out"
-    assert main(["limits", str(target), "--out", str(out), "--quiet", *SMALL]) == 0
+    assert main(["limits", str(star), "--out", str(out), "--quiet", *SMALL]) == 0
     return contents(out)
 
 
@@ -40,12 +31,8 @@ def contents(out: Path) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in FILES}
 
 
-def start(target: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
-    words = [sys.executable, "-m", "amibayes", "limits", str(target), "--out", str(out)]
-    return subprocess.Popen(
-        [*words, "--resume", "--quiet", *SMALL, *more],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])},
-    )
+def resumed(star: Path, out: Path, *more: str) -> subprocess.Popen[bytes]:
+    return start("amibayes", "limits", star, "--out", out, "--resume", "--quiet", *SMALL, *more)
 
 
 def finished_pieces(out: Path) -> int:
@@ -55,13 +42,6 @@ def finished_pieces(out: Path) -> int:
 def children_of(pid: int) -> list[int]:
     path = Path(f"/proc/{pid}/task/{pid}/children")
     return [int(word) for word in path.read_text().split()] if path.exists() else []
-
-
-def alive(pid: int) -> bool:
-    try:
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except OSError:
-        return False
 
 
 def kill_after(process: subprocess.Popen[bytes], out: Path, pieces: int) -> list[int]:
@@ -74,13 +54,13 @@ def kill_after(process: subprocess.Popen[bytes], out: Path, pieces: int) -> list
     return workers
 
 
-def killed_and_resumed(target: Path, out: Path, kills: int, seed: int) -> dict[str, bytes]:
+def killed_and_resumed(star: Path, out: Path, kills: int, seed: int) -> dict[str, bytes]:
     """Kill a run at random moments, then let it finish."""
     rng = np.random.default_rng(seed)
     for k, pieces in enumerate(sorted(rng.integers(1, 55, kills))):
         before = finished_pieces(out)
         more = ("--workers", "2") if k % 2 else ()
-        workers = kill_after(start(target, out, *more), out, max(int(pieces), before + 1))
+        workers = kill_after(resumed(star, out, *more), out, max(int(pieces), before + 1))
         assert finished_pieces(out) > before
         assert not (out / "limits.json").exists()
         if more:
@@ -89,31 +69,30 @@ def killed_and_resumed(target: Path, out: Path, kills: int, seed: int) -> dict[s
             while any(alive(pid) for pid in workers) and time.monotonic() < deadline:
                 time.sleep(0.05)
             assert not any(alive(pid) for pid in workers)
-    assert start(target, out).wait(120) == 0
+    assert resumed(star, out).wait(120) == 0
     assert not (out / "limits.journal").exists()
     return contents(out)
 
 
 @pytest.mark.slow
-def test_killed_twice_and_resumed_the_same_bytes(target, whole, tmp_path) -> None:
-    assert killed_and_resumed(target, tmp_path / "out", 2, seed=1) == whole
+def test_killed_twice_and_resumed_the_same_bytes(star, whole, tmp_path) -> None:
+    assert killed_and_resumed(star, tmp_path / "out", 2, seed=1) == whole
 
 
 @pytest.mark.slow
-def test_killed_five_times_and_resumed_the_same_bytes(target, whole, tmp_path) -> None:
-    assert killed_and_resumed(target, tmp_path / "out", 5, seed=2) == whole
+def test_killed_five_times_and_resumed_the_same_bytes(star, whole, tmp_path) -> None:
+    assert killed_and_resumed(star, tmp_path / "out", 5, seed=2) == whole
 
 
-def test_two_workers_give_the_same_bytes(target, whole, tmp_path) -> None:
+def test_two_workers_give_the_same_bytes(star, whole, tmp_path) -> None:
     words = ("--out", str(tmp_path / "out"), "--quiet", "--workers", "2", *SMALL)
-    assert main(["limits", str(target), *words]) == 0
+    assert main(["limits", str(star), *words]) == 0
     assert contents(tmp_path / "out") == whole
 
 
-def test_dask_workers_give_the_same_bytes_though_one_is_killed(target, whole, tmp_path) -> None:
+def test_dask_workers_give_the_same_bytes_though_one_is_killed(star, whole, tmp_path) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    from test_parallel_cluster import end, free_port, start_worker
-    from test_parallel_cluster import start as start_dask
+    from dask_cluster import end, free_port, start_dask, start_worker
 
     port, out = free_port(), tmp_path / "out"
     words = ("--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
@@ -121,7 +100,7 @@ def test_dask_workers_give_the_same_bytes_though_one_is_killed(target, whole, tm
     processes = [start_dask("dask_scheduler", *words)]
     try:
         processes += [start_worker(address), start_worker(address)]
-        run = start(target, out, "--scheduler", address)
+        run = resumed(star, out, "--scheduler", address)
         while run.poll() is None and finished_pieces(out) < 20:
             time.sleep(0.01)
         os.kill(processes[1].pid, signal.SIGKILL)

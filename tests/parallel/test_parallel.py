@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import alive
+
+from amibayes.support.request import digest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import parallel_work as work
@@ -23,7 +26,6 @@ from amibayes.parallel import (
     ProcessExecutor,
     SerialExecutor,
     child_seeds,
-    digest,
     open_executor,
     progress_bar,
     run_job,
@@ -133,14 +135,6 @@ def wait_until(condition: Any, seconds: float = 20.0) -> bool:
             return True
         time.sleep(0.05)
     return False
-
-
-def alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-    return state != "Z"
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dask_cluster import end, free_port, start_dask, start_worker
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import parallel_work as work
@@ -26,36 +26,12 @@ pytest.importorskip("distributed", reason="dask.distributed is not installed")
 HERE = str(Path(__file__).parents[1])
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def start(*words: str) -> subprocess.Popen[bytes]:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([HERE, *sys.path])}
-    return subprocess.Popen(
-        [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-
-
-def start_worker(address: str) -> subprocess.Popen[bytes]:
-    return start("dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
-
-
-def end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.wait()
-
-
 @pytest.fixture
 def scheduler() -> Iterator[str]:
     port = free_port()
-    process = start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+    process = start_dask(
+        "dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"
+    )
     yield f"tcp://127.0.0.1:{port}"
     end(process)
 

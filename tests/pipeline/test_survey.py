@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from commands import run
 from helpers import error_of, niriss, simulated
 from PIL import Image
 
-from amibayes.cli import main
 from amibayes.errors import DataError
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.batch import read_targets
@@ -22,13 +22,6 @@ from amibayes.plots.survey import Found, LimitCurve, survey_plot
 TRUTH = [110.0, -75.0, 0.02]
 CLOSED = ("--criterion", "absil", "--separations", 5, "--null-draws", 0, "--observables", "cp")
 QUICK = ("--no-posterior", "--null-draws", 2000, "--no-limits", "--separation", "50:400")
-
-
-def run(*words: object) -> int:
-    try:
-        return main(list(map(str, words)))
-    except SystemExit as stop:
-        return int(stop.code or 0)
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from epochs import F430M, epoch, noisy
 from helpers import niriss, simulated
 from scipy import stats
-from test_joint import F430M, epoch, noisy
 
 from amibayes.cli import main
 from amibayes.errors import DataError

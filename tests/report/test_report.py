@@ -16,19 +16,18 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import niriss, simulated
-from test_validation import PLAN, answers
+from trial_answers import PLAN, answers
 
 from amibayes.cli import common, main
 from amibayes.errors import DataError
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.options import SearchOptions
-from amibayes.plots.pictures import picture_names
+from amibayes.plots.pictures import PICTURES, Stages, picture_names
 from amibayes.plots.style import save
 from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
-from amibayes.report.captions import CAPTIONS
 from amibayes.report.joint_sections import RESIDUALS
 from amibayes.report.page import Sky, page_html, read_figure
-from amibayes.report.search_page import PLACED
+from amibayes.report.search_page import SECTIONS
 from amibayes.report.statement import statement_of
 from amibayes.report.validation import validation_page, validation_pictures
 from amibayes.report.words import chance, count, measured, plain
@@ -161,12 +160,15 @@ def test_the_page_is_whole_and_safe(page: Reader, folder: Path) -> None:
     assert all(i["alt"] and int(str(i["width"])) > 300 for i in page.images)
 
 
-def test_every_picture_has_its_words_and_its_place() -> None:
-    """A new picture of the main job needs a caption and a section."""
-    drawn = {n.removesuffix(".png") for n in picture_names(SearchOptions(), calibrated=True)
-             if n.endswith(".png")}  # fmt: skip
-    assert drawn <= set(CAPTIONS)
-    assert drawn <= set(PLACED)
+def test_every_picture_stands_in_a_section_and_is_drawn_by_some_run() -> None:
+    full = Stages(True, True, True, True, True)
+    assert len({p.name for p in PICTURES}) == len(PICTURES)
+    for picture in PICTURES:
+        assert picture.section in SECTIONS
+        assert picture.title
+        assert picture.text.endswith(".")
+        assert picture.when(full)
+    assert "files.png" not in picture_names(SearchOptions(), calibrated=True)
 
 
 def test_no_detection_states_a_limit(content) -> None:

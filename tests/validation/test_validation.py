@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from trial_answers import PLAN, answers
 
 from amibayes.cli import main
 from amibayes.errors import DataError, RunError
@@ -24,28 +25,6 @@ from amibayes.validation import QUICK, validate
 from amibayes.validation.plan import FIELD_MAS, RANGES, ValidationPlan
 from amibayes.validation.tally import rate, sum_of_tosses, tally, unequal, uniformity
 from amibayes.validation.trial import run_trial
-
-PLAN = replace(QUICK, per_range=100, n_alone=400)
-
-
-def answers(plan: ValidationPlan, seed: int = 1, **spoilt: float):
-    """Answers of a sound programme; ``spoilt`` names what is wrong with it, and how much."""
-    rng = np.random.default_rng(seed)
-    for kind in plan.kinds:
-        alarm = rng.random() ** spoilt.get("alarm", 1.0)
-        if kind == "alone":
-            yield {"false_alarm_probability": alarm}
-            continue
-        rank = rng.random(3) ** np.array([1.0, 1.0, spoilt.get("contrast", 1.0)])
-        chance = rng.random()
-        yield {
-            "false_alarm_probability": alarm,
-            "truth": np.array([100.0, 50.0, 0.01]),
-            "rank": rank,
-            "covered": rng.random((3, 2)) < spoilt.get("coverage", 1.0) * np.array([0.68, 0.95]),
-            "found": rng.random() < chance * spoilt.get("found", 1.0),
-            "expected": chance,
-        }
 
 
 def test_a_sound_programme_passes() -> None:

@@ -1,0 +1,59 @@
+"""What all stages of a run share: where the work is done, what is kept, who is told."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+from amibayes.parallel import Executor, Journal, Journals, Progress
+
+Announce = Callable[[str], None]
+
+
+def silent(stage: str) -> None:
+    """Announce nothing."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a job.
+
+    Parameters
+    ----------
+    announce : callable
+        Called with the name of each stage as it begins.
+    progress : callable, optional
+        Called with (done, expected) within the longer stages.
+    executor : Executor, optional
+        Where null draws and injections are computed; the result does not depend on it.
+    journals : Journals, optional
+        Keep finished pieces, so that a run that was cut off goes on.
+    seconds : dict
+        What each stage took, filled in as they end.
+    """
+
+    announce: Announce = silent
+    progress: Progress | None = None
+    executor: Executor | None = None
+    journals: Journals | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Announce a stage and time it."""
+        self.announce(name)
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+
+    def journal(self, job: str) -> Journal | None:
+        """Open the journal of a job, where finished pieces are kept."""
+        return None if self.journals is None else self.journals.of(job)
+
+    def under(self, part: str) -> Run:
+        """Give the same run with journals of a part of their own."""
+        if self.journals is None:
+            return self
+        return replace(self, journals=self.journals.under(part))

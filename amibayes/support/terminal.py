@@ -1,0 +1,54 @@
+"""The summary on the terminal: at most twenty lines, whatever there is to tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+MAX_LINES = 20
+"""What stays on a small terminal without scrolling."""
+
+
+def shortened(
+    lines: Sequence[str], last: Sequence[str] = (), more: str = "and {} more lines"
+) -> list[str]:
+    """Leave out what does not fit, and say how much.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Of which those at the end may be left out.
+    last : sequence of str
+        Lines that always stand at the end.
+    more : str
+        Stands for what is left out, ``{}`` for how many.
+
+    Returns
+    -------
+    list of str
+        At most `MAX_LINES`.
+    """
+    room = MAX_LINES - len(last)
+    if len(lines) <= room:
+        return [*lines, *last]
+    return [*lines[: room - 1], more.format(len(lines) - room + 1), *last]
+
+
+def with_warnings(lines: Sequence[str], warnings: Sequence[str], last: str, file: str) -> list[str]:
+    """Put as many warnings after the lines as fit; the others are in a file.
+
+    Parameters
+    ----------
+    lines : sequence of str
+    warnings : sequence of str
+    last : str
+        Stands at the end.
+    file : str
+        Name of the file that holds all warnings.
+    """
+    told = [row("WARNING", text) for text in warnings]
+    return shortened([*lines, *told], [last], row("WARNING", f"{{}} more warnings in {file}"))
+
+
+def row(label: str, text: str) -> str:
+    """Write a line of a summary: what it is about, and what is found."""
+    return f"{label:<11} {text}"

@@ -1,0 +1,28 @@
+"""A dask cluster on this machine: a scheduler and workers in processes of their own."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+
+from commands import start
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def start_dask(program: str, *words: str) -> subprocess.Popen[bytes]:
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return start(f"distributed.cli.{program}", *words, start_new_session=True, **silent)
+
+
+def start_worker(address: str) -> subprocess.Popen[bytes]:
+    return start_dask("dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
