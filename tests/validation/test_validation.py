@@ -129,8 +129,8 @@ def test_the_page_says_what_holds_and_what_fails(tmp_path) -> None:
     assert set(figures) == {name for name, *_ in PICTURES.values()}
     said = page_html(validation_page(bad, figures, "out"))
     assert said.count("FAILS") == len(failing)
-    assert "Doubtful" in said
-    assert "Sound" in page_html(validation_page(sound, figures, "out"))
+    assert "Failed" in said
+    assert "Passed" in page_html(validation_page(sound, figures, "out"))
     content = validation_json(bad)
     assert content["passed"] is False
     assert [c["passed"] for c in content["checks"]] == [c.passed for c in bad.checks]
