@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance
+from amibayes.detection.false_alarm import Significance, draws_needed, reachable
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.analytic import analytic_limit
@@ -163,12 +163,13 @@ def measure_limits(
 
 
 def _refuse(options: LimitsOptions) -> None:
-    if options.criterion == "injection" and options.search.null_draws < 1.0 / options.search.alpha:
+    alpha = options.search.alpha
+    if options.criterion == "injection" and not reachable(alpha, options.search.null_draws):
         raise UsageError(
             f"{options.search.null_draws} null draws cannot measure a false-alarm probability of "
-            f"{options.search.alpha:g}",
+            f"{alpha:g}",
             source="--null-draws",
-            remedy=f"give {round(10.0 / options.search.alpha)} or more, or another --criterion",
+            remedy=f"give {draws_needed(alpha)} or more, or another --criterion",
         )
     if options.criterion == "closure-phase" and options.observables not in (None, ("cp",)):
         raise UsageError("uses closure phases alone", source="--criterion closure-phase")

@@ -148,7 +148,7 @@ def _limits(
     found: Found, tests: Tests, options: SearchOptions, rng: np.random.Generator, run: Run
 ) -> DetectionLimit | None:
     """Measure the detection limits; None where unwanted or without null draws."""
-    if tests.first is None or not options.limits:
+    if tests.first is None or tests.first.detected is None or not options.limits:
         return None
     with run.stage("limits"):
         return detection_limit(

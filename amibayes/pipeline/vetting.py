@@ -247,7 +247,8 @@ def _by_itself(
     found = search(likelihood, separation_mas)
     # Neither test takes the size of the stated errors for known.
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
-    limit = detection_limit(found, found_by_noise, rng) if limits else None
+    enough = limits and found_by_noise.detected is not None
+    limit = detection_limit(found, found_by_noise, rng) if enough else None
     vetted = replace(vetted, companion=found, significance=found_by_noise, limit=limit)
     if not data.n_vis2:
         return vetted

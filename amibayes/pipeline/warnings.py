@@ -8,16 +8,13 @@ from scipy.stats import chi2
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance
-from amibayes.detection.whiteness import channel_correlation
+from amibayes.detection.false_alarm import Significance, draws_needed
+from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes
 from amibayes.posterior.ensemble import Posterior, modes_to_sample
 from amibayes.posterior.grid import integrable
 from amibayes.posterior.priors import Prior
-
-NOTABLE, SURE = 0.2, 5.0
-"""Correlation between channels that is worth a warning, and its size in chance errors."""
 
 MAX_NAMED = 3
 """Outliers that a warning names."""
@@ -164,8 +161,8 @@ def _joint_warnings(result: SearchResult) -> list[str]:
 
 def _correlated(result: SearchResult) -> list[str]:
     """Warn where channels err together: errors alone count them as independent."""
-    correlation, n_pairs = channel_correlation(result)
-    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
+    correlation = correlated(result)
+    if correlation is None:
         return []
     return [
         f"residuals of neighbouring channels are correlated by {correlation:.2f}, which the "
@@ -195,7 +192,8 @@ def search_warnings(
     if tested is not None and tested.detected is None:
         found.append(
             f"{tested.n_draws} null draws cannot measure a false-alarm probability below "
-            f"{tested.alpha:g}: no detection is claimed or denied (raise --null-draws)"
+            f"{tested.alpha:g}: no detection is claimed or denied (give --null-draws "
+            f"{draws_needed(tested.alpha)} or more)"
         )
     found += _outliers(result)
     found += _correlated(result)

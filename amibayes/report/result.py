@@ -158,6 +158,8 @@ def _significance(result: SearchResult, tested: Significance | None, alpha: floa
             "detected": tested.detected,
             "statistic": tested.statistic,
             "threshold": tested.threshold(),
+            "parametric": tested.parametric,
+            "randomised": _randomised(tested),
             "extrapolation": None
             if tested.tail is None
             else {
@@ -167,6 +169,18 @@ def _significance(result: SearchResult, tested: Significance | None, alpha: floa
             },
         }
     return out
+
+
+def _randomised(weight: Significance) -> Json | None:
+    check = weight.randomised
+    if check is None:
+        return None
+    return {
+        "n_exposures": check.n_exposures,
+        "n_draws": check.n_draws,
+        "probability": check.probability,
+        "interval": None if check.interval is None else list(check.interval),
+    }
 
 
 def _modes(report: SearchReport) -> list[Json]:

@@ -68,6 +68,21 @@ def _verdict(report: SearchReport) -> str:
 
 
 def _chance(tested: Significance) -> str:
+    """The false-alarm probability, with that by randomised residuals where there is one."""
+    check = tested.randomised
+    if check is None or check.probability is None:
+        return _parametric(tested)
+    if check.probability < tested.probability:
+        return f"{_parametric(tested)}; {check.note}"
+    low, high = tested.interval
+    return (
+        f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) by "
+        f"randomised residuals of {check.n_exposures} exposures; {tested.parametric:.2g} by "
+        f"{tested.n_draws} null searches"
+    )
+
+
+def _parametric(tested: Significance) -> str:
     """The false-alarm probability, and past the draws what is no more than extrapolated."""
     low, high = tested.interval
     tail = tested.tail
@@ -76,7 +91,7 @@ def _chance(tested: Significance) -> str:
             f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) "
             f"in {tested.n_draws} null searches"
         )
-    above = int((tested.null >= tested.statistic).sum())
+    above = tested.n_above
     return (
         f"{above or 'none'} of {tested.n_draws} null searches reach it: false-alarm probability "
         f"below {high:.2g} (95%); extrapolated {_power(tail.generalised_pareto)} (Pareto), "

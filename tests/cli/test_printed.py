@@ -50,7 +50,7 @@ def report(path: Path) -> SearchReport:
         (80.0, 200.0),
         diameter="free",
         extra_noise=False,
-        null_draws=2000,
+        null_draws=3000,
         companions=(1, 2),
         posterior=False,
         limits=False,

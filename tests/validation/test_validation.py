@@ -156,7 +156,7 @@ def test_command_on_one_star(monkeypatch, tmp_path, capsys) -> None:
 @pytest.fixture
 def small() -> ValidationPlan:
     setting = replace(QUICK.settings[0], n_integrations=12)
-    return replace(QUICK, settings=(setting,), per_range=1, n_alone=1, null_draws=300)
+    return replace(QUICK, settings=(setting,), per_range=1, n_alone=1, null_draws=400)
 
 
 @pytest.mark.slow
