@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.errors import UsageError
-from amibayes.support.options import COMPANIONS, OBSERVABLES, SEED, ExtractionMethod, choices
+from amibayes.support.options import COMPANIONS, EXTRACTION_METHODS, OBSERVABLES, SEED
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
@@ -69,8 +69,8 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--method",
-        choices=choices(ExtractionMethod),
-        default=choices(ExtractionMethod)[0],
+        choices=tuple(EXTRACTION_METHODS),
+        default=next(iter(EXTRACTION_METHODS)),
         help="fit of the images (fringes), or a way to sample their Fourier transform "
         "(default: %(default)s)",
     )

@@ -27,7 +27,7 @@ from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
-from amibayes.support.options import ExtractionMethod
+from amibayes.support.options import EXTRACTION_METHODS
 from amibayes.units import ComplexArray, FloatArray
 
 NYQUIST = 0.5
@@ -79,7 +79,7 @@ class Extraction:
 
 def extract(
     cubes: Cube | str | Path | Sequence[Cube | str | Path],
-    method: ExtractionMethod = "fringes",
+    method: str = next(iter(EXTRACTION_METHODS)),
     *,
     options: ExtractOptions | None = None,
     **header: Any,

@@ -155,7 +155,9 @@ def weighted_fit(model: FringeModel, weight: FloatArray) -> FringeFit:
     return FringeFit(model, cho_solve(factor, np.diag(1.0 / scale)) / scale[:, None], weight)
 
 
-def fringe_sampling(fit: FringeFit, view: View) -> OneEach:
+def fringe_sampling(
+    view: View, basis: FringeBasis, fit: FringeFit, options: object = None
+) -> OneEach:
     """Coefficients of the fit as flux, a sample per baseline, and background."""
     return OneEach.of(fit.inverse, view.instrument.mask, view.frequency_px)
 

@@ -10,13 +10,12 @@ from typing import Any
 from amibayes.errors import UsageError
 from amibayes.support.options import (
     CLIP_INTEGRATIONS,
+    EXTRACTION_METHODS,
     ExtractionCovariance,
-    ExtractionMethod,
     Geometry,
-    choices,
 )
 
-METHODS: tuple[str, ...] = choices(ExtractionMethod)
+METHODS = EXTRACTION_METHODS
 
 
 COLDEST_K = 100.0
@@ -55,7 +54,7 @@ class ExtractOptions:
         Where a value makes no sense.
     """
 
-    method: ExtractionMethod = "fringes"
+    method: str = next(iter(EXTRACTION_METHODS))
     clip: float = CLIP_INTEGRATIONS
     outlier: float = 7.0
     window_px: float | None = None
@@ -92,7 +91,7 @@ class ExtractOptions:
         if self.window_px is not None and self.method == "fringes":
             raise UsageError(
                 "the method fringes has no window",
-                remedy=f"leave the window out, or choose from {', '.join(METHODS[1:])}",
+                remedy=f"leave the window out, or choose from {', '.join(list(METHODS)[1:])}",
             )
 
     def as_mapping(self) -> Mapping[str, Any]:

@@ -9,13 +9,11 @@ from amibayes.cube.source import Source
 from amibayes.errors import DataError
 from amibayes.extraction.cleaning import Reference, median_and_scatter, reference_of
 from amibayes.extraction.fourier.sampling import split
-from amibayes.extraction.fourier.transform import fourier_sampling
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
     FringeFit,
     centre_on,
     fringe_fit,
-    fringe_sampling,
     shift_of,
 )
 from amibayes.extraction.noise import (
@@ -29,6 +27,7 @@ from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.view import View, look_at
 from amibayes.optics import FringeBasis
+from amibayes.support.options import EXTRACTION_METHODS, entry
 from amibayes.units import BoolArray, FloatArray, SingleArray
 
 MAX_RESIDUAL = 0.25
@@ -56,11 +55,8 @@ def make_operator(file: Source, options: ExtractOptions) -> ExtractionOperator:
         view, basis, even = centre_on(view, image, good, template.source, basis)
     noise, level, scatter = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(even.model, _fit_variance(basis, image, noise, good) + level, good)
-    sampling = (
-        fringe_sampling(fit, view)
-        if options.method == "fringes"
-        else fourier_sampling(view, basis, options)
-    )
+    make_sampling = entry(EXTRACTION_METHODS[options.method])
+    sampling = make_sampling(view, basis, fit, options)
     variance, third = (np.where(good, a, 0.0).ravel() for a in (noise.variance, noise.skewness))
     return ExtractionOperator(
         view, geometry, reference, fit, scatter, sampling, variance, third, options

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 import re
 from dataclasses import replace
 from typing import Any, get_args, get_origin, get_type_hints
@@ -16,6 +17,7 @@ from amibayes.extraction import ExtractOptions
 from amibayes.extraction.reading import ImageOptions
 from amibayes.pipeline.limits import LimitsOptions
 from amibayes.pipeline.options import SearchOptions
+from amibayes.support.options import EXTRACTION_METHODS, entry
 
 
 def parsed(command: str, *words: str) -> argparse.Namespace:
@@ -45,7 +47,14 @@ def test_docstrings_list_the_choices(kind: type) -> None:
     listed = dict(re.findall(r"^    (\w+) : \{(.*?)\}", str(kind.__doc__), flags=re.MULTILINE))
     hints = get_type_hints(kind)
     for name in listed:
-        assert re.findall(r'"(.*?)"', listed[name]) == list(literals(hints[name])), name
+        known = list(literals(hints[name])) or list(EXTRACTION_METHODS)
+        assert re.findall(r'"(.*?)"', listed[name]) == known, name
+
+
+@pytest.mark.parametrize("method", EXTRACTION_METHODS)
+def test_every_method_of_extraction_can_be_made(method: str) -> None:
+    parameters = inspect.signature(entry(EXTRACTION_METHODS[method])).parameters
+    assert list(parameters)[::2] == ["view", "fit"]
 
 
 def literals(hint: Any) -> tuple[str, ...]:

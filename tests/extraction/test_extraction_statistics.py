@@ -107,7 +107,7 @@ def bound(extraction: Extraction, cube: Cube) -> FloatArray:
     design = operator.fit.design
     numbers = np.linalg.inv(design.T @ (design / variance[:, None]))[:-1, :-1]
     flux = float(extraction.frames.flux.mean())
-    fit = fringe_sampling(operator.fit, operator.view)
+    fit = fringe_sampling(operator.view, None, operator.fit)
     jacobian = fit.jacobian(flux, np.full(21, flux, dtype=complex))
     return np.asarray(np.sqrt(np.diag(jacobian @ numbers @ jacobian.T)))
 

@@ -36,7 +36,9 @@ FAINTEST, BRIGHT = 0.3, 0.6
 above the second in full. Farther out the feet of neighbouring splodges overlap."""
 
 
-def fourier_sampling(view: View, fringes: FringeBasis, options: ExtractOptions) -> Sampling:
+def fourier_sampling(
+    view: View, fringes: FringeBasis, fit: object, options: ExtractOptions
+) -> Sampling:
     """Make the operator of one of the Fourier methods; ``fringes`` is the view's basis."""
     star = fringes.image().ravel()
     level = _Levels.of(view, options, star)
