@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import sys
 import warnings
 from collections.abc import Callable
@@ -16,7 +17,8 @@ from amibayes.support.options import COMPANIONS, EXTRACTION_METHODS, OBSERVABLES
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
-    from amibayes.parallel import Executor, Progress, StageBars
+    from amibayes.parallel import Executor, StageBars
+    from amibayes.parallel import Progress as Told
     from amibayes.posterior.priors import PriorSetting
 
 
@@ -42,9 +44,9 @@ def add_speech_options(group: argparse._ActionsContainer) -> None:
         action="store_true",
         help="print the result as JSON on standard output and nothing else there",
     )
-    amount = group.add_mutually_exclusive_group()
-    amount.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    amount.add_argument("--verbose", action="store_true", help="report every stage and its seconds")
+    loudness = group.add_mutually_exclusive_group()
+    loudness.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    loudness.add_argument("--verbose", action="store_true", help="tell every stage and its seconds")
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
@@ -64,7 +66,7 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
         "--temperature",
         type=positive_float,
         metavar="K",
-        help="blackbody in place of the stars' spectrum (default: as many photons at every "
+        help="blackbody that stands for the stars' spectrum (default: as many photons at every "
         "wavelength of the filter)",
     )
     group.add_argument(
@@ -172,7 +174,7 @@ def command_line(arguments: argparse.Namespace) -> str:
 
 def progress_of(
     arguments: argparse.Namespace, description: str, *, unit: str = "piece", scale: float = 1.0
-) -> AbstractContextManager[Progress]:
+) -> AbstractContextManager[Told]:
     """Open a progress bar, unless ``--quiet``."""
     from amibayes.parallel import progress_bar
 
@@ -227,6 +229,17 @@ def number_range(text: str) -> tuple[float, float]:
     if not 0.0 <= low < high < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} needs 0 <= LOW < HIGH")
     return low, high
+
+
+def pair_of_numbers(text: str) -> tuple[float, float]:
+    """Parse ``A,B``, neither below zero."""
+    try:
+        first, second = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not A,B") from error
+    if not (0.0 <= first < math.inf and 0.0 <= second < math.inf):
+        raise argparse.ArgumentTypeError(f"{text!r} holds a number below zero, or infinite")
+    return first, second
 
 
 def configure_logging(arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from amibayes.cli import common
 from amibayes.errors import UsageError
 from amibayes.support.options import (
     CLIP_CALIBRATORS,
+    NOISE_PRIOR,
     CalibrationMethod,
     ClosureCovariance,
     ContrastSharing,
@@ -168,7 +169,7 @@ def add_model(group: argparse._ActionsContainer) -> None:
 
 
 def add_joint(group: argparse._ActionsContainer) -> None:
-    """Add what several files share."""
+    """Add what several files share and what they do not."""
     group.add_argument(
         "--contrast",
         choices=choices(ContrastSharing),
@@ -191,7 +192,7 @@ def add_joint(group: argparse._ActionsContainer) -> None:
         "--file-noise",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="fit noise beyond the stated errors to every file by itself (default: yes)",
+        help="judge noise beyond the stated errors for every file by itself (default: yes)",
     )
 
 
@@ -232,6 +233,8 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "motion": arguments.motion,
         "fastest_mas_yr": arguments.fastest,
         "extra_noise": arguments.extra_noise,
+        "channel_noise": arguments.channel_noise,
+        "noise_prior": arguments.noise_prior,
         "robust": arguments.robust,
         "file_noise": arguments.file_noise,
         "seed": arguments.seed,
@@ -253,19 +256,33 @@ def add_observables(
 
 
 def add_data(group: argparse._ActionsContainer) -> None:
-    """Add how data are read, calibrated and selected."""
+    """Add how data are read, calibrated and believed."""
     add_reduction(group)
     add_closure_covariance(group)
     add_calibration(group)
     add_calibrator_diameters(group)
     group.add_argument(
-        "--keep-all", action="store_true", help="use every calibrator, whatever vetting finds"
+        "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
     )
     group.add_argument(
         "--extra-noise",
         action=argparse.BooleanOptionalAction,
         default=True,
         help="add noise where the stated errors do not explain the residuals (default: yes)",
+    )
+    group.add_argument(
+        "--channel-noise",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="fit what the channels of an exposure share of the noise (default: yes)",
+    )
+    group.add_argument(
+        "--noise-prior",
+        type=common.pair_of_numbers,
+        default=NOISE_PRIOR,
+        metavar="VIS2,DEG",
+        help="widths of the prior of extra noise, of V² as a share of it and of closure phases; "
+        "three times as much is the most (default: 0.05,3)",
     )
     add_insname(group)
     group.add_argument(

@@ -331,9 +331,9 @@ def innermost_first(
         Those the first one cannot be told from.
     """
     thetas = np.array([m.theta for m in modes])
-    data = likelihood.observables.covariance.whiten(likelihood.predict(thetas))
+    data = likelihood.noise.whiten(likelihood.predict(thetas))
     none = single_likelihood(likelihood).predict(np.atleast_2d(single))
-    signal = data - likelihood.observables.covariance.whiten(none)
+    signal = data - likelihood.noise.whiten(none)
     apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
     alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
     places = thetas[:, likelihood.parameters.place()]

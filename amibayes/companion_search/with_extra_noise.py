@@ -2,101 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import optimize
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import TwoCompanions
-from amibayes.data.covariance import (
-    Covariance,
-)
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import averaged_noise
-from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.channel_noise import ChannelShare
 from amibayes.likelihood.extra_noise import (
+    CONVERGED,
     MAX_ROUNDS,
-    SETTLED,
-    UNLIKELY,
     ExtraNoise,
-    FileNoise,
-    _with_noise,
-    add_noise,
-    mean_of_files,
+    NoisePrior,
+    with_noise,
 )
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.residuals import files_of
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.student_noise import averaged_student_noise
-from amibayes.units import FloatArray
-
-
-def fit_noise(likelihood: Likelihood, theta: FloatArray, *, per_file: bool = False) -> ExtraNoise:
-    """Find the extra noise that makes the residuals of a fit most likely.
-
-    Each kind of observable is judged by itself: it gets extra noise only where its χ² has a
-    probability below `UNLIKELY`. The likelihood is the restricted one: the parameters of
-    the fit take their share of the degrees of freedom.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        With the stated errors.
-    theta : (n_dim,) float array
-        The fit.
-    per_file : bool
-        Judge the files apart.
-    """
-    data, difference = likelihood.observables, likelihood.difference(theta)[:, 0]
-    vis2 = np.arange(data.covariance.size) < data.n_vis2
-    share = 1.0 - len(theta) / likelihood.n_independent
-    parts = files_of(data)
-    if not per_file or len(parts) < 2:
-        return ExtraNoise(
-            _one_kind(data, difference, vis2, share, "vis2"),
-            _one_kind(data, difference, ~vis2, share, "closure_phase_rad"),
-        )
-    files = tuple(
-        FileNoise(
-            part.source,
-            _one_kind(data, difference, part.of_kind("vis2"), share, "vis2"),
-            _one_kind(data, difference, part.of_kind("cp"), share, "closure_phase_rad"),
-        )
-        for part in parts
-    )
-    return mean_of_files(data, files)
-
-
-def _one_kind(
-    data: Observables, difference: FloatArray, which: NDArray[np.bool_], share: float, name: str
-) -> float:
-    """Extra noise of one kind of observable from its residuals."""
-    if not which.any():
-        return 0.0
-    n = data.n_vis2
-    part = data.select(which[:n], which[n:])
-    residual = difference[which]
-    chi2, dof = _chi2(part.covariance, residual), share * part.covariance.rank
-    if chi2_survival(chi2, dof, data.degrees_of_freedom) > UNLIKELY:
-        return 0.0
-    typical = float(np.sqrt(np.median(part.covariance.variance)))
-    largest = typical * np.sqrt(chi2 / dof)
-
-    def loss(log_sigma: float) -> float:
-        sigma = float(np.exp(log_sigma))
-        extra = ExtraNoise(vis2=sigma) if name == "vis2" else ExtraNoise(closure_phase_rad=sigma)
-        noisy = _with_noise(part, extra).covariance
-        return _chi2(noisy, residual) + share * noisy.logdet()
-
-    bounds = float(np.log(1e-2 * typical)), float(np.log(10.0 * largest))
-    best = optimize.minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 1e-3})
-    return float(np.exp(best.x))
-
-
-def _chi2(covariance: Covariance, residual: FloatArray) -> float:
-    return float((covariance.whiten(residual) ** 2).sum())
 
 
 def search_with_noise(
@@ -104,8 +30,14 @@ def search_with_noise(
     separation_mas: tuple[float, float] | None = None,
     *,
     per_file: bool = False,
+    prior: NoisePrior | None = None,
 ) -> tuple[SearchResult, ExtraNoise]:
-    """Search, and search again with the extra noise that the residuals ask for.
+    """Search, and search again with the noise that the best of the models leaves.
+
+    The noise is fitted at the best solutions of every search, that with the stated errors
+    included, and the pair of noise and solution with the largest restricted likelihood is
+    taken: a fit that explains the data by noise does not stand where another explains them by
+    light.
 
     Parameters
     ----------
@@ -113,7 +45,8 @@ def search_with_noise(
         With the stated errors.
     separation_mas : (inner, outer), optional
     per_file : bool
-        Judge the noise of every file by itself.
+        Fit the noise of every file by itself.
+    prior : NoisePrior, optional
 
     Returns
     -------
@@ -124,23 +57,39 @@ def search_with_noise(
     """
     result, noise = search(likelihood, separation_mas), ExtraNoise()
     tried = [(_score(result), result, noise)]
-    settled = False
-    while not settled and len(tried) <= MAX_ROUNDS:
-        before, noise = noise, fit_noise(likelihood, result.theta, per_file=per_file)
-        settled = _same(before, noise)
-        if not settled:
-            noisy = Likelihood(add_noise(likelihood.observables, noise), likelihood.model)
-            result = search(noisy, separation_mas)
+    converged = False
+    while not converged and len(tried) <= MAX_ROUNDS:
+        before = noise
+        noise = _best_noise(likelihood, result, per_file=per_file, prior=prior)
+        converged = _same(before, noise)
+        if not converged:
+            result = search(with_noise(likelihood, noise), separation_mas)
             tried.append((_score(result), result, noise))
-    if settled:
+    if converged:
         return tried[-1][1], tried[-1][2]
     # Noise and position chase each other: the most likely pair of those tried stands.
     _, result, noise = min(tried, key=lambda t: t[0])
-    return replace(result, warnings=(*result.warnings, UNSETTLED)), noise
+    return replace(result, warnings=(*result.warnings, NOT_CONVERGED)), noise
 
 
-UNSETTLED = (
-    "companion and extra noise do not settle: the data fit neither, and the most likely of the "
+def _best_noise(
+    stated: Likelihood, result: SearchResult, *, per_file: bool, prior: NoisePrior | None
+) -> ExtraNoise:
+    """The noise of that solution of a search which, each with its own noise, is most likely."""
+    found = []
+    for mode in result.modes[:MODES_TRIED]:
+        theta = np.array(mode.theta)
+        noise = fit_noise(stated, theta, per_file=per_file, prior=prior)
+        found.append((float(with_noise(stated, noise).log_prob(theta)[0]), noise))
+    return max(found, key=lambda f: f[0])[1]
+
+
+MODES_TRIED = 3
+"""Solutions of a search at which the noise is fitted: with errors that are too small, an alias
+may come first by chance."""
+
+NOT_CONVERGED = (
+    "companion and extra noise did not converge: the data fit neither, and the most likely of the "
     "pairs tried is given"
 )
 
@@ -155,7 +104,24 @@ def _same(a: ExtraNoise, b: ExtraNoise) -> bool:
     if a.files and b.files:
         for x, y in zip(a.files, b.files, strict=True):
             pairs += [(x.vis2, y.vis2), (x.closure_phase_rad, y.closure_phase_rad)]
-    return all(abs(x - y) <= SETTLED * max(x, y) for x, y in pairs)
+    near = all(abs(x - y) <= CONVERGED * max(x, y) for x, y in pairs)
+    return near and _same_shares(a, b)
+
+
+def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
+    """Shares of channels agree where they differ by little of what they are uncertain by."""
+    if len(a.channels) != len(b.channels):
+        return False
+    each = zip(a.channels, b.channels, strict=True)
+    return all(
+        abs(x.vis2.value - y.vis2.value) <= SHARE_CONVERGED
+        and abs(x.closure_phase.value - y.closure_phase.value) <= SHARE_CONVERGED
+        for x, y in each
+    )
+
+
+SHARE_CONVERGED = 0.02
+"""Change of a correlation at which search and noise agree: below what a hundred exposures tell."""
 
 
 def noise_averaged(
@@ -165,6 +131,8 @@ def noise_averaged(
     *,
     extra_noise: bool = True,
     per_file: bool = False,
+    channels: Sequence[ChannelShare] = (),
+    prior: NoisePrior | None = None,
 ) -> tuple[SearchResult, TwoCompanions | None]:
     """Give search and second companion a likelihood averaged over the unknown extra noise.
 
@@ -179,6 +147,9 @@ def noise_averaged(
         Student's t distribution all the same.
     per_file : bool
         The noise of every file is unknown by itself.
+    channels : sequence of ChannelShare
+        What channels of an exposure share, as the search found it.
+    prior : NoisePrior, optional
     """
     if not extra_noise and result.robustness is None:
         return result, two
@@ -194,7 +165,9 @@ def noise_averaged(
             per_file=per_file,
         )
     else:
-        noise = averaged_noise(profile.noise, stated, fits, per_file=per_file)
+        noise = averaged_noise(
+            profile.noise, stated, fits, per_file=per_file, channels=channels, prior=prior
+        )
     averaged = profile.with_noise(noise)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))

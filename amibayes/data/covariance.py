@@ -194,7 +194,8 @@ class BlockCovariance:
             raise ValueError("the blocks of a covariance have to tile the data vector")
         self.size = size
         self.blocks = tuple(blocks)
-        self.whitening, self._colouring, self._logdet = self._assemble()
+        self.whitening, colouring, self._logdet = self._assemble()
+        self.colouring = csr_array(colouring.T)
         self._unwhitening = self.whitening.T.tocsr()
         self.rank = int(self.whitening.shape[0])
 
@@ -248,7 +249,7 @@ class BlockCovariance:
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Noise vectors, (size, n)."""
-        return np.asarray(self._colouring.T @ rng.standard_normal((self.rank, n)))
+        return np.asarray(self.colouring @ rng.standard_normal((self.rank, n)))
 
     def dense(self) -> FloatArray:
         """The full matrix, (size, size)."""

@@ -69,13 +69,8 @@ class Statistic(Protocol):
         ...
 
     @property
-    def residual(self) -> FloatArray:
-        """Data less the fit (n_data,) of the data that it was made from."""
-        ...
-
-    @property
     def observed(self) -> FloatArray:
-        """The same whitened, (n_independent,)."""
+        """Whitened residuals (n_data,) of the data that it was made from."""
         ...
 
     @property
@@ -151,8 +146,8 @@ class BankStatistic:
     treatment : ErrorTreatment
     ratio : Ratio
         What is made of a gain in χ².
-    residual : (n_data,) float array
-        Data less the fit, V² then closure phases in radians.
+    observed : (n_data,) float array
+        Whitened residuals of the data.
     """
 
     likelihood: Likelihood
@@ -160,12 +155,7 @@ class BankStatistic:
     bank: TemplateBank
     treatment: ErrorTreatment
     ratio: Ratio
-    residual: FloatArray
-
-    @property
-    def observed(self) -> FloatArray:
-        """Whitened residuals (n_independent,) of the data."""
-        return self.likelihood.noise.whiten(self.residual)
+    observed: FloatArray
 
     @property
     def label(self) -> str:
@@ -339,12 +329,11 @@ def make_statistic(
         Parameters with a companion that is there already.
     """
     bank = TemplateBank(likelihood, grid, single, beside=beside)
-    fit = (single_likelihood(likelihood), single) if beside is None else (likelihood, beside)
-    residual = fit[0].difference(np.atleast_2d(fit[1]))[:, 0]
-    observed = likelihood.noise.whiten(residual)
+    left = single_likelihood(likelihood).residuals(single)
+    observed = (left if beside is None else likelihood.residuals(beside))[:, 0]
     treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)
     ratio = _ratio(likelihood, bank, known=stated_errors and whitening is None)
-    return BankStatistic(likelihood, single, bank, treatment, ratio, residual)
+    return BankStatistic(likelihood, single, bank, treatment, ratio, observed)
 
 
 def _treatment(
@@ -356,12 +345,12 @@ def _treatment(
 ) -> ErrorTreatment:
     if whitening is not None:
         return StudentScores(whitening)
-    null = rotation_null(likelihood.observables, bank.project(observed))
+    null = rotation_null(likelihood.noise, bank.project(observed))
     if null is not None:
         return Rotations(null)
     if stated_errors:
         return KnownErrors()
-    groups = scale_groups(likelihood.observables, bank.n_nuisance)
+    groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.common_rows)
     return FreeScale.measured(groups, bank, observed)
 
 

@@ -9,12 +9,6 @@ from amibayes.data.observables import Measurements
 from amibayes.likelihood.student import symmetric_whitening
 from amibayes.units import IntArray
 
-NOTABLE, SURE = 0.2, 5.0
-"""Correlation between channels that matters, and its size in chance errors.
-
-A correlation of 0.2 makes the variance of a sum over ten channels nearly three times as large.
-"""
-
 
 def channel_correlation(result: SearchResult) -> tuple[float, int]:
     """Correlation of the residuals of a fit between neighbouring channels of a row.
@@ -30,19 +24,14 @@ def channel_correlation(result: SearchResult) -> tuple[float, int]:
         Pairs of data it rests on; by chance it scatters by 1/√n_pairs.
     """
     data = result.likelihood.observables
-    residuals = symmetric_whitening(data).residuals(result.likelihood.residuals(result.theta))[:, 0]
+    # Turned to single channels: what the noise model knows of their correlation is taken out
+    # by the whitening, what is left shows between neighbours.
+    white = result.likelihood.noise.aligned(result.likelihood.residuals(result.theta))
+    residuals = symmetric_whitening(data).residuals(white)[:, 0]
     vis2, closure = _neighbours(data.vis2), _neighbours(data.closure_phase) + data.n_vis2
     first, second = residuals[np.concatenate([vis2, closure], axis=1)]
     norm = float(np.sqrt((first @ first) * (second @ second)))
     return (float(first @ second) / norm if norm else 0.0), len(first)
-
-
-def correlated(result: SearchResult) -> float | None:
-    """Correlation between channels beyond the model of the noise; None where it does not matter."""
-    correlation, n_pairs = channel_correlation(result)
-    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
-        return None
-    return correlation
 
 
 def _neighbours(data: Measurements) -> IntArray:

@@ -19,6 +19,7 @@ Amount = Literal["stated", "extra", "averaged"]
 Residuals = Literal["gaussian", "student"]
 Scope = Literal["common", "per file", "shared calibrators"]
 Bank = Literal["tied", "per band", "motion"]
+Channels = Literal["independent", "correlated"]
 Method = Literal["search", "closed limits", "grid posterior"]
 
 
@@ -40,6 +41,8 @@ class Combination:
     companions : int
     method : {"search", "closed limits", "grid posterior"}
         What is asked of it.
+    channels : {"independent", "correlated"}
+        Whether channels of an exposure share some of their noise.
     """
 
     covariance: CovarianceOrigin = "known"
@@ -49,6 +52,7 @@ class Combination:
     bank: Bank = "tied"
     companions: int = 1
     method: Method = "search"
+    channels: Channels = "independent"
 
 
 def refusal(combination: Combination) -> tuple[str, str] | None:
@@ -59,6 +63,12 @@ def refusal(combination: Combination) -> tuple[str, str] | None:
         return (
             "robust residuals need errors that are stated, not estimated from the scatter",
             "leave --robust out: extraction has left out integrations that are outliers",
+        )
+    if c.residuals == "student" and c.channels == "correlated":
+        # Its weights are those of single data; a common error is no outlier of any of them.
+        return (
+            "robust residuals take the channels of an exposure as independent",
+            "leave --robust or --channel-noise out",
         )
     if c.method == "closed limits" and c.bank != "tied":
         # Their formulae have one linear parameter at each position: one contrast, at rest.

@@ -26,6 +26,8 @@ from amibayes.data.covariance import (
 )
 from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
 from amibayes.data.observables import Observables, closure_sets
+from amibayes.likelihood.channel_noise import ChannelShare, noise_with_channels
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
 from amibayes.units import FloatArray, IntArray
 
@@ -36,8 +38,43 @@ UNLIKELY = 1e-3
 MAX_ROUNDS = 4
 
 
-SETTLED = 0.01
+CONVERGED = 0.01
 """Relative change of the extra noise at which search and noise agree."""
+
+
+VIS2_PRIOR, CLOSURE_PRIOR_RAD = 0.05, float(np.radians(3.0))
+"""Half-normal prior of extra noise: of V², relative to its root mean square, and of closure
+phases. Calibration of a few per cent and degrees is common; more is another model's light."""
+
+BOUND = 3.0
+"""Extra noise is at most so many times the width of its prior."""
+
+
+@dataclass(frozen=True)
+class NoisePrior:
+    """How much noise beside the stated errors is plausible.
+
+    Parameters
+    ----------
+    vis2 : float
+        Width of the half-normal prior of extra noise of V², relative to the root mean square
+        of V².
+    closure_phase_rad : float
+        Likewise of closure phases.
+    channels : bool
+        Whether channels of an exposure may share some of their noise.
+    """
+
+    vis2: float = VIS2_PRIOR
+    closure_phase_rad: float = CLOSURE_PRIOR_RAD
+    channels: bool = True
+
+    def width(self, data: Observables, kind: str) -> float:
+        """Width of the prior of one kind, in the unit of the data."""
+        if kind == "closure_phase_rad":
+            return self.closure_phase_rad
+        value = data.vis2.value[~data.vis2.flag]
+        return self.vis2 * float(np.sqrt(np.mean(value**2))) if len(value) else self.vis2
 
 
 @dataclass(frozen=True)
@@ -62,11 +99,15 @@ class ExtraNoise:
     files : tuple of FileNoise
         What each file gets, where files are told apart; the two above are then the root mean
         squares over all data.
+    channels : tuple of ChannelShare
+        What the channels of an exposure share of the whole variance, for every file where
+        files are told apart; empty where channels are independent.
     """
 
     vis2: float = 0.0
     closure_phase_rad: float = 0.0
     files: tuple[FileNoise, ...] = ()
+    channels: tuple[ChannelShare, ...] = ()
 
     @property
     def any(self) -> bool:
@@ -109,6 +150,12 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
     freedom = welch_satterthwaite([(squared_share(stated, noisy.covariance), data.freedom)])
     scatter = None if data.scatter is None else csr_array(data.scatter + whole - stated)
     return replace(noisy, freedom=freedom, scatter=scatter)
+
+
+def with_noise(likelihood: Likelihood, extra: ExtraNoise) -> Likelihood:
+    """Add extra noise, and what channels share, to a likelihood with the stated errors."""
+    data = add_noise(likelihood.observables, extra)
+    return Likelihood(data, likelihood.model, noise_with_channels(data, extra.channels))
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:

@@ -31,7 +31,7 @@ class Likelihood:
     Parameters
     ----------
     observables : Observables
-        Their covariance is the one that stands for the noise.
+        Values and layout; their covariance is where ``noise`` comes from by default.
     model : BinaryModel, optional
     noise : NoiseModel, optional
         By default what the observables state: Gaussian, or the t distribution of an
@@ -75,11 +75,7 @@ class Likelihood:
 
     def with_noise(self, noise: NoiseModel) -> Likelihood:
         """Make the likelihood of the same data and model with other noise."""
-        data = self.observables
-        if noise.covariance is not data.covariance:
-            known = noise.covariance, noise.freedom, noise.scatter
-            data = replace(data, covariance=known[0], freedom=known[1], scatter=known[2])
-        return Likelihood(data, self.model, noise, self.samples)
+        return Likelihood(self.observables, self.model, noise, self.samples)
 
     @property
     def degrees(self) -> float:
@@ -129,13 +125,16 @@ class Likelihood:
         gradient = np.einsum("sn,psn->np", pull, slopes).real / self.noise.inflation(chi2)[:, None]
         return self.log_norm - 0.5 * self.deviance(chi2), np.asarray(gradient)
 
-    def jacobian(self, theta: ArrayLike) -> FloatArray:
-        """Whitened derivatives of the model at one parameter set, (n_independent, n_dim)."""
+    def slopes(self, theta: ArrayLike) -> FloatArray:
+        """Derivatives of the model of the data at one parameter set, (n_data, n_dim)."""
         value, slopes = self.model.gradient(self.samples, self._sets(theta))
         by_phase = (slopes[:, :, 0] / (value[:, 0] + NEVER_ZERO)).imag.T
         by_vis2 = 2.0 * (slopes[:, :, 0] * value[:, 0].conj()).real.T
-        rows = np.concatenate([self.samples.squares @ by_vis2, self.samples.legs @ by_phase])
-        return self.noise.whiten(rows)
+        return np.concatenate([self.samples.squares @ by_vis2, self.samples.legs @ by_phase])
+
+    def jacobian(self, theta: ArrayLike) -> FloatArray:
+        """Whitened derivatives of the model at one parameter set, (n_independent, n_dim)."""
+        return self.noise.whiten(self.slopes(theta))
 
     def errors(self, theta: ArrayLike) -> FloatArray:
         """Covariance (n_dim, n_dim) of the parameters from the inverse of the Fisher matrix.

@@ -39,7 +39,7 @@ def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> tuple[Part,
     """
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
     primary, scale = response.star, response.scale
-    whitening = likelihood.observables.covariance.whitening
+    whitening = likelihood.noise.covariance.whitening
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
     even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary))

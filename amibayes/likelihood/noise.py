@@ -20,7 +20,8 @@ from scipy.special import gammaln
 from amibayes.data.covariance import Covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
-from amibayes.units import FloatArray
+from amibayes.likelihood.channel_rows import ChannelRows
+from amibayes.units import BoolArray, FloatArray
 
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
@@ -59,6 +60,15 @@ class NoiseModel(Protocol):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the unknown amounts that `log_prob` averages over."""
+        ...
+
+    @property
+    def common_rows(self) -> BoolArray | None:
+        """Whitened rows that channels of an exposure share, (n_independent,); None if none."""
+        ...
+
+    def aligned(self, white: FloatArray) -> FloatArray:
+        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
         ...
 
     @property
@@ -139,12 +149,25 @@ class GaussianNoise:
     Parameters
     ----------
     covariance : Covariance
+    freedom, scatter
+        None: they belong to an `EstimatedNoise`.
+    rows : ChannelRows, optional
+        How whitened data are turned where channels of an exposure share some noise.
     """
 
     covariance: Covariance
-
     freedom: Freedom | None = None
     scatter: csr_array | None = None
+    rows: ChannelRows | None = None
+
+    @property
+    def common_rows(self) -> BoolArray | None:
+        """Whitened rows that channels of an exposure share, (n_independent,); None if none."""
+        return None if self.rows is None else self.rows.common
+
+    def aligned(self, white: FloatArray) -> FloatArray:
+        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
+        return white if self.rows is None else np.asarray(self.rows.rotation.T @ white)
 
     @property
     def n_independent(self) -> int:
@@ -282,6 +305,15 @@ class FittedNoise:
     def scatter(self) -> csr_array | None:
         """That of the fit."""
         return self.fit.scatter
+
+    @property
+    def common_rows(self) -> BoolArray | None:
+        """Those of the fit."""
+        return self.fit.common_rows
+
+    def aligned(self, white: FloatArray) -> FloatArray:
+        """As the fit does it."""
+        return self.fit.aligned(white)
 
     @property
     def n_independent(self) -> int:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.data.observables import Observables
+from amibayes.likelihood.noise import NoiseModel
 from amibayes.units import FloatArray, read_only
 
 NEGLIGIBLE = 1e-9
@@ -61,25 +61,25 @@ class RotationNull:
         return np.asarray((self.factor @ normal + np.outer(self.residual, along)) / length)
 
 
-def rotation_null(data: Observables, residual: FloatArray) -> RotationNull | None:
+def rotation_null(noise: NoiseModel, residual: FloatArray) -> RotationNull | None:
     """Lay out what an estimated covariance rests on; None where the covariance is known.
 
     Parameters
     ----------
-    data : Observables
-        Unflagged. Where its covariance by scatter alone is not known, the prior counts as
+    noise : NoiseModel
+        Where its covariance by scatter alone is not known, the prior counts as
         scatter: there are then as many integrations as the t distribution is worth.
     residual : (n_data,) float array
         Whitened, of the fit without a companion.
     """
-    if data.freedom is None:
+    if noise.freedom is None:
         return None
-    degrees, p = data.freedom.degrees, len(residual)
-    if data.scatter is None:
+    degrees, p = noise.freedom.degrees, len(residual)
+    if noise.scatter is None:
         return RotationNull(degrees, degrees + p, np.sqrt(degrees - 2.0) * np.eye(p), residual)
-    whitening = data.covariance.whitening
-    variance, axes = np.linalg.eigh((whitening @ data.scatter @ whitening.T).toarray())
+    whitening = noise.covariance.whitening
+    variance, axes = np.linalg.eigh((whitening @ noise.scatter @ whitening.T).toarray())
     measured = variance > NEGLIGIBLE * variance[-1]
-    factor = axes[:, measured] * np.sqrt(data.freedom.scatter * variance[measured])
-    rows = max(data.freedom.scatter, factor.shape[1]) + 1.0
+    factor = axes[:, measured] * np.sqrt(noise.freedom.scatter * variance[measured])
+    rows = max(noise.freedom.scatter, factor.shape[1]) + 1.0
     return RotationNull(degrees, rows, factor, residual)

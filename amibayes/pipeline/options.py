@@ -11,6 +11,7 @@ from amibayes.posterior.priors import PriorSetting
 from amibayes.support.options import (
     ALPHA,
     CLIP_CALIBRATORS,
+    NOISE_PRIOR,
     NULL_DRAWS,
     OBSERVABLES,
     SEED,
@@ -45,7 +46,7 @@ class SearchOptions:
     clip : float
         Sigma clipping of the calibrators.
     keep_all : bool
-        Use all calibrators, whatever vetting finds.
+        Use all calibrators, whatever vetting would say of them.
     insname, target : str, optional
         One instrument, one target of a file that holds several.
     flag : tuple of str
@@ -71,10 +72,15 @@ class SearchOptions:
         Largest rate of a motion along east and along north; by default λ/B_max over the span.
     extra_noise : bool
         Add noise per kind of observable where the residuals ask for it.
+    channel_noise : bool
+        Fit what the channels of one exposure share of the noise.
+    noise_prior : (float, float)
+        Widths of the half-normal prior of extra noise: of V², relative to it, and of closure
+        phases, degrees. It is at most three times as large.
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
     file_noise : bool, optional
-        Fit that noise to every file by itself; by default where there are several.
+        Judge that noise for every file by itself; by default where there are several.
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).
@@ -112,6 +118,8 @@ class SearchOptions:
     motion: bool = False
     fastest_mas_yr: float | None = None
     extra_noise: bool = True
+    channel_noise: bool = True
+    noise_prior: tuple[float, float] = NOISE_PRIOR
     robust: bool = False
     file_noise: bool | None = None
     posterior: bool = True

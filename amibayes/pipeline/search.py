@@ -19,12 +19,12 @@ from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm
-from amibayes.pipeline.field import FieldSearch, search_field
+from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Announce, Run, silent
-from amibayes.pipeline.warnings import search_warnings
+from amibayes.pipeline.warnings import search_cautions
 from amibayes.posterior.ensemble import Posterior, sample
 from amibayes.posterior.evidence import Evidence, compare_models
 from amibayes.posterior.grid import GridPosterior, affordable, grid_posterior
@@ -148,7 +148,7 @@ def _limits(
     found: Found, tests: Tests, options: SearchOptions, rng: np.random.Generator, run: Run
 ) -> DetectionLimit | None:
     """Measure the detection limits; None where unwanted or without null draws."""
-    if tests.first is None or tests.first.detected is None or not options.limits:
+    if tests.first is None or not options.limits:
         return None
     with run.stage("limits"):
         return detection_limit(
@@ -186,6 +186,8 @@ def _inferred(
         ready.observables.only(options.observables),
         extra_noise=options.extra_noise,
         per_file=options.file_noise is not False,
+        channels=found.noise.channels,
+        prior=noise_prior(options),
     )
     prior, counts = _prior(result, options), _counts(options)
     grid = samples = evidence = None
@@ -249,7 +251,7 @@ def _report(
 
 
 def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference) -> tuple[str, ...]:
-    warnings = search_warnings(
+    warnings = search_cautions(
         ready.observables, found.result, found.noise, tests.first, posterior.samples
     )
     return (*ready.warnings, *found.warnings, *warnings)

@@ -10,6 +10,7 @@ import numpy as np
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.likelihood.averaged_noise import NoisePosterior
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.support.atomic_files import sha256
 
 Json = dict[str, Any]
@@ -54,6 +55,24 @@ def data_json(result: SearchResult) -> Json:
         "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
         "separation_mas": [result.grid.inner_mas, result.grid.outer_mas],
     }
+
+
+def channel_correlation_json(noise: ExtraNoise) -> Json:
+    """Correlation of neighbouring channels' noise, its error, and what all channels share.
+
+    Of files with correlations of their own the mean.
+    """
+    found: Json = {}
+    for key in ("vis2", "closure_phase"):
+        shares = [getattr(s, key) for s in noise.channels]
+        value, error = (np.array([getattr(s, n) for s in shares]) for n in ("value", "error"))
+        told = np.isfinite(error)
+        found[key] = float(value[told].mean()) if told.any() else 0.0
+        spread = np.sqrt((error[told] ** 2).sum()) / told.sum() if told.any() else np.nan
+        found[f"{key}_error"] = number(float(spread))
+        common = [s.common for s, ok in zip(shares, told, strict=True) if ok]
+        found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
+    return found
 
 
 def noise_interval(found: NoisePosterior, unit: float) -> Json:

@@ -63,7 +63,7 @@ def cannot_write(path: Path, error: OSError) -> RunError:
 
 
 def _reason(error: OSError) -> str:
-    """The message of the system, without what a library wraps around it."""
+    """What the system said, without what a library wraps around it."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
@@ -93,7 +93,7 @@ def sha256(path: str | Path) -> str:
 
 
 def short_names(paths: Sequence[str | Path]) -> list[str]:
-    """Names of files, with as many of their folders as it takes to be distinct."""
+    """Names of files, with as many of their folders as it takes to tell each from the others."""
     parts = [Path(path).parts for path in paths]
     names = []
     for mine in parts:

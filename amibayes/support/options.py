@@ -27,7 +27,7 @@ ExtractionCovariance = Literal["shrunk", "scatter", "physical"]
 """Scatter of the integrations and photon noise combined, or one of them alone."""
 
 Geometry = Literal["fitted", "stated"]
-"""Scale and rotation of the mask, where the image determines them."""
+"""Scale and rotation of the mask, where the image tells them."""
 
 CalibrationMethod = Literal["hierarchical", "weighted"]
 """How calibrators are combined; unless given, by how many share a baseline."""
@@ -68,6 +68,9 @@ COMPANIONS = (0, 1, 2)
 """Numbers of companions whose evidences can be compared."""
 
 SEED = 1
+
+NOISE_PRIOR = (0.05, 3.0)
+"""Widths of the half-normal prior of extra noise: share of V², degrees of closure phase."""
 
 CLIP_CALIBRATORS = 3.0
 """Standard deviations past which a calibrator's value is left out: one in 370 of good ones."""

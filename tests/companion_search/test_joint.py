@@ -18,7 +18,7 @@ from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import resolution_mas, search
 from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.template_bank import TemplateBank, trial_rates
-from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
+from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.covariance import DiagonalCovariance, dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
@@ -30,6 +30,7 @@ from amibayes.likelihood.averaged_noise import averaged_noise, files_share_error
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, add_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.residuals import files_of
 from amibayes.models.bands import band_numbers, bands_of, dates
 from amibayes.models.binary import BinaryModel

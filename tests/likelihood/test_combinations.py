@@ -13,7 +13,6 @@ from helpers import NIRISS_HOLES
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.companion_search.with_extra_noise import fit_noise
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
@@ -24,6 +23,7 @@ from amibayes.likelihood.combinations import Combination, combination_of, refusa
 from amibayes.likelihood.extra_noise import add_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.student_noise import averaged_student_noise
 from amibayes.models.parameters import Box
 

@@ -10,12 +10,13 @@ from helpers import niriss, simulated
 from scipy import stats
 
 from amibayes.companion_search.grid import make_grid
-from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
+from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.detection.treatments import Ratio
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 
 FIELD = (50.0, 400.0)
 EXTRA = ExtraNoise(0.02, np.radians(1.0))

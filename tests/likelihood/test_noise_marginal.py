@@ -13,15 +13,13 @@ from scipy.special import logsumexp
 from weighted_draws import ranks_of
 
 from amibayes.companion_search.optimise import refine
-from amibayes.companion_search.with_extra_noise import fit_noise, search_with_noise
+from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.covariance import dense_covariance
-from amibayes.likelihood.averaged_noise import (
-    MAX_INFLATION,
-    PRIOR_STATED_ERRORS_CORRECT,
-    averaged_noise,
-)
-from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
+from amibayes.likelihood.averaged_noise import averaged_noise
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_terms import MAX_INFLATION, PRIOR_STATED_ERRORS_CORRECT
 from amibayes.models.parameters import Box
 from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import grid_posterior
@@ -37,11 +35,14 @@ def understated(theta, factor, rng):
     return replace(noisy, covariance=niriss().covariance)
 
 
-def averaged(data):
+FLAT = NoisePrior(np.inf, np.inf)
+
+
+def averaged(data, prior=None):
     result, _ = search_with_noise(Likelihood(data), FIELD)
     alone = single_likelihood(result.likelihood)
     fits = [(result.likelihood, result.theta), (alone, result.single_theta)]
-    noise = averaged_noise(result.likelihood.noise, data, fits)
+    noise = averaged_noise(result.likelihood.noise, data, fits, prior=prior)
     return result, result.likelihood.with_noise(noise)
 
 
@@ -51,7 +52,7 @@ def test_average_is_the_integral_over_the_noise(kind, factor, rng) -> None:
     """Against scipy's quadrature of likelihoods whose covariances are made one by one."""
     data = simulated(niriss(0.005 * factor, 0.3 * factor), TRUTH, rng)
     data = replace(data, covariance=niriss(covariance=kind).covariance)
-    result, marginal = averaged(data)
+    result, marginal = averaged(data, FLAT)
     theta = np.array([result.theta, result.theta + np.array([1.0, 2.0, 5e-4])])
     x, w = np.polynomial.legendre.leggauss(150)
     inflation = np.log(MAX_INFLATION) * 0.5 * (1.0 + x)

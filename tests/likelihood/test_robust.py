@@ -14,14 +14,15 @@ from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.robust import RobustFits, search_robust
 from amibayes.companion_search.search import search
-from amibayes.companion_search.with_extra_noise import fit_noise
 from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.detection.statistic import make_statistic
 from amibayes.errors import UsageError
-from amibayes.likelihood.averaged_noise import AveragedNoise, averaged_noise, with_nodes
+from amibayes.likelihood.averaged_noise import AveragedNoise, averaged_noise
 from amibayes.likelihood.extra_noise import add_noise
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_terms import with_nodes
 from amibayes.likelihood.student import DEGREES, normal_moments, scales, scores, symmetric_whitening
 from amibayes.likelihood.student_noise import student_terms
 from amibayes.models.parameters import Box

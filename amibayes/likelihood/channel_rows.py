@@ -1,0 +1,257 @@
+"""Whitened data in the order of their channels, and turned so that a common error is one row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.sparse import csr_array
+
+from amibayes.data.covariance import Block, Covariance, DiagonalCovariance, as_blocks
+from amibayes.data.observables import Observables
+from amibayes.units import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelLayout:
+    """Which whitened rows are the channels of one baseline, or triangles, of one exposure.
+
+    Arrays are sorted by group, and by channel within a group.
+
+    Parameters
+    ----------
+    order : (rank,) int array
+        Where each stands in the whitened data.
+    group : (rank,) int array
+        Numbered from 0.
+    gap : (rank,) float array
+        Channels since the one before in its group; infinite for the first one.
+    weight : (rank,) float array
+        Shape of the common error in units of the errors, of unit mean square in each group.
+    vis2 : (rank,) bool array
+        Rows of V².
+    source : (rank,) int array
+        File that a row comes from, an index into ``names``.
+    names : tuple of str
+    """
+
+    order: IntArray
+    group: IntArray
+    gap: FloatArray
+    weight: FloatArray
+    vis2: BoolArray
+    source: IntArray
+    names: tuple[str, ...]
+
+    @property
+    def starts(self) -> BoolArray:
+        """First rows of the groups, (rank,)."""
+        return np.isinf(self.gap)
+
+    @cached_property
+    def count(self) -> IntArray:
+        """Number of rows of each group."""
+        return np.bincount(self.group)
+
+    @property
+    def any(self) -> bool:
+        """Whether there is a group of several channels."""
+        return bool(len(self.count) and self.count.max() > 1)
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Sums of (rank, …) over the groups, (n_groups, …)."""
+        at = np.flatnonzero(self.starts)
+        return np.asarray(np.add.reduceat(values, at, axis=0))
+
+    def innovations(self, values: FloatArray, neighbour: FloatArray) -> FloatArray:
+        """Differences of sorted rows (rank, …) to what their neighbour predicts, of unit variance.
+
+        (x_i − φ^Δ x_{i−1})/√(1 − φ^{2Δ}) of a correlation φ^Δ between channels Δ apart.
+        """
+        back = self._back(neighbour)
+        before = np.roll(values, 1, axis=0)
+        shape = (-1,) + (1,) * (values.ndim - 1)
+        scale = np.sqrt(1.0 - back**2).reshape(shape)
+        return np.asarray((values - back.reshape(shape) * before) / scale)
+
+    def _back(self, neighbour: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore"):
+            return np.where(
+                self.starts, 0.0, np.power(neighbour, np.where(self.starts, 1, self.gap))
+            )
+
+    def turned(self, common: FloatArray, neighbour: FloatArray) -> ChannelRows:
+        """Rows for shares ρ and correlations φ (rank,), sorted as all else here."""
+        n = len(self.order)
+        cuts = np.append(np.flatnonzero(self.starts), n).tolist()
+        variance = np.ones(n)
+        parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        for first, last in pairwise(cuts):
+            if last == first + 1:
+                parts.append((np.array([first]), np.array([first]), np.ones(1)))
+                continue
+            row, column, value = haar(self.weight[first:last])
+            parts.append((row + first, column + first, value))
+            rho, phi = common[first], neighbour[first]
+            # Differences of neighbours are never trusted more than independent channels are:
+            # what makes neighbours alike (overlap on the detector) blurs the signal there too.
+            rest = np.maximum(variance_of(row, value, phi), 1.0)
+            variance[first:last] = (1.0 - rho) * rest
+            variance[first] += rho * (last - first)
+        places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
+        rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
+        sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
+        several = self.count[self.group] > 1
+        return ChannelRows(
+            csr_array(sort.T @ rotation @ sort),
+            self._unsorted(np.sqrt(variance)),
+            self._unsorted(self.starts & several),
+        )
+
+    def _unsorted(self, values: NDArray[Any]) -> NDArray[Any]:
+        out = np.empty_like(values)
+        out[self.order] = values
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelRows:
+    """Whitened data turned to rows that are independent where their channels are not.
+
+    Parameters
+    ----------
+    rotation : (rank, rank) sparse array
+        Orthonormal; the first row of each group is along its common error.
+    sigma : (rank,) float array
+        Standard deviation of the rows.
+    common : (rank,) bool array
+        Rows along a common error.
+    """
+
+    rotation: csr_array
+    sigma: FloatArray
+    common: BoolArray
+
+
+def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
+    """Variance of rows of channels in order, correlated by φ^|i−j| and of unit variance each."""
+    if phi == 0.0:
+        return np.asarray(np.bincount(row, value**2), dtype=float)
+    before = np.zeros(len(value))
+    cuts = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row)).tolist()
+    for first, last in pairwise(cuts):
+        # Sum of all channels before, each times φ to the power of its distance.
+        before[first:last] = lfilter([0.0, phi], [1.0, -phi], value[first:last])
+    return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
+
+
+def haar(weight: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Sparse orthonormal matrix whose first row is along ``weight`` (n,): row, column, value.
+
+    The other rows are differences between the two halves of a range of channels, of the
+    halves of these, and so on: n log n entries.
+    """
+    n = len(weight)
+    rows, columns, values = [np.zeros(n, dtype=np.intp)], [np.arange(n)], [weight / _norm(weight)]
+    ranges, row = [(0, n)], 1
+    while ranges:
+        first, last = ranges.pop()
+        if last - first < 2:
+            continue
+        middle = (first + last) // 2
+        left, right = weight[first:middle], weight[middle:last]
+        a, b = _norm(left), _norm(right)
+        detail = np.concatenate([left * (b / a), right * (-a / b)]) / np.hypot(a, b)
+        rows.append(np.full(last - first, row))
+        columns.append(np.arange(first, last))
+        values.append(detail)
+        row += 1
+        ranges += [(first, middle), (middle, last)]
+    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
+
+def _norm(x: FloatArray) -> float:
+    return float(np.sqrt(x @ x))
+
+
+def channel_layout(data: Observables) -> ChannelLayout:
+    """Find the rows that are channels of one exposure, in data whitened by their covariance.
+
+    Parameters
+    ----------
+    data : Observables
+        Unflagged, in independent channels. Data that a block correlates across channels, or
+        across kinds, already have their correlations stated: they are groups of one.
+    """
+    group, channel, weight, first = _labelled(data)
+    order = np.lexsort((channel, group))
+    group, channel, weight = group[order], channel[order], weight[order]
+    begins = np.append(True, np.diff(group) != 0)[: len(group)]
+    group = np.cumsum(begins) - 1
+    gap = np.where(begins, np.inf, np.diff(channel, prepend=0).astype(float))
+    mean = np.bincount(group, weight**2) / np.maximum(np.bincount(group), 1)
+    names = tuple(sorted({s.source for s in data.setups}))
+    of_setup = np.array([names.index(s.source) for s in data.setups], dtype=np.intp)
+    setup = np.concatenate([data.vis2.setup, data.closure_phase.setup])[first]
+    return ChannelLayout(
+        order,
+        group,
+        gap,
+        weight / np.sqrt(mean[group]),
+        (first < data.n_vis2)[order],
+        of_setup[setup][order],
+        names,
+    )
+
+
+def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+    """Group, channel, shape of the common error and first datum of each whitened row."""
+    n_vis2 = data.n_vis2
+    setup, row, channel = (
+        np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
+        for name in ("setup", "row", "channel")
+    )
+    sigma = np.sqrt(data.covariance.variance)
+    # The pattern of a gain is V² itself, not below its noise; that of an offset is flat.
+    shape = np.ones(len(sigma))
+    shape[:n_vis2] = np.maximum(np.abs(data.vis2.value), sigma[:n_vis2])
+    vis2, strength = np.arange(len(sigma)) < n_vis2, np.log(shape / sigma)
+    if isinstance(data.covariance, DiagonalCovariance):
+        keys = np.stack([~vis2, setup, row])
+        group = np.unique(keys, axis=1, return_inverse=True)[1].ravel()
+        return group, channel, np.exp(strength), np.arange(len(sigma))
+    number, blocks = _rows_of_blocks(data.covariance)
+    first = np.array([b.index[0] for b in blocks], dtype=np.intp)
+    weight = np.array([np.exp(strength[b.index].mean()) for b in blocks])
+    group = np.empty(len(number), dtype=np.intp)
+    label: dict[object, int] = {}
+    for block, at in zip(blocks, _rows_by_block(number), strict=True):
+        inside = block.index
+        mixed = (channel[inside] != channel[inside[0]]).any() or np.any(
+            vis2[inside] != vis2[inside[0]]
+        )
+        who = tuple(zip(setup[inside].tolist(), row[inside].tolist(), strict=True))
+        for k, place in enumerate(at.tolist()):
+            key = place if mixed else (bool(vis2[inside[0]]), who, k)
+            group[place] = label.setdefault(key, len(label))
+    return group, channel[first][number], weight[number], first[number]
+
+
+def _rows_of_blocks(covariance: Covariance) -> tuple[IntArray, list[Block]]:
+    """Number of the block that each whitened row belongs to, and the blocks."""
+    blocks, whitening = as_blocks(covariance), covariance.whitening
+    home = np.empty(covariance.size, dtype=np.intp)
+    for number, block in enumerate(blocks):
+        home[block.index] = number
+    return home[whitening.indices[whitening.indptr[:-1]]], blocks
+
+
+def _rows_by_block(number: IntArray) -> list[IntArray]:
+    """Rows of each block, in their order, from the block of each row."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)

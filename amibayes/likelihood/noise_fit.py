@@ -1,0 +1,175 @@
+"""Noise as the residuals of a fit show it: extra variance, and what channels share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import optimize
+
+from amibayes.data.covariance import Covariance
+from amibayes.data.observables import Observables
+from amibayes.likelihood.channel_noise import (
+    COMMON,
+    ChannelShare,
+    Correlation,
+    channel_covariance,
+    correlation_of,
+)
+from amibayes.likelihood.channel_rows import ChannelLayout, channel_layout
+from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.extra_noise import (
+    BOUND,
+    UNLIKELY,
+    ExtraNoise,
+    FileNoise,
+    NoisePrior,
+    _with_noise,
+    mean_of_files,
+)
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.residuals import groups_of
+from amibayes.units import BoolArray, FloatArray
+
+ROUNDS = 3
+"""Extra variance and share of the channels in turn; they hardly depend on each other."""
+
+
+def fit_noise(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    *,
+    per_file: bool = False,
+    prior: NoisePrior | None = None,
+) -> ExtraNoise:
+    """Find the noise that makes the residuals of a fit most likely.
+
+    Each kind of observable by itself: it gets extra variance only where its χ² has a
+    probability below `UNLIKELY`, as much as is most probable under the prior and at most
+    `BOUND` times its width. The likelihood is the restricted one: the parameters of the fit
+    take their share of the degrees of freedom.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the stated errors.
+    theta : (n_dim,) float array
+        The fit.
+    per_file : bool
+        Every file has noise of its own.
+    prior : NoisePrior, optional
+    """
+    prior, data = prior or NoisePrior(), likelihood.observables
+    work = _Fit(likelihood, theta, prior)
+    vis2 = np.arange(data.covariance.size) < data.n_vis2
+    found, shares = [], []
+    for source, here in groups_of(data, per_file=per_file):
+        v, v_share = work.of_kind(here & vis2, "vis2")
+        c, c_share = work.of_kind(here & ~vis2, "closure_phase_rad")
+        found.append(FileNoise(source, v, c))
+        shares.append(ChannelShare(v_share, c_share, source))
+    if len(found) == 1:
+        extra = ExtraNoise(found[0].vis2, found[0].closure_phase_rad)
+    else:
+        extra = mean_of_files(data, found)
+    told = any(np.isfinite([s.vis2.error, s.closure_phase.error]).any() for s in shares)
+    return replace(extra, channels=tuple(shares)) if told else extra
+
+
+class _Fit:
+    """Residuals of a fit, and what is asked of their noise."""
+
+    def __init__(self, likelihood: Likelihood, theta: FloatArray, prior: NoisePrior) -> None:
+        self.data, self.prior = likelihood.observables, prior
+        self.difference = likelihood.difference(theta)[:, 0]
+        self.jacobian = likelihood.slopes(theta)
+        self.share = 1.0 - len(theta) / likelihood.n_independent
+
+    def of_kind(self, which: BoolArray, kind: str) -> tuple[float, Correlation]:
+        """Extra noise of some data, and what channels of an exposure share."""
+        amount, shared = 0.0, Correlation()
+        if not which.any():
+            return amount, shared
+        n = self.data.n_vis2
+        part = self.data.select(which[:n], which[n:])
+        one = _Kind(part, self.difference[which], self.jacobian[which], self.share, kind)
+        for _ in range(ROUNDS):
+            before = amount
+            if self.prior.channels and self.data.freedom is None:
+                shared = one.correlation(amount)
+            amount = one.amount(shared, self.prior.width(part, kind))
+            if abs(amount - before) <= 1e-2 * amount:
+                break
+        return amount, shared
+
+
+@dataclass(frozen=True, eq=False)
+class _Kind:
+    """Data of one kind whose noise is one: residuals, slopes of the fit, and layout."""
+
+    data: Observables
+    residual: FloatArray
+    jacobian: FloatArray
+    share: float
+    kind: str
+
+    def covariance(self, amount: float, shared: Correlation) -> Covariance:
+        """With an amount of extra noise, and channels that share some of the noise."""
+        extra = (
+            ExtraNoise(vis2=amount) if self.kind == "vis2" else ExtraNoise(closure_phase_rad=amount)
+        )
+        data = _with_noise(self.data, extra) if amount > 0.0 else self.data
+        if shared.value == 0.0:
+            return data.covariance
+        return channel_covariance(data.covariance, self._layout, [ChannelShare(shared, shared)])
+
+    @cached_property
+    def _layout(self) -> ChannelLayout:
+        """Of the stated errors: extra noise hardly changes their shape over an exposure."""
+        return channel_layout(self.data)
+
+    def explained(self, shared: Correlation) -> bool:
+        """Whether the stated errors explain the residuals, for any share within 2σ."""
+        near = [-2.0, 0.0, 2.0] if np.isfinite(shared.error) else [0.0]
+        degrees, dof = self.data.degrees_of_freedom, self.share * self.data.covariance.rank
+        for sigmas in near:
+            common = float(np.clip(shared.common + sigmas * shared.error, 0.0, COMMON[-1]))
+            tried = replace(shared, common=common) if sigmas else shared
+            chi2 = _chi2(self.covariance(0.0, tried), self.residual)
+            if chi2_survival(chi2, dof, degrees) > UNLIKELY:
+                return True
+        return False
+
+    def amount(self, shared: Correlation, width: float) -> float:
+        """Extra noise; none where the stated errors explain the residuals."""
+        if self.explained(shared):
+            return 0.0
+        stated = self.covariance(0.0, shared)
+        chi2, dof = _chi2(stated, self.residual), self.share * stated.rank
+        typical = float(np.sqrt(np.median(self.data.covariance.variance)))
+        largest = typical * np.sqrt(chi2 / dof)
+
+        def loss(log_sigma: float) -> float:
+            sigma = float(np.exp(log_sigma))
+            noisy = self.covariance(sigma, shared)
+            fit = _chi2(noisy, self.residual) + self.share * noisy.logdet()
+            return fit + (sigma / width) ** 2
+
+        low, high = 1e-2 * typical, min(10.0 * largest, BOUND * width)
+        if high <= low:  # the stated errors are beyond what the prior allows already
+            return 0.0
+        bounds = float(np.log(low)), float(np.log(high))
+        best = optimize.minimize_scalar(
+            loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}
+        )
+        return float(np.exp(best.x))
+
+    def correlation(self, amount: float) -> Correlation:
+        """What channels share, given an amount of extra noise."""
+        base = self.covariance(amount, Correlation())
+        return correlation_of(self._layout, base.whiten(self.residual), base.whiten(self.jacobian))
+
+
+def _chi2(covariance: Covariance, residual: FloatArray) -> float:
+    return float((covariance.whiten(residual) ** 2).sum())

@@ -1,0 +1,222 @@
+"""Noise that channels of an exposure share: algebra, its fit, and honest false alarms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+
+from amibayes.companion_search.grid import make_grid
+from amibayes.data.observables import Observables, join
+from amibayes.data.point_source import point_source
+from amibayes.detection.statistic import make_statistic
+from amibayes.likelihood.channel_noise import (
+    ChannelShare,
+    Correlation,
+    correlation_of,
+    noise_with_channels,
+)
+from amibayes.likelihood.channel_rows import channel_layout, haar
+from amibayes.likelihood.extra_noise import NoisePrior, with_noise
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise_fit import fit_noise
+
+STATIONS = np.array([[0.0, 0.0], [30.0, 10.0], [-20.0, 45.0], [60.0, -30.0]])
+CHANNELS = np.linspace(1.55e-6, 1.75e-6, 6)
+
+
+def pionier(exposures: int = 4, covariance: str = "assumed") -> Observables:
+    """Four telescopes, six channels, exposures while the sky turns."""
+    parts = []
+    for k in range(exposures):
+        c, s = np.cos(0.2 * k), np.sin(0.2 * k)
+        parts.append(
+            point_source(
+                STATIONS @ np.array([[c, s], [-s, c]]),
+                CHANNELS,
+                0.04e-6,
+                vis2_error=0.02,
+                closure_error_rad=np.radians(1.0),
+                covariance=covariance,
+                mjd=60000.0 + 0.02 * k,
+            )
+        )
+    return join(parts)
+
+
+def noisy(data: Observables, shares: ChannelShare, rng) -> Observables:
+    """A point source with noise that channels share."""
+    return with_draw(data, noise_with_channels(data, [shares]).draw(1, rng)[:, 0])
+
+
+def with_draw(data: Observables, draw: np.ndarray) -> Observables:
+    vis2, closure = np.split(data.data + draw, [data.n_vis2])
+    return replace(
+        data,
+        vis2=replace(data.vis2, value=vis2),
+        closure_phase=replace(data.closure_phase, value=closure),
+    )
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 64])
+def test_haar_is_a_rotation_with_the_weights_first(n, rng) -> None:
+    weight = rng.uniform(0.5, 2.0, n)
+    row, column, value = haar(weight)
+    turn = np.zeros((n, n))
+    turn[row, column] = value
+    np.testing.assert_allclose(turn @ turn.T, np.eye(n), atol=1e-12)
+    np.testing.assert_allclose(turn[0], weight / np.linalg.norm(weight))
+    assert len(value) <= n * (2 + np.log2(n))
+
+
+def share(vis2: float, closure: float, neighbour: float = 0.0) -> ChannelShare:
+    found = [Correlation(c, neighbour, c + (1 - c) * neighbour) for c in (vis2, closure)]
+    return ChannelShare(*found)
+
+
+@pytest.mark.parametrize("covariance", ["assumed", "diagonal"])
+def test_covariance_is_the_stated_matrix(covariance, rng) -> None:
+    """Against the matrix written out: channels of a baseline, or of triangles, correlated.
+
+    V² are 1 and errors equal, so that the common error has the same size in every channel.
+    """
+    data = pionier(2, covariance)
+    found = noise_with_channels(data, [share(0.5, 0.3)]).covariance
+    base, n2, expected = data.covariance.dense(), data.n_vis2, np.zeros((data.covariance.size,) * 2)
+    vis2, closure = data.vis2, data.closure_phase
+    same = (vis2.setup[:, None] == vis2.setup) & (vis2.row[:, None] == vis2.row)
+    apart = vis2.channel[:, None] - vis2.channel
+    expected[:n2, :n2] = np.where(same, np.where(apart == 0, 1.0, 0.5) * 0.02**2, 0.0)
+    # Triangles: as within one channel, times the correlation between channels of an exposure.
+    one = {}
+    for a, b in np.argwhere(closure.channel[:, None] == closure.channel):
+        one[closure.setup[a], closure.setup[b], closure.row[a], closure.row[b]] = base[
+            n2 + a, n2 + b
+        ]
+    for a, b in np.ndindex(len(closure), len(closure)):
+        key = closure.setup[a], closure.setup[b], closure.row[a], closure.row[b]
+        apart = closure.channel[a] - closure.channel[b]
+        expected[n2 + a, n2 + b] = one[key] * (1.0 if apart == 0 else 0.3)
+    np.testing.assert_allclose(found.dense(), expected, atol=1e-12)
+    np.testing.assert_allclose(found.variance, np.diag(expected), rtol=1e-9)
+    white = found.whitening.toarray()
+    np.testing.assert_allclose(white @ expected @ white.T, np.eye(found.rank), atol=1e-9)
+    draws = found.draw(rng, 4000)
+    assert np.abs((found.whiten(draws) ** 2).mean(axis=1) - 1.0).max() < 5 * np.sqrt(2 / 4000)
+    values = np.linalg.eigvalsh(expected)
+    assert found.logdet() == pytest.approx(np.log(values[values > 1e-10]).sum(), abs=1e-6)
+    at = np.array([0, 3, n2 + 1])
+    np.testing.assert_allclose(found.select(at).dense(), expected[np.ix_(at, at)], atol=1e-12)
+
+
+@pytest.mark.parametrize("phi", [0.3, 0.8])
+def test_neighbours_raise_the_variance_of_sums_and_of_no_difference_lower_it(phi) -> None:
+    """The mean of an exposure has the variance of the matrix; no direction has less than 1."""
+    data = pionier(1, "diagonal").only(["vis2"])
+    found = noise_with_channels(data, [share(0.0, 0.0, phi)]).covariance.dense() / 0.02**2
+    apart = np.subtract.outer(np.arange(6), np.arange(6))
+    exact = phi ** np.abs(apart)
+    rows = [np.flatnonzero(data.vis2.row == r) for r in np.unique(data.vis2.row)]
+    mean = np.full(6, 1.0 / 6.0)
+    for at in rows:
+        assert mean @ found[np.ix_(at, at)] @ mean == pytest.approx(mean @ exact @ mean, rel=1e-9)
+    assert np.linalg.eigvalsh(found).min() > 1.0 - 1e-9
+
+
+def test_one_channel_and_stated_correlations_stay_as_they_are() -> None:
+    data = niriss()
+    assert not channel_layout(data).any
+    assert noise_with_channels(data, [share(0.5, 0.5)]).covariance is data.covariance
+
+
+def correlated(layout, rho: float, phi: float, n: int, rng) -> np.ndarray:
+    """Whitened noise (rank, n) of the very model, channel by channel."""
+    out, before = np.empty((len(layout.order), n)), np.zeros(n)
+    for k, first in enumerate(layout.starts):
+        if first:
+            gain, before = rng.standard_normal(n), rng.standard_normal(n)
+        else:
+            before = phi * before + np.sqrt(1.0 - phi**2) * rng.standard_normal(n)
+        out[layout.order[k]] = np.sqrt(1.0 - rho) * before + np.sqrt(rho) * gain
+    return out
+
+
+@pytest.mark.parametrize(("rho", "phi"), [(0.0, 0.0), (0.5, 0.0), (0.8, 0.0), (0.3, 0.5)])
+def test_correlation_is_recovered_with_its_error(rho, phi) -> None:
+    """40 data sets of 8 exposures: pulls scatter by 1, whatever the scale of the errors."""
+    rng = np.random.default_rng(4)
+    data = pionier(8).only(["vis2"])
+    layout = channel_layout(data)
+    jacobian = rng.standard_normal((len(layout.order), 3))
+    draws = 3.0 * correlated(layout, rho, phi, 40, rng)
+    found = [correlation_of(layout, left, jacobian) for left in draws.T]
+    truth = rho + (1.0 - rho) * phi
+    pulls = np.array([(f.value - truth) / f.error for f in found])
+    if truth == 0.0:
+        assert 0.0 < np.median(pulls) < 2.0  # correlations are not negative here
+        return
+    # 40 pulls: mean to 0.16, scatter to 0.11; half of a pull is the price of a flat prior.
+    assert abs(pulls.mean()) < 5 * 0.16
+    assert abs(pulls.std() - 1.0) < 5 * 0.11
+
+
+def test_fit_of_noise_finds_share_and_amount(rng) -> None:
+    data = noisy(pionier(16), share(0.5, 0.7), rng)
+    found = fit_noise(Likelihood(data), np.array([10.0, 5.0, 0.0]))
+    (told,) = found.channels
+    assert abs(told.vis2.value - 0.5) < 5 * told.vis2.error < 0.5
+    assert abs(told.closure_phase.value - 0.7) < 5 * told.closure_phase.error < 0.5
+    assert not found.any
+    assert not fit_noise(
+        Likelihood(data), np.array([10.0, 5.0, 0.0]), prior=NoisePrior(channels=False)
+    ).channels
+
+
+def test_extra_noise_is_bounded_by_its_prior(rng) -> None:
+    """A binary that a single star is fitted to looks like noise of tens of degrees."""
+    data = simulated(pionier(4), [12.0, 6.0, 0.5], rng)
+    noise = fit_noise(Likelihood(data), np.array([10.0, 5.0, 0.0]))
+    assert noise.closure_phase_rad <= np.radians(9.0)
+    assert noise.vis2 <= 0.15
+    wide = fit_noise(
+        Likelihood(data), np.array([10.0, 5.0, 0.0]), prior=NoisePrior(1.0, np.radians(60.0))
+    )
+    assert wide.closure_phase_rad > np.radians(12.0)
+
+
+def probabilities(n: int, seed: int) -> np.ndarray:
+    """False-alarm probabilities of null data with half of the variance common to channels."""
+    rng = np.random.default_rng(seed)
+    sheet, null = pionier(8), None
+    draws = noise_with_channels(sheet, [share(0.5, 0.5)]).draw(n, rng)
+    grid, out = make_grid(3.0, 12.0, 1.0), []
+    for draw in draws.T:
+        data = with_draw(sheet, draw)
+        stated = Likelihood(data)
+        theta = np.array([10.0, 5.0, 0.0])
+        likelihood = with_noise(stated, fit_noise(stated, theta))
+        statistic = make_statistic(likelihood, grid, np.empty(0))
+        if null is None:
+            null = np.sort(statistic.draw_null(4000, rng))
+        out.append((1 + (null >= statistic.value).sum()) / 4001.0)
+    return np.array(out)
+
+
+def test_false_alarms_are_uniform_with_half_of_the_noise_common() -> None:
+    """60 null sets, one null distribution: KS p > 1e-4, shares within binomial 1e-4 bounds."""
+    p = probabilities(60, 1)
+    assert stats.kstest(p, "uniform").pvalue > 1e-4
+    hits = int((p < 0.05).sum())
+    assert stats.binomtest(hits, len(p), 0.05, alternative="greater").pvalue > 1e-4
+
+
+@pytest.mark.slow
+def test_false_alarms_are_uniform_in_1000_null_sets() -> None:
+    p = probabilities(1000, 2)
+    assert stats.kstest(p, "uniform").pvalue > 1e-4
+    for level in (0.05, 0.01):
+        hits = int((p < level).sum())
+        assert stats.binomtest(hits, len(p), level, alternative="greater").pvalue > 1e-4
