@@ -49,6 +49,11 @@ class Setup:
         Of the target (0 where unknown).
     response : OffAxisResponse, optional
         What the extraction lets through of light off the axis.
+    array_frame : str
+        FRAME of OI_ARRAY: "GEOCENTRIC" coordinates have their origin in ``array_centre_m``;
+        empty on the sky, or where unknown.
+    array_centre_m : tuple of float
+        ARRAYX, ARRAYY, ARRAYZ.
     """
 
     insname: str
@@ -64,6 +69,8 @@ class Setup:
     right_ascension_deg: float = 0.0
     declination_deg: float = 0.0
     response: OffAxisResponse | None = None
+    array_frame: str = ""
+    array_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         _freeze(self)

@@ -95,7 +95,10 @@ def band_numbers(observables: Observables, names: tuple[str, ...]) -> IntArray:
 
 
 def dates(observables: Observables) -> tuple[float, float, float]:
-    """First, last and mean date (MJD) of the data, the mean weighted by inverse variance.
+    """First, last and mean date (MJD) of the data.
+
+    The mean is weighted by inverse variance within V² and within closure phases, whose variances
+    have different units; each kind counts by its number of data.
 
     Raises
     ------
@@ -114,6 +117,8 @@ def dates(observables: Observables) -> tuple[float, float, float]:
             remedy="fill in the MJD column",
         )
     weight = 1.0 / data.covariance.variance
+    for kind in (slice(0, data.n_vis2), slice(data.n_vis2, None)):
+        weight[kind] /= weight[kind].mean() if weight[kind].size else 1.0
     # Summed about the first date, so that the order of the data does not show.
     mean = mjd.min() + float(np.sum(np.sort(weight * (mjd - mjd.min()))) / np.sum(np.sort(weight)))
     return float(mjd.min()), float(mjd.max()), mean

@@ -40,7 +40,15 @@ class Layout:
         target, targets = _shared(setups, ["target", "right_ascension_deg", "declination_deg"])
         array, arrays = _shared(
             setups,
-            ["arrname", "stations", "station_index", "station_xyz_m", "station_diameter_m"],
+            [
+                "arrname",
+                "stations",
+                "station_index",
+                "station_xyz_m",
+                "station_diameter_m",
+                "array_frame",
+                "array_centre_m",
+            ],
         )
         channel, channels = _shared(setups, ["insname", "wavelength_m", "band_m"])
         arrnames = _distinct([printable(s.arrname) or UNKNOWN for s in arrays])

@@ -191,9 +191,10 @@ def _array_table(layout: Layout, number: int) -> Any:
     }
     table = _table("OI_ARRAY", columns, _only_needed({"DIAMETER_REST": rest}), 1)
     table.header["ARRNAME"] = layout.arrnames[number]
-    table.header["FRAME"] = ("SKY", "station coordinates are not geocentric")
-    for axis in "XYZ":
-        table.header[f"ARRAY{axis}"] = 0.0
+    # Holes of a mask and stations of unknown place are given on the sky.
+    table.header["FRAME"] = (printable(setup.array_frame) or "SKY", "of the station coordinates")
+    for axis, value in zip("XYZ", setup.array_centre_m, strict=True):
+        table.header[f"ARRAY{axis}"] = value if np.isfinite(value) else 0.0
     if layout.arrnames[number] != setup.arrname:
         _own(table, "ARRNAME", setup.arrname)
     return table

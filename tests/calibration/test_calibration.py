@@ -129,7 +129,10 @@ def test_one_calibrator_is_plain_error_propagation(instrument: Instrument) -> No
     by_calibrator = np.diag(np.r_[ratio / calibrator.vis2.value, np.ones(35)])
     expected = by_target @ target.covariance.dense() @ by_target
     expected += by_calibrator @ calibrator.covariance.dense() @ by_calibrator
-    np.testing.assert_allclose(found.observables.covariance.dense(), expected, atol=1e-17)
+    dense = found.observables.covariance.dense()
+    np.testing.assert_allclose(dense[n:, n:], expected[n:, n:], atol=1e-17)
+    # Of V² at expected values, not measured ones: the same but for some times the errors.
+    np.testing.assert_allclose(dense[:n, :n], expected[:n, :n], rtol=0.2, atol=1e-17)
     assert found.observables.covariance.rank == n + 15
     assert found.observables.covariance_kind == "assumed"
     assert found.calibrators[0].kept
@@ -152,7 +155,10 @@ def test_correlations_between_vis2_and_closure_phase_are_carried(rng: np.random.
     c = target.covariance.dense()
     a = np.diag(np.r_[1 / calibrators[0].vis2.value, np.ones(35)])
     b = np.diag(np.r_[target.vis2.value / calibrators[0].vis2.value ** 2, np.ones(35)])
-    np.testing.assert_allclose(single, a @ c @ a + b @ c @ b, atol=1e-16)
+    expected, scale = a @ c @ a + b @ c @ b, np.sqrt(np.diag(a @ c @ a + b @ c @ b))
+    np.testing.assert_allclose(single / scale / scale[:, None], expected / scale / scale[:, None],
+                               atol=0.5)  # fmt: skip
+    np.testing.assert_allclose(single[21:, 21:], expected[21:, 21:], atol=1e-16)
 
 
 def shuffled(star: Observables, rng: np.random.Generator) -> Observables:
@@ -300,13 +306,38 @@ def test_targets_that_share_calibrators_are_correlated(instrument: Instrument) -
     dense, n = found.observables.covariance.dense(), 21
     jacobian = [np.diag(t.vis2.value / calibrator.vis2.value**2) for t in targets]
     expected = jacobian[0] @ calibrator.covariance.dense()[:n, :n] @ jacobian[1]
-    np.testing.assert_allclose(dense[:n, n : 2 * n], expected, atol=1e-17)
+    np.testing.assert_allclose(dense[:n, n : 2 * n], expected, rtol=0.2, atol=1e-17)
     assert [t.n_vis2 for t in found.targets] == [21, 21]
     np.testing.assert_array_equal(found.targets[1].vis2.value, found.observables.vis2.value[21:])
     alone = calibrate(targets[1], [calibrator]).observables
     np.testing.assert_allclose(
-        found.targets[1].covariance.dense(), alone.covariance.dense(), atol=1e-17
+        found.targets[1].covariance.dense(), alone.covariance.dense(), rtol=0.1, atol=1e-17
     )
+
+
+def test_errors_do_not_follow_the_noise() -> None:
+    """A weighted mean of calibrated V² of a point is its plain mean, not below it.
+
+    With errors taken at the measured values it lies 0.9 of its standard errors below, since
+    values that come out low get small errors (d'Agostini 1994).
+    """
+    off = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        stars = [
+            replace(s := point_source(HOLES, [4.8e-6], [1e-7], vis2_error=0.07,
+                                      closure_error_rad=0.1),
+                    vis2=replace(s.vis2, value=1 + 0.07 * rng.normal(size=21),
+                                 mjd=s.vis2.mjd + 0.1 * i))
+            for i in range(7)
+        ]  # fmt: skip
+        found = calibrate(stars[:4], stars[4:], method="weighted", clip=None).observables
+        found = found.only(["vis2"]).unflagged()
+        weight = found.covariance.solve(np.ones(len(found.data)))
+        best = weight @ found.data / weight.sum()
+        off.append((best - found.data.mean()) * np.sqrt(weight.sum()))
+    assert abs(np.mean(off)) < 0.1 + 4 * np.std(off) / np.sqrt(len(off))
+    assert np.std(off) < 0.3
 
 
 def test_mean_of_closures_closes(rng: np.random.Generator) -> None:

@@ -404,3 +404,16 @@ def test_public_files_round_trip(name: str, data: Path, tmp_path: Path) -> None:
     for kind in ("assumed", "diagonal"):
         observables = read_oifits(data / "oifits" / name, closure_covariance=kind)
         round_trip(observables, tmp_path / "a.fits")
+
+
+def test_frame_of_the_stations_is_kept(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Geocentric coordinates stay geocentric; those of a mask are on the sky."""
+    data = random_observables(rng)
+    write_oifits(tmp_path / "sky.fits", data)
+    assert fits.getheader(tmp_path / "sky.fits", "OI_ARRAY")["FRAME"] == "SKY"
+    centre = (1942042.8, -5455305.9, -2654521.4)
+    setup = replace(data.setups[0], array_frame="GEOCENTRIC", array_centre_m=centre)
+    write_oifits(tmp_path / "a.fits", replace(data, setups=(setup,)))
+    again = read_oifits(tmp_path / "a.fits")
+    assert again.setups[0].array_frame == "GEOCENTRIC"
+    assert again.setups[0].array_centre_m == centre
