@@ -66,6 +66,8 @@ class BinaryModel:
         Companions move linearly, at most so fast along east and along north; 0: they stand.
     reference_mjd : float
         Date at which a moving companion is at its east and north.
+    surroundings : tuple of Component
+        What else is on the sky, such as a disc; its parameters are nuisances, component 0.
     """
 
     companions: int = 1
@@ -75,6 +77,7 @@ class BinaryModel:
     bands: tuple[str, ...] = ()
     fastest_mas_yr: float = 0.0
     reference_mjd: float = 0.0
+    surroundings: tuple[Component, ...] = ()
 
     @property
     def n_contrasts(self) -> int:
@@ -95,7 +98,12 @@ class BinaryModel:
             )
             for k in range(self.companions)
         ]
-        return (*companions, Star(self.diameter_mas), Background(self.background))
+        return (
+            *companions,
+            Star(self.diameter_mas),
+            Background(self.background),
+            *self.surroundings,
+        )
 
     @cached_property
     def parameters(self) -> Parameters:

@@ -88,7 +88,7 @@ def test_every_page_stands_in_a_table_of_contents() -> None:
 @pytest.mark.parametrize("page", [p for p in PAGES if "_generated/" in p.read_text()], ids=str)
 def test_pictures_are_those_that_a_script_makes(page: Path) -> None:
     scripts = {"tutorial": "tutorial.py", "gallery": "gallery.py", "statistics": "figures.py"}
-    pictures = ROOT / "amibayes" / "pictures.py"
+    pictures = ROOT / "amibayes" / "plots" / "pictures.py"
     for folder, name in re.findall(r"_generated/(\w+)/(\w+)\.png", page.read_text("utf-8")):
         code = (DOCS / scripts[folder]).read_text("utf-8") + pictures.read_text("utf-8")
         assert name in code, f"{page.name}: {folder}/{name}.png"
