@@ -24,7 +24,7 @@ TRUTH = (96.4, 114.9, 0.01)
 """East and north (mas) and flux ratio of the NIRISS companion."""
 
 N_IMAGES, N_COPIES = 100, 10
-"""Integrations that are simulated, and how often they stand in the cube."""
+"""Integrations that are simulated, and how often they are in the cube."""
 
 
 def niriss() -> Observables:

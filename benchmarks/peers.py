@@ -64,8 +64,8 @@ def version_of(peer: Peer, folder: Path) -> str:
 
 def measure(peer: Peer, folder: Path, *arguments: str) -> dict[str, float]:
     """Run a peer's job and return its CPU seconds by name; see `run`."""
-    said = run(peer, folder, str(JOBS / f"with_{peer.name}.py"), *arguments)
-    lines = [line.split() for line in said.splitlines() if line.startswith("cpu_s ")]
+    output = run(peer, folder, str(JOBS / f"with_{peer.name}.py"), *arguments)
+    lines = [line.split() for line in output.splitlines() if line.startswith("cpu_s ")]
     return {name: float(seconds) for _, name, seconds in lines}
 
 

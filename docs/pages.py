@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def put_table(page: str, lines: Sequence[str], mark: str = "table") -> None:
-    """Replace what stands between ``<!-- mark -->`` and ``<!-- end of mark -->``.
+    """Replace what is between ``<!-- mark -->`` and ``<!-- end of mark -->``.
 
     Parameters
     ----------

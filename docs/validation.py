@@ -21,7 +21,7 @@ def number(value: float | None) -> str:
 
 
 def lines_of(content: dict) -> list[str]:
-    said = "all checks hold" if content["passed"] else "some checks fail"
+    outcome = "all checks hold" if content["passed"] else "some checks fail"
     rows = [
         f"| {c['name']} | {c['n']} | {number(c['measured'])} | {number(c['expected'])} "
         f"| {number(c['error'])} | {c['p_value']:.2g} | {'holds' if c['passed'] else '**fails**'} |"
@@ -29,7 +29,7 @@ def lines_of(content: dict) -> list[str]:
     ]
     return [
         f"Result of the {content['plan']} plan, seed {content['seed']}, {content['n_trials']} "
-        f"stars: {said}.",
+        f"stars: {outcome}.",
         "",
         "| check | stars | measured | expected | error | p | |",
         "|---|---|---|---|---|---|---|",

@@ -5,7 +5,7 @@
 NIRISS aperture masking through F480M. All four share the instrument: each baseline loses
 visibility and shifts phase by amounts of its own, which drift a little from one star to
 the next, about as much as the noise of one exposure. Without calibration nothing fits.
-The truth stands in the headers; the files are the same, byte by byte, on every machine.
+The truth is in the headers; the files are the same, byte by byte, on every machine.
 """
 
 from __future__ import annotations

@@ -53,10 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
         "files": [
             a.as_json()
             | {
-                "fixed": [f.code for f in mended],
-                "copy": str(folder / copies[a.oifits.path]) if mended else None,
+                "fixed": [f.code for f in done],
+                "copy": str(folder / copies[a.oifits.path]) if done else None,
             }
-            for a, mended in zip(audits, fixed, strict=True)
+            for a, done in zip(audits, fixed, strict=True)
         ],
     }
     write_json(folder / RESULT, content)
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str]:
-    """Name of the corrected copy of each file that has something certain to mend.
+    """Name of the corrected copy of each file that has something certain to correct.
 
     Raises
     ------
@@ -103,12 +103,12 @@ def _summary(
 ) -> list[str]:
     """At most 20 lines: what was found, each kind once for a file; the rest is in the JSON."""
     lines = []
-    for a, mended in zip(audits, fixed, strict=True):
+    for a, done in zip(audits, fixed, strict=True):
         count = len(a.findings)
-        said = "nothing found" if not count else f"{count} finding{'s' if count > 1 else ''}"
-        if mended:
-            said += f", {len(mended)} mended in {folder / copies[a.oifits.path]}"
-        lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {said}")
+        found = "nothing found" if not count else f"{count} finding{'s' if count > 1 else ''}"
+        if done:
+            found += f", {len(done)} corrected in {folder / copies[a.oifits.path]}"
+        lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {found}")
         lines += [_line(group) for group in _alike(a.findings)]
     return shortened(lines, [f"explained in {folder / RESULT}"])
 

@@ -72,7 +72,7 @@ class Job:
         command = importlib.import_module(f"amibayes.cli.{self.arguments.command}")
         try:
             return str(command.request(self.arguments))
-        except AmibayesError:  # what is wrong is told when its turn comes
+        except AmibayesError:  # reported when its turn comes
             return ""
 
 
@@ -165,7 +165,7 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
 
 
 def _set_options(own: argparse.Namespace, row: SurveyTarget) -> list[str]:
-    """Set the options of a row; give them as they would stand on the command line."""
+    """Set the options of a row; give them as on the command line."""
     parser = _RowParser(add_help=False, allow_abbrev=False)
     importlib.import_module(f"amibayes.cli.{own.command}").add_arguments(parser)
     words = [
@@ -178,7 +178,7 @@ def _set_options(own: argparse.Namespace, row: SurveyTarget) -> list[str]:
 
 
 def _words(parser: argparse.ArgumentParser, column: str, value: object) -> Iterator[str]:
-    """Write a cell as it would stand on the command line."""
+    """Write a cell as on the command line."""
     flags = parser._option_string_actions
     flag = "--" + column.replace("_", "-")
     if flag not in flags or flag in NOT_OF_A_ROW:
@@ -226,10 +226,10 @@ def _carry_out(
     keys = [outcome.key for outcome in outcomes]
     with (
         common.executor_of(arguments) as executor,
-        common.progress_of(arguments, "targets", unit="target") as told,
+        common.progress_of(arguments, "targets", unit="target") as progress,
     ):
         work = partial(_one, arguments.command)
-        errors = run_job(work, [jobs[k] for k in todo], executor, progress=told)
+        errors = run_job(work, [jobs[k] for k in todo], executor, progress=progress)
         for k, error in zip(todo, errors, strict=True):
             yield k, _outcome(arguments, jobs[k], keys[k], error)
 
@@ -246,7 +246,7 @@ def _outcome(arguments: argparse.Namespace, job: Job, key: str, error: str) -> O
 
 
 def _one(command: str, job: Job) -> str:
-    """Do one target; say in one line what went wrong, or nothing."""
+    """Do one target; give in one line what went wrong, or nothing."""
     if job.arguments is None:
         return job.error
     common.configure_logging(job.arguments)
@@ -258,7 +258,7 @@ def _one(command: str, job: Job) -> str:
     except MemoryError as error:
         return f"not enough memory: {error} (ask for less)"
     except Exception as error:
-        # One target's surprise must not cost the others their night; nothing is hidden.
+        # One target's failure must not end the others; --debug shows it whole.
         logging.getLogger("amibayes").debug("%s failed", job.name, exc_info=True)
         text = " ".join(str(error).split())
         return f"{type(error).__name__}: {text} (a fault of amibayes: run it alone with --debug)"

@@ -17,8 +17,7 @@ from amibayes.support.options import COMPANIONS, EXTRACTION_METHODS, OBSERVABLES
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
-    from amibayes.parallel import Executor, StageBars
-    from amibayes.parallel import Progress as Told
+    from amibayes.parallel import Executor, Progress, StageBars
     from amibayes.posterior.priors import PriorSetting
 
 
@@ -44,9 +43,9 @@ def add_speech_options(group: argparse._ActionsContainer) -> None:
         action="store_true",
         help="print the result as JSON on standard output and nothing else there",
     )
-    loudness = group.add_mutually_exclusive_group()
-    loudness.add_argument("--quiet", action="store_true", help="no progress, no summary")
-    loudness.add_argument("--verbose", action="store_true", help="tell every stage and its seconds")
+    amount = group.add_mutually_exclusive_group()
+    amount.add_argument("--quiet", action="store_true", help="no progress, no summary")
+    amount.add_argument("--verbose", action="store_true", help="report every stage and its seconds")
     group.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
 
@@ -66,7 +65,7 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
         "--temperature",
         type=positive_float,
         metavar="K",
-        help="blackbody that stands for the stars' spectrum (default: as many photons at every "
+        help="blackbody in place of the stars' spectrum (default: as many photons at every "
         "wavelength of the filter)",
     )
     group.add_argument(
@@ -174,7 +173,7 @@ def command_line(arguments: argparse.Namespace) -> str:
 
 def progress_of(
     arguments: argparse.Namespace, description: str, *, unit: str = "piece", scale: float = 1.0
-) -> AbstractContextManager[Told]:
+) -> AbstractContextManager[Progress]:
     """Open a progress bar, unless ``--quiet``."""
     from amibayes.parallel import progress_bar
 

@@ -169,7 +169,7 @@ def add_model(group: argparse._ActionsContainer) -> None:
 
 
 def add_joint(group: argparse._ActionsContainer) -> None:
-    """Add what several files share and what they do not."""
+    """Add what several files share."""
     group.add_argument(
         "--contrast",
         choices=choices(ContrastSharing),
@@ -192,7 +192,7 @@ def add_joint(group: argparse._ActionsContainer) -> None:
         "--file-noise",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="judge noise beyond the stated errors for every file by itself (default: yes)",
+        help="fit noise beyond the stated errors to every file by itself (default: yes)",
     )
 
 
@@ -256,13 +256,13 @@ def add_observables(
 
 
 def add_data(group: argparse._ActionsContainer) -> None:
-    """Add how data are read, calibrated and believed."""
+    """Add how data are read, calibrated and selected."""
     add_reduction(group)
     add_closure_covariance(group)
     add_calibration(group)
     add_calibrator_diameters(group)
     group.add_argument(
-        "--keep-all", action="store_true", help="use every calibrator, whatever vetting says"
+        "--keep-all", action="store_true", help="use every calibrator, whatever vetting finds"
     )
     group.add_argument(
         "--extra-noise",

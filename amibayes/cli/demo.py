@@ -72,12 +72,12 @@ def _commands(folder: Path, seed: int) -> list[list[str]]:
 
 
 def _step(arguments: argparse.Namespace, words: list[str]) -> dict[str, Any]:
-    """Run one command, and say which."""
+    """Run one command, and print it."""
     from amibayes.cli.main import run_command
 
-    said = not (arguments.quiet or arguments.json)
+    prints = not (arguments.quiet or arguments.json)
     line = shlex.join(["amibayes", *words])
-    if said:
+    if prints:
         print(f"$ {line}", flush=True)
     begin = time.perf_counter()
     run_command([*words, "--quiet", *(["--overwrite"] if arguments.overwrite else [])])
@@ -114,7 +114,7 @@ def _compared(true: dict[str, float], fit: dict[str, Any]) -> dict[str, dict[str
 
 
 def _summary(content: dict[str, Any]) -> list[str]:
-    state = {True: "detected", False: "NOT detected", None: "not judged"}[content["detected"]]
+    state = {True: "detected", False: "NOT detected", None: "not tested"}[content["detected"]]
     lines = [
         "",
         f"companion {state}",

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Look, time, and say what was found."""
+    """Inspect, time, and print what was found."""
     common.configure_logging(arguments)
     from amibayes.support.environment import checkup
 

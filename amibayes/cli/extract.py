@@ -61,7 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--geometry",
         choices=choices(Geometry),
         default=choices(Geometry)[0],
-        help="pixel scale and rotation of the mask (default: %(default)s, where the image tells)",
+        help="pixel scale and rotation of the mask (default: %(default)s, where "
+        "the image determines them)",
     )
     group.add_argument("--per-integration", action="store_true", help="write every integration too")
     common.add_output_options(parser, "extract")

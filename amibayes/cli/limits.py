@@ -75,7 +75,7 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="null searches for the false-alarm probability; 0: none (default: "
         f"{LIMITS_NULL_DRAWS} for injection, else {NULL_DRAWS}, "
-        "which only say whether a companion is to be taken out first)",
+        "which only decide whether a companion is taken out first)",
     )
     group.add_argument(
         "--mass-table",
@@ -97,7 +97,7 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure the limits of one target, or of each of a table; a finished run is told again."""
+    """Measure the limits of one target, or of each of a table; a finished run is shown again."""
     common.configure_logging(arguments)
     if arguments.batch is not None:
         return batch.run_batch(arguments)
@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
-    """Measure the limits of one target and write their files, without a word."""
+    """Measure the limits of one target and write their files, without printing."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.support.atomic_files import output_folder

@@ -20,17 +20,17 @@ from amibayes.errors import AmibayesError
 
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
-    "limits": "say what companions a target's data would have shown",
+    "limits": "measure what companions a target's data would have shown",
     "calibrate": "divide the instrument out of a target's data with calibrators",
-    "vet": "say which calibrators may be believed, and why",
+    "vet": "keep or drop each calibrator, with the numbers",
     "extract": "measure V² and closure phases in image cubes",
-    "audit": "say what is wrong or doubtful in OIFITS files",
+    "audit": "list what is wrong or doubtful in OIFITS files",
     "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",
-    "validate": "check on simulated exposures that the numbers mean what they say",
+    "validate": "check coverage and error rates on simulated exposures",
     "plan": "groups, integrations and time of an exposure, and what it lets one see",
     "demo": "simulate, extract, calibrate and search in under a minute, with a report to open",
-    "doctor": "say what this installation has: versions, libraries, cores, speed",
+    "doctor": "list what this installation has: versions, libraries, cores, speed",
     "completion": "print what makes a shell complete commands and options",
 }
 """Command name → one line of help; the module of the same name holds the command."""
@@ -141,7 +141,7 @@ def run_command(words: list[str]) -> int:
 
 
 def _report(error: Exception) -> int:
-    """Say in one line what went wrong; give the exit status."""
+    """Print in one line what went wrong; give the exit status."""
     status = 4
     if isinstance(error, AmibayesError):
         text, status = str(error), error.exit_status
@@ -174,7 +174,7 @@ def _stopped_politely() -> Iterator[None]:
 
 
 def _way_on(words: list[str]) -> str:
-    """Say how to go on, where the command knows how."""
+    """Give the option that goes on, where the command has it."""
     command = next((word for word in words if word in COMMANDS), None)
     if command is None or "--resume" not in _options_of(build_parser(command), command):
         return ""

@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     )
     if arguments.separation[1] * MAS > 3.0 * instrument.field_rad:
         raise UsageError(
-            f"reaches {arguments.separation[1]:g} mas; the baselines tell positions apart over "
+            f"reaches {arguments.separation[1]:g} mas; the baselines distinguish positions over "
             f"{instrument.field_rad / MAS:.0f} mas",
             source="--separation",
             remedy="narrow the range",
@@ -140,7 +140,7 @@ def _curve(curve: ContrastCurve) -> dict[str, list[float]]:
 
 
 def summary(plan: Plan, expected: Expectation) -> list[str]:
-    """Say it in a few lines."""
+    """Sum the plan up in a few lines."""
     import numpy as np
 
     groups, curve, closures = plan.groups, expected.curve, expected.closure_curve

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     batch.add_inputs(parser)
     data_options.add_model(parser.add_argument_group("model"))
     data_options.add_joint(parser.add_argument_group("several files"))
-    _add_weighing(parser.add_argument_group("prior and evidence"))
+    _add_comparison(parser.add_argument_group("prior and evidence"))
     data = parser.add_argument_group("data")
     data_options.add_observables(data, OBSERVABLES, "which observables to fit (default: both)")
     data_options.add_data(data)
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_output_options(parser, "search")
 
 
-def _add_weighing(group: argparse._ArgumentGroup) -> None:
+def _add_comparison(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--prior",
         action="append",
@@ -66,7 +66,7 @@ def _add_weighing(group: argparse._ArgumentGroup) -> None:
         "--companions",
         type=common.companion_counts,
         metavar="0,1,2",
-        help="numbers of companions whose evidences are compared; 2 looks for a second one and "
+        help="numbers of companions whose evidences are compared; 2 searches for a second one and "
         "fits both (default: 0,1 with the posterior)",
     )
     group.add_argument(
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str, object]]:
-    """Run the main job for one target and write its files, without a word."""
+    """Run the main job for one target and write its files, without printing."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
     from amibayes.parallel import Journals
@@ -169,7 +169,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
 def _write(
     arguments: argparse.Namespace, report: SearchReport, folder: Path, request: str
 ) -> dict[str, object]:
-    """Write everything but the chain; the result last, so that it stands for a whole run."""
+    """Write everything but the chain; the result last: where it is, the run is finished."""
     from amibayes.oifits import write_oifits
     from amibayes.plots.pictures import save_pictures
     from amibayes.report import captioned, result_json, search_page, write_page

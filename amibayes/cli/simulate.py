@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, Any]]:
-    """Take and write the exposures; say what each one is."""
+    """Take and write the exposures; describe each."""
     from amibayes.parallel import Journals
     from amibayes.simulation.observe import ramp_path
     from amibayes.simulation.program import naming_source
@@ -91,8 +91,8 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
     with executor_of(arguments) as executor, naming_source(arguments.scene):
         for shot, shutter in program.shutters(arguments.seed):
             path = folder / shot.file_name
-            with progress_of(arguments, shot.name, unit="integration") as told:
-                take(path, shutter, executor, program.history, told, journals)
+            with progress_of(arguments, shot.name, unit="integration") as progress:
+                take(path, shutter, executor, program.history, progress, journals)
             done.append(described(shot, shutter, path))
     journals.remove()
     return done
@@ -103,7 +103,7 @@ def take(
     shutter: PreparedExposure,
     executor: Executor,
     history: tuple[str, ...],
-    told: Progress,
+    progress: Progress,
     journals: Journals,
 ) -> None:
     """Take and write an exposure, unless a run that was cut off has finished it."""
@@ -113,13 +113,13 @@ def take(
     if finished.read(0) is not None and path.is_file():
         return
     pieces = journals.of(path.stem)
-    write_exposure(path, shutter, executor, history=history, progress=told, journal=pieces)
+    write_exposure(path, shutter, executor, history=history, progress=progress, journal=pieces)
     finished.write(0, {"finished": True})
     pieces.remove()
 
 
 def described(shot: ExposureSpec, shutter: PreparedExposure, path: Path) -> dict[str, Any]:
-    """Say what an exposure is, in plain numbers."""
+    """Describe an exposure in plain numbers."""
     import numpy as np
 
     from amibayes.units import MAS
@@ -144,7 +144,7 @@ def described(shot: ExposureSpec, shutter: PreparedExposure, path: Path) -> dict
 
 
 def summary(done: list[dict[str, Any]]) -> list[str]:
-    """Say what was made, in a few lines."""
+    """List what was made."""
     lines = [
         f"{entry['path']}  {entry['filter']}  {entry['n_groups']} groups, "
         f"{entry['n_integrations']} integrations, {entry['total_photons']:.3g} photons"

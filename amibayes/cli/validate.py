@@ -1,4 +1,4 @@
-"""``amibayes validate``: whether the numbers mean what they say, on simulated exposures."""
+"""``amibayes validate``: coverage and error rates on simulated exposures."""
 
 from __future__ import annotations
 

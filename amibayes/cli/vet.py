@@ -1,4 +1,4 @@
-"""``amibayes vet``: which calibrators may be believed."""
+"""``amibayes vet``: keep or drop each calibrator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--calibrated",
         action="store_true",
-        help="the files are calibrated already: judge each by itself, not against the others",
+        help="the files are calibrated already: test each by itself, not against the others",
     )
     data_options.add_separation(group)
     group.add_argument(
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Judge the calibrators and write the verdicts."""
+    """Test the calibrators and write the verdicts."""
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.calibrators)
     levels = arguments.charge_levels

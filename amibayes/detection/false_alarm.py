@@ -7,11 +7,12 @@ normals, so ten thousand searches are two matrix products.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
+from amibayes.detection.binomial import clopper_pearson
+from amibayes.detection.randomised import Randomised
 from amibayes.detection.statistic import Statistic
 from amibayes.detection.tails import (
     MIN_PROBABILITY,
@@ -40,17 +41,20 @@ class Significance:
     null : (n_draws,) float array
         The same for noise alone, sorted.
     probability : float
-        (1 + number of draws at least as large) / (1 + number of draws).
+        (1 + number of draws at least as large) / (1 + number of draws); by randomised
+        residuals, where that is the larger one.
     interval : (float, float)
         95 % Clopper–Pearson interval of the probability.
     tail : Tail or None
         Extrapolation, where the draws reach no further (fewer than 10 at least as large).
     alpha : float
-        Detection means ``probability`` < ``alpha``.
+        Detection means that the upper end of the interval is below ``alpha``.
     test : Statistic, optional
         What was evaluated and drawn.
     field : (n_grid,) float array, optional
         The statistic of the data at every position of the bank.
+    randomised : Randomised, optional
+        The check that owes nothing to the model of the noise.
     """
 
     statistic: float
@@ -61,6 +65,7 @@ class Significance:
     alpha: float
     test: Statistic | None = None
     field: FloatArray | None = None
+    randomised: Randomised | None = None
 
     @property
     def n_draws(self) -> int:
@@ -68,11 +73,39 @@ class Significance:
         return len(self.null)
 
     @property
+    def parametric(self) -> float:
+        """(1 + number of null draws at least as large) / (1 + number of null draws)."""
+        return (1 + self.n_above) / (1 + self.n_draws)
+
+    @property
+    def n_above(self) -> int:
+        """Number of null draws at least as large as the statistic."""
+        return int((self.null >= self.statistic).sum())
+
+    @property
     def detected(self) -> bool | None:
-        """Whether the false-alarm probability is below alpha; None where too few were drawn."""
-        if 1.0 / (1.0 + self.n_draws) >= self.alpha:
+        """Whether the false-alarm probability is below alpha, with confidence.
+
+        The upper end of its interval counts; None where so few were drawn that it could not
+        be below.
+        """
+        if not reachable(self.alpha, self.n_draws):
             return None
-        return self.probability < self.alpha
+        return self.interval[1] < self.alpha
+
+    def beside(self, check: Randomised) -> Significance:
+        """State the larger of this probability and that by randomised residuals."""
+        if check.probability is None or check.interval is None:
+            return replace(self, randomised=check)
+        if check.probability <= self.probability:
+            return replace(self, randomised=check)
+        return replace(
+            self,
+            probability=check.probability,
+            interval=check.interval,
+            tail=None,
+            randomised=check,
+        )
 
     def threshold(self, alpha: float | None = None) -> float:
         """Statistic that noise alone exceeds with probability alpha."""
@@ -153,9 +186,12 @@ def significance(
     )
 
 
-def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact binomial interval of a probability (Clopper & Pearson 1934)."""
-    rest = 0.5 * (1.0 - level)
-    low = stats.beta.ppf(rest, successes, trials - successes + 1) if successes else 0.0
-    high = stats.beta.isf(rest, successes + 1, trials - successes) if successes < trials else 1.0
-    return float(low), float(high)
+def reachable(alpha: float, n_draws: int) -> bool:
+    """Whether so many draws, none of them above, would put the probability below alpha."""
+    return n_draws > 0 and clopper_pearson(0, n_draws)[1] < alpha
+
+
+def draws_needed(alpha: float) -> int:
+    """Smallest number of draws from which a probability below alpha can be told."""
+    n = int(np.ceil(np.log(0.025) / np.log1p(-alpha)))
+    return n if reachable(alpha, n) else n + 1

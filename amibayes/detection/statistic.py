@@ -69,8 +69,13 @@ class Statistic(Protocol):
         ...
 
     @property
+    def residual(self) -> FloatArray:
+        """Data less the fit (n_data,) of the data that it was made from."""
+        ...
+
+    @property
     def observed(self) -> FloatArray:
-        """Whitened residuals (n_data,) of the data that it was made from."""
+        """The same whitened, (n_independent,)."""
         ...
 
     @property
@@ -146,8 +151,8 @@ class BankStatistic:
     treatment : ErrorTreatment
     ratio : Ratio
         What is made of a gain in χ².
-    observed : (n_data,) float array
-        Whitened residuals of the data.
+    residual : (n_data,) float array
+        Data less the fit, V² then closure phases in radians.
     """
 
     likelihood: Likelihood
@@ -155,7 +160,12 @@ class BankStatistic:
     bank: TemplateBank
     treatment: ErrorTreatment
     ratio: Ratio
-    observed: FloatArray
+    residual: FloatArray
+
+    @property
+    def observed(self) -> FloatArray:
+        """Whitened residuals (n_independent,) of the data."""
+        return self.likelihood.noise.whiten(self.residual)
 
     @property
     def label(self) -> str:
@@ -329,11 +339,12 @@ def make_statistic(
         Parameters with a companion that is there already.
     """
     bank = TemplateBank(likelihood, grid, single, beside=beside)
-    left = single_likelihood(likelihood).residuals(single)
-    observed = (left if beside is None else likelihood.residuals(beside))[:, 0]
+    fit = (single_likelihood(likelihood), single) if beside is None else (likelihood, beside)
+    residual = fit[0].difference(np.atleast_2d(fit[1]))[:, 0]
+    observed = likelihood.noise.whiten(residual)
     treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)
     ratio = _ratio(likelihood, bank, known=stated_errors and whitening is None)
-    return BankStatistic(likelihood, single, bank, treatment, ratio, observed)
+    return BankStatistic(likelihood, single, bank, treatment, ratio, residual)
 
 
 def _treatment(

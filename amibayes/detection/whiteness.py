@@ -9,6 +9,12 @@ from amibayes.data.observables import Measurements
 from amibayes.likelihood.student import symmetric_whitening
 from amibayes.units import IntArray
 
+NOTABLE, SURE = 0.2, 5.0
+"""Correlation between channels that matters, and its size in chance errors.
+
+A correlation of 0.2 makes the variance of a sum over ten channels nearly three times as large.
+"""
+
 
 def channel_correlation(result: SearchResult) -> tuple[float, int]:
     """Correlation of the residuals of a fit between neighbouring channels of a row.
@@ -32,6 +38,14 @@ def channel_correlation(result: SearchResult) -> tuple[float, int]:
     first, second = residuals[np.concatenate([vis2, closure], axis=1)]
     norm = float(np.sqrt((first @ first) * (second @ second)))
     return (float(first @ second) / norm if norm else 0.0), len(first)
+
+
+def correlated(result: SearchResult) -> float | None:
+    """Correlation between channels beyond the model of the noise; None where it does not matter."""
+    correlation, n_pairs = channel_correlation(result)
+    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
+        return None
+    return correlation
 
 
 def _neighbours(data: Measurements) -> IntArray:

@@ -16,7 +16,7 @@ from scipy import stats
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import resolution_mas
-from amibayes.detection.false_alarm import Significance
+from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.statistic import Statistic
 from amibayes.errors import UsageError
 from amibayes.limits.aliases import ambiguous, nearer_aliases
@@ -124,6 +124,12 @@ def _without_companion(
     if test is None:
         raise UsageError(
             "the significance holds no statistic", remedy="make it with amibayes.significance"
+        )
+    if significance.detected is None:
+        raise UsageError(
+            f"{significance.n_draws} null draws cannot set a threshold at a false-positive rate "
+            f"of {significance.alpha:g}",
+            remedy=f"draw {draws_needed(significance.alpha)} or more",
         )
     if not significance.detected:
         return test, significance.threshold()

@@ -10,7 +10,7 @@ from astropy.table import QTable
 from scipy import stats
 
 from amibayes.data.tables import UNITS, html_table, quantity_table
-from amibayes.detection.false_alarm import clopper_pearson
+from amibayes.detection.binomial import clopper_pearson
 from amibayes.limits.logistic import Logistic, fit_logistic
 from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag
 

@@ -96,7 +96,7 @@ class DaskExecutor:
         look_s = 1.0
         while True:
             # A finished piece whose worker is gone before its result was fetched is computed
-            # again, so that no look may last forever; but a long result has its time.
+            # again, so that no wait may last forever; but a long result has its time.
             failed = future.status == "error"
             try:
                 return future.result(timeout=look_s)

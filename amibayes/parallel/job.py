@@ -110,7 +110,7 @@ def run_job(
     journal : Journal, optional
         Where finished pieces are kept.
     progress : Progress, optional
-        Told after each piece.
+        Called after each piece.
 
     Yields
     ------
@@ -120,8 +120,8 @@ def run_job(
     kept = {i for i in range(len(pieces)) if journal is not None and journal.read(i) is not None}
     todo = [i for i in range(len(pieces)) if i not in kept]
     fresh = executor.map(function, [pieces[i] for i in todo])
-    tell = progress or _say_nothing
-    tell(len(kept), len(pieces))
+    report = progress or _ignore
+    report(len(kept), len(pieces))
     finished = len(kept)
     for index in range(len(pieces)):
         if journal is not None and index in kept:
@@ -129,12 +129,12 @@ def run_job(
             continue
         result = next(fresh)
         finished += 1
-        tell(finished, len(pieces))
+        report(finished, len(pieces))
         yield result if journal is None else journal.write(index, result)
 
 
-def _say_nothing(done: int, total: int) -> None:
-    """Stand in for a progress bar that nobody asked for."""
+def _ignore(done: int, total: int) -> None:
+    """Take the place of a progress bar that nobody asked for."""
 
 
 def slices(total: int, size: int) -> list[slice]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from tqdm import tqdm
 
 
-def _tell(line: str) -> None:
+def _report(line: str) -> None:
     """Write a line on standard error beside the bars."""
     tqdm.write(line, file=sys.stderr)
 
@@ -59,16 +59,16 @@ class StageBars:
         self._bar: tqdm[None] | None = None
 
     def stage(self, name: str) -> None:
-        """Begin a stage: its name, and a bar as soon as something is said of how far it is."""
+        """Begin a stage: its name, and a bar as soon as its progress is known."""
         self.end()
         self._name, self._counts, self._begun = name, False, time.perf_counter()
         if self._verbose:
-            _tell(f"amibayes: {name}")
+            _report(f"amibayes: {name}")
         if not self._leave:
             self._bar = self._new(0, None, bar_format="{desc} …")
 
     def update(self, done: int, total: int) -> None:
-        """Say how much of the stage is done; the total may grow."""
+        """Show how much of the stage is done; the total may grow."""
         now, end = round(done * self._scale), round(total * self._scale)
         if self._bar is None or not self._counts:
             self.close()
@@ -80,10 +80,10 @@ class StageBars:
             self._bar.refresh()
 
     def end(self) -> None:
-        """End the stage, and tell how long it took where that is wanted."""
+        """End the stage, and report how long it took where that is wanted."""
         self.close()
         if self._verbose and self._name:
-            _tell(f"amibayes: {self._name}: {time.perf_counter() - self._begun:.1f} s")
+            _report(f"amibayes: {self._name}: {time.perf_counter() - self._begun:.1f} s")
         self._name = ""
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ def stage_bars(
     leave : bool
         Keep each bar when its stage is done.
     verbose : bool
-        Tell each stage as it begins, and its seconds as it ends, on standard error.
+        Report each stage as it begins, and its seconds as it ends, on standard error.
     """
     bars = StageBars(unit, scale, quiet=quiet, leave=leave, verbose=verbose)
     try:

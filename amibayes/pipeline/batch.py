@@ -68,7 +68,7 @@ def read_targets(path: str | Path) -> tuple[SurveyTarget, ...]:
     path : path
         ECSV, CSV, FITS or any other table that astropy reads. Column ``target`` names the
         files of a target: several with spaces between them, or semicolons where names hold
-        spaces; ``*`` and ``?`` stand for anything; relative to the table. ``cal`` names its
+        spaces; ``*`` and ``?`` match anything; relative to the table. ``cal`` names its
         calibrators likewise, ``name`` its folder. Every other column is an option.
 
     Raises
@@ -99,8 +99,8 @@ def _table(path: Path) -> Table:
     # Readers of tables raise whatever their format suggests.
     except Exception as error:
         what = "cannot be read" if isinstance(error, OSError) else "is no table"
-        said = error.strerror if isinstance(error, OSError) and error.strerror else error
-        first = str(said).strip().split("\n")[0]
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        first = str(reason).strip().split("\n")[0]
         raise DataError(f"{what}: {first}", source=path, remedy="give an ECSV file") from error
 
 
@@ -141,7 +141,7 @@ def _folder_name(name: str) -> str:
 def _refuse_twins(rows: list[SurveyTarget], path: str | Path) -> None:
     seen: set[str] = set()
     for row in rows:
-        # Not every file system tells capitals from small letters.
+        # Not every file system distinguishes capitals from small letters.
         if row.name.casefold() in seen:
             raise DataError(
                 f"two targets are called '{row.name}'",

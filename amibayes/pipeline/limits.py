@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance
+from amibayes.detection.false_alarm import Significance, draws_needed, reachable
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.analytic import analytic_limit
@@ -25,7 +25,7 @@ from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.run import Announce, Run, silent
-from amibayes.pipeline.warnings import search_cautions
+from amibayes.pipeline.warnings import search_warnings
 from amibayes.support.options import (
     LIMITS_NULL_DRAWS,
     LIMITS_SEPARATIONS,
@@ -149,7 +149,7 @@ def measure_limits(
         # The fourth stream, as in the main job: the same calibration for the same seed.
         rng = np.random.default_rng(seeds[3])
         ready = prepare(targets, calibrators, options.search, rng, run)
-        limits, cautions = _all_limits(ready, options, seeds[5:], run)
+        limits, notes = _all_limits(ready, options, seeds[5:], run)
     return LimitsReport(
         options,
         tuple(str(p) for p in targets),
@@ -157,18 +157,19 @@ def measure_limits(
         ready.observables,
         ready.calibration,
         limits,
-        (*ready.warnings, *cautions),
+        (*ready.warnings, *notes),
         run.seconds,
     )
 
 
 def _refuse(options: LimitsOptions) -> None:
-    if options.criterion == "injection" and options.search.null_draws < 1.0 / options.search.alpha:
+    alpha = options.search.alpha
+    if options.criterion == "injection" and not reachable(alpha, options.search.null_draws):
         raise UsageError(
-            f"{options.search.null_draws} null draws cannot tell a false-alarm probability of "
-            f"{options.search.alpha:g}",
+            f"{options.search.null_draws} null draws cannot measure a false-alarm probability of "
+            f"{alpha:g}",
             source="--null-draws",
-            remedy=f"give {round(10.0 / options.search.alpha)} or more, or another --criterion",
+            remedy=f"give {draws_needed(alpha)} or more, or another --criterion",
         )
     if options.criterion == "closure-phase" and options.observables not in (None, ("cp",)):
         raise UsageError("uses closure phases alone", source="--criterion closure-phase")
@@ -188,14 +189,14 @@ def _all_limits(
         if limits:
             search = _alike(search, limits[0].result)
         try:
-            limit, cautions = _one_limit(ready.observables, search, options, seed, run)
+            limit, notes = _one_limit(ready.observables, search, options, seed, run)
         except DataError as error:
             if not limits:
                 raise
             warnings.append(f"no limit from {' + '.join(kinds)} alone: {error.what}")
             continue
         limits.append(limit)
-        warnings += cautions if len(limits) == 1 else []
+        warnings += notes if len(limits) == 1 else []
     return tuple(limits), warnings
 
 
@@ -243,8 +244,8 @@ def _one_limit(
     with run.stage(f"limits {name}"):
         limit = _limit(found.result, tested, options, streams[1], run)
     measured = MeasuredLimit(search.observables, found.result, found.noise, tested, limit)
-    cautions = search_cautions(data, found.result, found.noise, tested, None)
-    return measured, [*found.warnings, *cautions]
+    notes = search_warnings(data, found.result, found.noise, tested, None)
+    return measured, [*found.warnings, *notes]
 
 
 def _limit(

@@ -46,7 +46,7 @@ class SearchOptions:
     clip : float
         Sigma clipping of the calibrators.
     keep_all : bool
-        Use all calibrators, whatever vetting would say of them.
+        Use all calibrators, whatever vetting finds.
     insname, target : str, optional
         One instrument, one target of a file that holds several.
     flag : tuple of str
@@ -80,7 +80,7 @@ class SearchOptions:
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
     file_noise : bool, optional
-        Judge that noise for every file by itself; by default where there are several.
+        Fit that noise to every file by itself; by default where there are several.
     posterior, limits : bool
         Whether to sample the posterior, and to measure detection limits (which need the
         null draws).

@@ -22,7 +22,7 @@ from amibayes.extraction.reading import check_together, read_observations
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
-from amibayes.pipeline.warnings import calibration_cautions, vetting_cautions
+from amibayes.pipeline.warnings import calibration_warnings, vetting_warnings
 
 MIN_TO_VET = 3
 """Of two calibrators that disagree nothing says which is the bad one."""
@@ -82,7 +82,7 @@ def prepare(
         *different_targets(parts),
     )
     vetting, calibration, observables = _calibrated(parts, references, options, rng, run)
-    warnings = (*vetting_cautions(vetting), *calibration_cautions(calibration), *joined)
+    warnings = (*vetting_warnings(vetting), *calibration_warnings(calibration), *joined)
     return Prepared(observables, tuple(references), calibration, vetting, warnings)
 
 

@@ -51,13 +51,13 @@ def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
     out: list[dict[str, object]] = []
     for k, path in enumerate(report.calibrators):
         vetted = None if verdicts is None else verdicts[k]
-        judged = vetted if vetted is not None and not vetted.kept else next(used)
+        verdict = vetted if vetted is not None and not vetted.kept else next(used)
         agreement = None if vetted is None else vetted.agreement
         out.append(
             {
                 "path": path,
-                "kept": judged.kept,
-                "reason": judged.reason,
+                "kept": verdict.kept,
+                "reason": verdict.reason,
                 "agreement_probability": agreement,
             }
         )

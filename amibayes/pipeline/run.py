@@ -1,4 +1,4 @@
-"""What all stages of a run share: where the work is done, what is kept, who is told."""
+"""What all stages of a run share: executor, journals and progress."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Announce, Run, silent
-from amibayes.pipeline.warnings import search_cautions
+from amibayes.pipeline.warnings import search_warnings
 from amibayes.posterior.ensemble import Posterior, sample
 from amibayes.posterior.evidence import Evidence, compare_models
 from amibayes.posterior.grid import GridPosterior, affordable, grid_posterior
@@ -148,7 +148,7 @@ def _limits(
     found: Found, tests: Tests, options: SearchOptions, rng: np.random.Generator, run: Run
 ) -> DetectionLimit | None:
     """Measure the detection limits; None where unwanted or without null draws."""
-    if tests.first is None or not options.limits:
+    if tests.first is None or tests.first.detected is None or not options.limits:
         return None
     with run.stage("limits"):
         return detection_limit(
@@ -251,7 +251,7 @@ def _report(
 
 
 def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference) -> tuple[str, ...]:
-    warnings = search_cautions(
+    warnings = search_warnings(
         ready.observables, found.result, found.noise, tests.first, posterior.samples
     )
     return (*ready.warnings, *found.warnings, *warnings)

@@ -158,7 +158,7 @@ def _ratio(charge_levels: Sequence[float] | None, k: int) -> float | None:
 
 def _against(one: Observables, others: Sequence[Observables]) -> Observables:
     """What the other calibrators leave of one: V² = 1 and closure phase 0, if all are points."""
-    # The scatter between calibrators is pooled over all baselines: two others can tell it.
+    # The scatter between calibrators is pooled over all baselines: two others are enough for it.
     keys = keys_of(one)
     seen = [np.bincount(match(other, keys).key, minlength=len(keys)) > 0 for other in others]
     method: CalibrationMethod = "hierarchical" if np.sum(seen, axis=0).max() > 1 else "weighted"
@@ -247,7 +247,8 @@ def _by_itself(
     found = search(likelihood, separation_mas)
     # Neither test takes the size of the stated errors for known.
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
-    limit = detection_limit(found, found_by_noise, rng) if limits else None
+    enough = limits and found_by_noise.detected is not None
+    limit = detection_limit(found, found_by_noise, rng) if enough else None
     vetted = replace(vetted, companion=found, significance=found_by_noise, limit=limit)
     if not data.n_vis2:
         return vetted

@@ -1,4 +1,4 @@
-"""What the reader of a result has to be warned of."""
+"""What makes the numbers of a result less certain than they seem."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from scipy.stats import chi2
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance
-from amibayes.detection.whiteness import channel_correlation
+from amibayes.detection.false_alarm import Significance, draws_needed
+from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes
 from amibayes.posterior.ensemble import Posterior, modes_to_sample
 from amibayes.posterior.grid import integrable
 from amibayes.posterior.priors import Prior
-
-NOTABLE, SURE = 0.2, 5.0
-"""Correlation between channels that is worth a warning, and its size in chance errors."""
 
 MAX_NAMED = 3
 """Outliers that a warning names."""
@@ -32,8 +29,8 @@ FAR_TOO_SMALL = 1e-6
 """Probability of a χ² as small, below which the errors are far too large."""
 
 
-def calibration_cautions(calibration: Calibration | None) -> list[str]:
-    """Say what a single calibrator cannot tell."""
+def calibration_warnings(calibration: Calibration | None) -> list[str]:
+    """Warn of what a single calibrator leaves unknown."""
     used = [] if calibration is None else [c for c in calibration.calibrators if c.n_used]
     if len(used) != 1:
         return []
@@ -45,8 +42,8 @@ def calibration_cautions(calibration: Calibration | None) -> list[str]:
     ]
 
 
-def vetting_cautions(vetting: Vetting | None) -> list[str]:
-    """Name the calibrators that vetting dropped, and what it doubts of the kept ones."""
+def vetting_warnings(vetting: Vetting | None) -> list[str]:
+    """Name the calibrators that vetting dropped, and what to know of the kept ones."""
     if vetting is None:
         return []
     dropped = [
@@ -77,7 +74,7 @@ def _outliers(result: SearchResult) -> list[str]:
 
 
 def _of_covariance(result: SearchResult) -> list[str]:
-    """Say where too few integrations tell the covariance, and no expectation helps."""
+    """Warn of a covariance of too few integrations, without an expectation beside it."""
     freedom, p = result.likelihood.observables.freedom, result.likelihood.n_independent
     if freedom is None or freedom.scatter + 1.0 >= ENOUGH * p:
         return []
@@ -91,7 +88,7 @@ def _of_covariance(result: SearchResult) -> list[str]:
 
 
 def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
-    """Say where the errors are so large that CANDID's nσ has lost its meaning."""
+    """Warn where the errors are so large that CANDID's nσ has lost its meaning."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
     which = "the errors, with the noise that was added," if noise.any else "the stated errors"
@@ -102,7 +99,7 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
 
 
 def _of_bright(result: SearchResult) -> list[str]:
-    """Say where the response of an extraction is known to first order only."""
+    """Warn where the response of an extraction is known to first order only."""
     responses = [s.response for s in result.likelihood.observables.setups]
     if result.companion.contrast < BRIGHT or all(r is None or r.single for r in responses):
         return []
@@ -113,7 +110,7 @@ def _of_bright(result: SearchResult) -> list[str]:
     ]
 
 
-def _noise_caution(noise: ExtraNoise) -> str:
+def _noise_warning(noise: ExtraNoise) -> str:
     each = [f for f in noise.files if f.vis2 > 0.0 or f.closure_phase_rad > 0.0]
     if each:
         added = ", ".join(f"{_amount(f.vis2, f.closure_phase_rad)} to {f.source}" for f in each)
@@ -132,7 +129,7 @@ def _amount(vis2: float, closure_phase_rad: float) -> str:
 
 
 def _of_prior(result: SearchResult, prior: Prior) -> list[str]:
-    """Say where the prior leaves the best fit out."""
+    """Warn where the prior leaves the best fit out."""
     c = result.companion.contrast
     if prior.contrast_min <= c <= prior.contrast_max:
         return []
@@ -142,30 +139,30 @@ def _of_prior(result: SearchResult, prior: Prior) -> list[str]:
     ]
 
 
-def _joint_cautions(result: SearchResult) -> list[str]:
-    """Say what free contrasts and motion take away, and where the rate is no measurement."""
+def _joint_warnings(result: SearchResult) -> list[str]:
+    """Warn of what free contrasts and motion take away, and where the rate is no measurement."""
     model = result.likelihood.model
     if integrable(result.likelihood):
         return []
     free = [f"{model.n_contrasts} contrasts"] * (model.n_contrasts > 1) + ["motion"] * model.moves
     found = [
-        f"with {' and '.join(free)} the posterior is not integrated directly: modes are weighed by "
-        "Laplace's approximation, one companion's evidence by importance sampling; limits are of "
-        "one contrast in every band, at rest"
+        f"with {' and '.join(free)} the posterior is not integrated directly: modes have "
+        "probabilities by Laplace's approximation, one companion's evidence by importance "
+        "sampling; limits are of one contrast in every band, at rest"
     ]
     rates = result.theta[result.likelihood.parameters.rates]
     if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
         found.append(
-            f"the rate stands at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
+            f"the rate is at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
             "raise --fastest"
         )
     return found
 
 
 def _correlated(result: SearchResult) -> list[str]:
-    """Say where channels err together: errors alone count them as independent."""
-    correlation, n_pairs = channel_correlation(result)
-    if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
+    """Warn where channels err together: errors alone count them as independent."""
+    correlation = correlated(result)
+    if correlation is None:
         return []
     return [
         f"residuals of neighbouring channels are correlated by {correlation:.2f}, which the "
@@ -174,28 +171,29 @@ def _correlated(result: SearchResult) -> list[str]:
     ]
 
 
-def search_cautions(
+def search_warnings(
     observables: Observables,
     result: SearchResult,
     noise: ExtraNoise,
-    weight: Significance | None,
+    tested: Significance | None,
     posterior: Posterior | None,
 ) -> tuple[str, ...]:
-    """Say what makes the numbers of a search less than they seem."""
-    found = [*result.warnings, *observables.notes, *_joint_cautions(result)]
+    """Warn of what makes the numbers of a search less than they seem."""
+    found = [*result.warnings, *observables.notes, *_joint_warnings(result)]
     found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
     if noise.any:
-        found.append(_noise_caution(noise))
+        found.append(_noise_warning(noise))
     elif result.chi2_binary / result.ndof > 2.0:
         found.append(
             f"reduced chi2 is {result.chi2_binary / result.ndof:.1f} with the companion: the "
             "errors are too small or the model is incomplete, and significance and errors are "
             "too optimistic"
         )
-    if weight is not None and weight.detected is None:
+    if tested is not None and tested.detected is None:
         found.append(
-            f"{weight.n_draws} null draws cannot tell a false-alarm probability below "
-            f"{weight.alpha:g}: nothing is said to be detected or not (raise --null-draws)"
+            f"{tested.n_draws} null draws cannot measure a false-alarm probability below "
+            f"{tested.alpha:g}: no detection is claimed or denied (give --null-draws "
+            f"{draws_needed(tested.alpha)} or more)"
         )
     found += _outliers(result)
     found += _correlated(result)

@@ -17,7 +17,7 @@ from amibayes.plots.style import BLACK, GREY, LIGHT_GREY, marker_of, new_figure,
 from amibayes.units import FloatArray
 
 ROOM_FOR_NAMES, EDGE_OF_NAME = 90, 9
-"""Letters that stand beside each other under a picture; those that a marker takes the room of."""
+"""Letters that fit beside each other under a picture; those that a marker takes the room of."""
 
 MAX_KEYS = 100
 """Numbers of one kind and data set beyond which markers get smaller."""
@@ -54,7 +54,7 @@ def calibrator_plot(
     Returns
     -------
     matplotlib.figure.Figure
-        Baselines and triangles stand in order of their (longest) baseline. Closure phases
+        Baselines and triangles are in order of their (longest) baseline. Closure phases
         of triangles whose stations are given in another order follow in sign.
     """
     kinds = [

@@ -37,7 +37,7 @@ class Curve:
     low, high : (n,) float array, optional
         Spread with position angle, or an interval.
     by_detection : (n,) bool array, optional
-        Where a companion counts wherever it is seen, as its place cannot be told.
+        Where a companion counts wherever it is seen, as its place cannot be measured.
     """
 
     delta_mag: FloatArray
@@ -149,7 +149,7 @@ def _edges(centres: FloatArray) -> FloatArray:
 
 
 def _mark_ambiguous(ax: Axes, separation_mas: FloatArray, curves: Sequence[Curve]) -> None:
-    """Put a cross on every point of a curve where a companion's place cannot be told."""
+    """Put a cross on every point of a curve where a companion's place cannot be measured."""
     label: str | None = "seen, but its place is ambiguous"
     for i, curve in enumerate(curves):
         marked = curve.by_detection

@@ -34,7 +34,7 @@ CONTOUR_POINTS = 10_000
 def label_of(name: str) -> str:
     """Name of a parameter as an axis label, with its unit; unknown names as they are.
 
-    That of a band, as ``contrast[NIRISS_4.82um]``, stands on a second line.
+    That of a band, as ``contrast[NIRISS_4.82um]``, is written on a second line.
     """
     name, _, band = name.partition("[")
     if band:

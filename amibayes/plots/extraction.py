@@ -1,4 +1,4 @@
-"""An extraction to look at: the frame, its power spectrum, the fit, what came of it."""
+"""Pictures of an extraction: the frame, its power spectrum, the fit, the observables."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def frame_plot(extraction: Extraction) -> Figure:
 
 @styled()
 def power_plot(extraction: Extraction) -> Figure:
-    """Draw the power spectrum of the reference frame, and where the splodges are looked for."""
+    """Draw the power spectrum of the reference frame, and where the splodges are searched for."""
     operator = extraction.operators[0]
     view = operator.view
     image = operator.reference.image[view.rows, view.columns]

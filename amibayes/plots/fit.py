@@ -64,7 +64,7 @@ def fit_plot(result: SearchResult) -> Figure:
     -------
     matplotlib.figure.Figure
         For each kind of data that there is, values above residuals in units of each
-        datum's own error. Closure phases stand at the longest baseline of their triangle.
+        datum's own error. Closure phases are drawn at the longest baseline of their triangle.
     """
     kinds = [k for k in _kinds(result) if len(k.observed)]
     figure = new_figure(0.6 + 4.6 * len(kinds))

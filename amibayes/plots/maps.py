@@ -42,7 +42,7 @@ MIN_SHOWN = 1e-12
 """Probabilities below this have one colour."""
 
 HALO = [withStroke(linewidth=3.5, foreground="white")]
-"""Markers stand out on dark and on bright parts of a map."""
+"""Markers that can be seen on dark and on bright parts of a map."""
 
 
 @styled()
@@ -111,13 +111,13 @@ def sky_map(
 
 
 @styled()
-def false_alarm_map(result: SearchResult, weight: Significance) -> Figure:
+def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
     """Draw the false-alarm probability of every position: there alone, and anywhere.
 
     Parameters
     ----------
     result : SearchResult
-    weight : Significance
+    tested : Significance
         Of the same search, with its ``field``.
 
     Returns
@@ -129,20 +129,20 @@ def false_alarm_map(result: SearchResult, weight: Significance) -> Figure:
     """
     figure = new_figure(11.6)
     axes = figure.subplots(2, 1)
-    for ax, (name, p) in zip(axes, probability_maps(weight).items(), strict=True):
+    for ax, (name, p) in zip(axes, probability_maps(tested).items(), strict=True):
         value = np.log10(np.maximum(p, MIN_SHOWN))
         low = min(float(value.min()), -2.0)
         label = f"{name.capitalize()} false-alarm probability (power of ten)"
         _paint(figure, ax, result.grid, value, label, cmap=f"{SEQUENTIAL}_r", vmin=low, vmax=0.0)
         _mark(ax, result)
-    _outline_extrapolation(axes[1], result.grid, weight)
+    _outline_extrapolation(axes[1], result.grid, tested)
     figure.suptitle(_headline(result))
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
 
 
-def probability_maps(weight: Significance) -> dict[str, FloatArray]:
+def probability_maps(tested: Significance) -> dict[str, FloatArray]:
     """Local and global false-alarm probability at every position, (n_grid,) each.
 
     Raises
@@ -150,17 +150,17 @@ def probability_maps(weight: Significance) -> dict[str, FloatArray]:
     ValueError
         Where the significance holds no field.
     """
-    if weight.field is None or weight.test is None:
+    if tested.field is None or tested.test is None:
         raise ValueError("this significance holds no statistic per position")
     return {
-        "local": weight.test.local_survival(weight.field),
-        "global": weight.survival(weight.field),
+        "local": tested.test.local_survival(tested.field),
+        "global": tested.survival(tested.field),
     }
 
 
-def _outline_extrapolation(ax: Axes, grid: Grid, weight: Significance) -> None:
+def _outline_extrapolation(ax: Axes, grid: Grid, tested: Significance) -> None:
     """Draw where the statistic is larger than the null draws reach."""
-    beyond = np.asarray(weight.field) > weight.reach
+    beyond = np.asarray(tested.field) > tested.reach
     if not beyond.any():
         return
     axis = np.arange(-grid.half_width, grid.half_width + 1) * grid.step_mas
@@ -231,7 +231,7 @@ def _mark(ax: Axes, result: SearchResult) -> None:
             markersize=9,
             markeredgewidth=1.5,
             clip_on=False,
-            label="other modes left standing",
+            label="modes within Δχ² 25",
             **plot,
         )
     _edges(ax, result.grid)

@@ -101,7 +101,7 @@ class Picture:
     draw : callable
         Draws it of a `SearchReport`.
     when : callable
-        Tells from the `Stages` of a run whether it is drawn.
+        Decides from the `Stages` of a run whether it is drawn.
     """
 
     name: str
@@ -167,18 +167,18 @@ def _calibrators(report: SearchReport) -> Figure:
 
 
 def _null(report: SearchReport) -> Figure:
-    weight = report.significance
-    assert weight is not None
+    tested = report.significance
+    assert tested is not None
     label = (
         "Largest 2Δln L anywhere in the field, scale of the noise free"
-        if weight.test is not None and weight.test.label != "Δχ²"
+        if tested.test is not None and tested.test.label != "Δχ²"
         else "Largest Δχ² anywhere in the field"
     )
     return null_plot(
-        weight.null,
-        weight.statistic,
-        weight.tail_curves(),
-        alpha=weight.alpha,
+        tested.null,
+        tested.statistic,
+        tested.tail_curves(),
+        alpha=tested.alpha,
         statistic=label,
     )
 
@@ -215,8 +215,8 @@ def _limits(report: SearchReport) -> Figure:
         ),
         "50% recovered": Curve(middle, by_detection=limits.by_detection),
     }
-    weight = report.significance
-    found = report.result.companion if weight is not None and weight.detected else None
+    tested = report.significance
+    found = report.result.companion if tested is not None and tested.detected else None
     fringe = resolution_mas(report.result.likelihood)
     return limits_plot(limits.separation_mas, curves, found, fringe_mas=fringe)
 
@@ -255,7 +255,7 @@ PICTURES = (
     Picture(
         "coverage",
         "Coverage",
-        "Spatial frequencies that the data sample; they set which positions can be told apart.",
+        "Spatial frequencies that the data sample; they set which positions can be distinguished.",
         "data",
         lambda report: coverage_plot(report.result.likelihood.observables),
     ),
@@ -381,8 +381,8 @@ def limits_picture(report: LimitsReport) -> Figure:
         curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
             limit.delta_mag, low, high, limit.by_detection
         )
-    weight, main = report.main.significance, report.main.result
-    found = main.companion if weight is not None and weight.detected else None
+    tested, main = report.main.significance, report.main.result
+    found = main.companion if tested is not None and tested.detected else None
     return limits_plot(
         report.main.limit.separation_mas,
         curves,

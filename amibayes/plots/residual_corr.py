@@ -1,4 +1,4 @@
-"""How the errors of a data set hang together: correlations, and the errors themselves."""
+"""Correlations of the errors of a data set, and the errors themselves."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _draw_matrix(figure: Figure, ax: Axes, correlation: FloatArray, n_vis2: int)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(7, integer=True))
     figure.colorbar(image, ax=ax, label="Correlation", location="bottom", aspect=35, shrink=0.85)
-    ax.set_anchor("N")  # what the square leaves free stands below it, not under the title
+    ax.set_anchor("N")  # what the square leaves free goes below it, not under the title
 
 
 def _which(n_vis2: int, n_closure: int) -> str:

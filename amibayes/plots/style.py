@@ -1,4 +1,4 @@
-"""What all pictures share: size, type, colours that the colour-blind tell apart, and saving.
+"""What all pictures share: size, type, colours that the colour-blind can distinguish, and saving.
 
 Pictures are drawn on the Agg canvas without pyplot, so that nothing needs a screen and no
 state outlives the call. A picture does not depend on the user's own matplotlib settings.
@@ -31,7 +31,7 @@ BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY = (
     "#cc79a7",
     "#56b4e9",
 )
-"""Okabe & Ito's palette, which the common forms of colour blindness tell apart."""
+"""Okabe & Ito's palette, which the common forms of colour blindness leave distinct."""
 
 SERIES = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY)
 MARKERS = ("o", "s", "^", "D", "v", "P")

@@ -23,7 +23,7 @@ from amibayes.plots.style import (
 from amibayes.units import FloatArray
 
 MAX_NAMED = 12
-"""With more targets than this single curves cannot be told apart: they are drawn grey."""
+"""With more targets than this single curves cannot be distinguished: they are drawn grey."""
 
 WIDE = 15.0
 """Ratio of the largest and the smallest separation above which their axis is logarithmic."""
@@ -63,16 +63,16 @@ def survey_plot(curves: Mapping[str, LimitCurve], found: Mapping[str, Found]) ->
     matplotlib.figure.Figure
     """
     names = list(dict.fromkeys([*curves, *found]))
-    told = len(names) <= MAX_NAMED
-    figure = new_figure(5.2 + (0.16 * ((len(names) + 2) // 3) if told else 0.0))
+    named = len(names) <= MAX_NAMED
+    figure = new_figure(5.2 + (0.16 * ((len(names) + 2) // 3) if named else 0.0))
     ax = figure.subplots()
     for k, name in enumerate(names):
-        colour, marker = marker_of(k) if told else (GREY, "o")
+        colour, marker = marker_of(k) if named else (GREY, "o")
         if name in curves:
-            _draw_curve(ax, name, curves[name], k, colour, marker, told)
+            _draw_curve(ax, name, curves[name], k, colour, marker, named)
         if name in found:
-            _draw_companion(ax, name, found[name], colour if told else VERMILLION, marker, told)
-    if not told:
+            _draw_companion(ax, name, found[name], colour if named else VERMILLION, marker, named)
+    if not named:
         _draw_median(ax, curves)
     _scale(ax, curves, found)
     magnitude_axis(ax)
@@ -83,9 +83,9 @@ def survey_plot(curves: Mapping[str, LimitCurve], found: Mapping[str, Found]) ->
 
 
 def _draw_curve(
-    ax: Axes, name: str, curve: LimitCurve, k: int, colour: str, marker: str, told: bool
+    ax: Axes, name: str, curve: LimitCurve, k: int, colour: str, marker: str, named: bool
 ) -> None:
-    if not told:
+    if not named:
         ax.plot(curve.separation_mas, curve.delta_mag, color=GREY, lw=0.8, alpha=0.6)
         return
     dash = DASHES[(k // len(SERIES)) % len(DASHES)]
@@ -102,7 +102,7 @@ def _draw_curve(
 
 
 def _draw_companion(
-    ax: Axes, name: str, found: Found, colour: str, marker: str, told: bool
+    ax: Axes, name: str, found: Found, colour: str, marker: str, named: bool
 ) -> None:
     errors = [found.delta_mag_error, found.separation_error_mas]
     up, along = [e if np.isfinite(e) else None for e in errors]
@@ -111,14 +111,14 @@ def _draw_companion(
         found.delta_mag,
         yerr=up,
         xerr=along,
-        fmt=marker if told else "*",
+        fmt=marker if named else "*",
         color=colour,
         markeredgecolor=BLACK,
         markeredgewidth=1.2,
         markersize=10,
-        label=f"{name}, companion" if told else None,
+        label=f"{name}, companion" if named else None,
     )
-    if not told:
+    if not named:
         place = (found.separation_mas, found.delta_mag)
         ax.annotate(name, place, (-7, 4), textcoords="offset points", ha="right")
 

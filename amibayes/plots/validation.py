@@ -30,7 +30,7 @@ def rank_plot(ranks: Mapping[str, FloatArray], names: Sequence[str]) -> Figure:
     -------
     matplotlib.figure.Figure
         One panel for each quantity: share of ranks below each value, less that value. The
-        band holds 95 % of the curves of a sound programme, whole (Kolmogorov–Smirnov).
+        band holds 95 % of the curves of a correct implementation, whole (Kolmogorov–Smirnov).
     """
     figure = new_figure(0.9 + 2.1 * len(names))
     axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
@@ -64,7 +64,7 @@ def alarm_plot(probability: FloatArray) -> Figure:
     count = np.arange(1, n + 1)
     grid = np.geomspace(min(0.5 / n, float(x[0])), 1.0, 200)
     low, high = stats.binom.ppf([[0.025], [0.975]], n, grid) / n
-    ax.fill_between(grid, low, high, color=LIGHT_GREY, lw=0, label="95 % of sound programmes")
+    ax.fill_between(grid, low, high, color=LIGHT_GREY, lw=0, label="95 % if correct")
     ax.plot(grid, grid, color=BLACK, ls=":", label="stated = measured")
     ax.step(x, count / n, where="post", color=BLUE, lw=2.0, label=f"{n} stars")
     ax.set(xscale="log", yscale="log", ylim=(0.3 / n, 1.3))

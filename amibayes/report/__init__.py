@@ -1,4 +1,4 @@
-"""What a run says: ``result.json``, ``limits.json``, summaries, and ``report.html``."""
+"""What a run writes: ``result.json``, ``limits.json``, summaries, and ``report.html``."""
 
 from amibayes.report.common import Json, number
 from amibayes.report.limits import (

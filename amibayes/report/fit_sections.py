@@ -103,7 +103,7 @@ def significance(content: Json) -> Section:
             fixed(s["delta_chi2"], 1),
             "Twice the gain in ln likelihood over the best fit without a companion: the difference "
             "of the two χ² where the errors are known, less where they were estimated from few "
-            "integrations. What a value is worth depends on how many positions were tried.",
+            "integrations. What a value means depends on how many positions were tried.",
         ),
         Fact(
             "CANDID nσ",
@@ -156,7 +156,7 @@ def _local(content: Json) -> Fact:
     return Fact(
         "Local significance",
         f"{fixed(gain**0.5, 1)} σ",
-        "Root of Δχ², as if no other position had been tried; the field makes it worth less.",
+        "Root of Δχ², as if no other position had been tried; the size of the field is not in it.",
     )
 
 
@@ -227,7 +227,7 @@ def _places(quantity: Json) -> int:
 
 
 def evidence(content: Json) -> Section | None:
-    """Models with different numbers of companions, weighed against each other."""
+    """Models with different numbers of companions, compared."""
     e = content["evidence"]
     if e is None:
         return None
@@ -249,7 +249,7 @@ def evidence(content: Json) -> Section | None:
         Column("Computed by", "text"),
     )
     text = (
-        "The evidence Z weighs models with all their parameters integrated over the prior; the "
+        "The evidence Z compares models with all their parameters integrated over the prior; the "
         "probabilities are those of the models given the data, and depend on that prior.",
     )
     table = Table("Evidence and probability of each number of companions", columns, rows)
@@ -285,7 +285,7 @@ def limits(content: Json) -> Section | None:
     text = (
         f"Companions were injected into data without one and searched for by the same criterion "
         f"(method {found['method']}, false-positive rate "
-        f"{plain(found['false_positive_rate'], 2)}). A dash stands where none is recovered "
+        f"{plain(found['false_positive_rate'], 2)}). A dash is given where none is recovered "
         "reliably, whatever its brightness.",
     )
     rows = tuple(

@@ -82,7 +82,7 @@ def _one_file(path: str, f: FileResiduals) -> Json:
 
 
 def noise_files_json(report: SearchReport) -> Json:
-    """Extra noise of every file, where they were judged apart."""
+    """Extra noise of every file, where they have noise of their own."""
     options = report.options
     if not is_joint(report) or options.file_noise is False or not options.extra_noise:
         return {}

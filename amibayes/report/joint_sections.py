@@ -64,7 +64,7 @@ def _motion(fit: Json) -> tuple[Table, ...]:
 
 
 def _files(content: Json) -> tuple[Table, ...]:
-    """Reduced χ² of every file, and the noise that was added to it where files were told apart."""
+    """Reduced χ² of every file, and its noise where files have noise of their own."""
     if "residuals" not in content:
         return ()
     extra = {f["path"]: f for f in content["noise"].get("files", ())}

@@ -122,7 +122,7 @@ def write_limits_table(path: str | Path, report: LimitsReport) -> None:
 
 
 def limits_summary(content: Json, folder: Path) -> list[str]:
-    """Say the content of ``limits.json`` in at most 20 lines."""
+    """Sum ``limits.json`` up in at most 20 lines."""
     data = content["data"]
     lines = [
         f"data        {data['n_vis2']} V2, {data['n_closure_phases']} closure phases, "

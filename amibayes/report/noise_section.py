@@ -13,7 +13,7 @@ Json = dict[str, Any]
 KINDS = {"extra_vis2": "V²", "extra_closure_phase_deg": "closure phase (°)"}
 
 MAX_OUTLIERS = 20
-"""Rows of the table; the rest stands in result.json."""
+"""Rows of the table; the rest is in result.json."""
 
 
 def noise(content: Json) -> Section:

@@ -32,7 +32,7 @@ PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table; numbers stand to the right, code may break anywhere."""
+    """A column of a table; numbers are aligned to the right, code may break anywhere."""
 
     title: str
     kind: Literal["text", "number", "code"] = "number"
@@ -52,7 +52,7 @@ class Table:
 
     @property
     def stacks(self) -> bool:
-        """Whether its rows are too wide for a telephone and stand there one below the other."""
+        """Whether its rows are too wide for a telephone and are stacked there."""
         kinds = [column.kind for column in self.columns]
         return "code" in kinds or (kinds[0] == "text" and len(kinds) > MAX_ON_A_TELEPHONE)
 
@@ -68,7 +68,7 @@ class Fact:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture as it stands in the page.
+    """A picture of the page.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ class Sky:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it, in this order."""
+    """A heading and what is under it, in this order."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -146,7 +146,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Statement:
-    """The answer in words: a label, one sentence, and what has to be said with it."""
+    """The answer in words: a label, one sentence, and what qualifies it."""
 
     kind: Kind
     label: str
@@ -166,7 +166,7 @@ class Page:
     subtitle : str
     statement : Statement
     facts : tuple of Fact
-        The few numbers that stand under the statement.
+        The few numbers under the statement.
     sections : tuple of Section
     sky : Sky, optional
     warnings : tuple of str, optional

@@ -141,7 +141,7 @@ def companion_errors(c: Companion) -> Json:
     return {name: number(value) for name, value in errors.items()}
 
 
-def _significance(result: SearchResult, weight: Significance | None, alpha: float) -> Json:
+def _significance(result: SearchResult, tested: Significance | None, alpha: float) -> Json:
     out: Json = {
         "delta_chi2": result.delta_chi2,
         "candid_n_sigma": result.candid_n_sigma,
@@ -152,23 +152,37 @@ def _significance(result: SearchResult, weight: Significance | None, alpha: floa
         "detected": None,
         "alpha": alpha,
     }
-    if weight is not None:
+    if tested is not None:
         out |= {
-            "false_alarm_probability": weight.probability,
-            "false_alarm_interval": list(weight.interval),
-            "n_null_draws": weight.n_draws,
-            "detected": weight.detected,
-            "statistic": weight.statistic,
-            "threshold": weight.threshold(),
+            "false_alarm_probability": tested.probability,
+            "false_alarm_interval": list(tested.interval),
+            "n_null_draws": tested.n_draws,
+            "detected": tested.detected,
+            "statistic": tested.statistic,
+            "threshold": tested.threshold(),
+            "parametric": tested.parametric,
+            "randomised": _randomised(tested),
             "extrapolation": None
-            if weight.tail is None
+            if tested.tail is None
             else {
-                "generalised_pareto": weight.tail.generalised_pareto,
-                "extreme_value": weight.tail.extreme_value,
-                "log10_error": number(weight.tail.log10_error),
+                "generalised_pareto": tested.tail.generalised_pareto,
+                "extreme_value": tested.tail.extreme_value,
+                "log10_error": number(tested.tail.log10_error),
             },
         }
     return out
+
+
+def _randomised(weight: Significance) -> Json | None:
+    check = weight.randomised
+    if check is None:
+        return None
+    return {
+        "n_exposures": check.n_exposures,
+        "n_draws": check.n_draws,
+        "probability": check.probability,
+        "interval": None if check.interval is None else list(check.interval),
+    }
 
 
 def _modes(report: SearchReport) -> list[Json]:
@@ -245,8 +259,8 @@ def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
     At the stated prior, and with a contrast uniform in the same range, which unlike a
     log-uniform one does not depend on its lower end.
     """
-    weight, posterior, grid = report.significance, report.posterior, report.grid
-    if posterior is None or (weight is not None and weight.detected):
+    tested, posterior, grid = report.significance, report.posterior, report.grid
+    if posterior is None or (tested is not None and tested.detected):
         return None
     if grid is None:
         contrast, uniform = float(np.quantile(posterior.column("contrast"), level)), math.nan

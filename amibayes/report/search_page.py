@@ -35,7 +35,7 @@ COVARIANCE = {
 
 
 def search_page(content: Json, figures: Sequence[Figure] = (), command: str = "") -> Page:
-    """Tell a search so that a referee can follow it.
+    """Lay a search out so that a referee can follow it.
 
     Parameters
     ----------
@@ -81,10 +81,10 @@ def captioned(folder: str | Path, names: Sequence[str]) -> list[Figure]:
         if not name.endswith(".png"):
             continue
         title = Path(name).stem.replace("_", " ").replace("-", " ").capitalize()
-        told = (title, f"Picture {name}.", "")
+        shown = (title, f"Picture {name}.", "")
         if name in known:
-            told = known[name].title, known[name].text, known[name].section
-        figures.append(read_figure(Path(folder) / name, *told))
+            shown = known[name].title, known[name].text, known[name].section
+        figures.append(read_figure(Path(folder) / name, *shown))
     return figures
 
 
@@ -104,15 +104,15 @@ def _subtitle(content: Json) -> str:
 def _tiles(content: Json) -> tuple[Fact, ...]:
     """The companion's numbers, or where none was detected those of what there is not."""
     fit, errors = content["fit"], content["fit"]["errors"]
-    told = false_alarm(content["significance"])
-    alarm = Fact("False-alarm probability", told, "by noise, anywhere in the field")
+    chance_text = false_alarm(content["significance"])
+    alarm = Fact("False-alarm probability", chance_text, "by noise, anywhere in the field")
     if content["significance"]["detected"] is False:
         return (alarm, *_excluded(content))
     if fit["contrast"] <= 0.0:
         return (alarm,)
-    judged = "" if content["significance"]["detected"] else " (best fit)"
+    label = "" if content["significance"]["detected"] else " (best fit)"
     place = (
-        Fact(f"{name}{judged}", measured(fit[key], errors[key], unit))
+        Fact(f"{name}{label}", measured(fit[key], errors[key], unit))
         for name, key, unit in (
             ("Separation", "separation_mas", " mas"),
             ("Position angle", "position_angle_deg", "°"),
@@ -171,7 +171,7 @@ def _inputs(content: Json) -> Table:
 
 def _calibration(calibration: Json) -> str:
     kept = sum(c["kept"] for c in calibration["calibrators"])
-    said = (
+    text = (
         f"{count(kept, 'calibrator')} of {len(calibration['calibrators'])} used, combined by the "
         f"{calibration['method']} method."
     )
@@ -185,8 +185,8 @@ def _calibration(calibration: Json) -> str:
         if tau.get(key) is not None
     ]
     if not parts:
-        return said
-    return f"{said} They scatter by {' and '.join(parts)} more than their errors say."
+        return text
+    return f"{text} They scatter by {' and '.join(parts)} more than their errors explain."
 
 
 def _calibrators(calibration: Json) -> Table:
@@ -224,7 +224,7 @@ SECTIONS: dict[str, Callable[[Json], Section | None]] = {
 """The sections of the report in their order, by the name that `Picture.section` gives.
 
 A function makes a section of the content of ``result.json``, or None where there is nothing
-to tell; its pictures are put in afterwards. A new section is one more line.
+to show; its pictures are put in afterwards. A new section is one more line.
 """
 
 
@@ -239,7 +239,7 @@ def _again(content: Json, command: str) -> Section:
         code=command,
         notes=(
             f"amibayes {content['amibayes']}, seed {content['seed']}, field {field(content)}; "
-            f"Python {platform.python_version()}, {packages}. Every number of this page stands "
+            f"Python {platform.python_version()}, {packages}. Every number of this page is "
             "in result.json with all its digits.",
         ),
     )

@@ -34,8 +34,8 @@ def place(content: Json) -> str:
     separation = measured(fit["separation_mas"], errors["separation_mas"], "\u00a0mas")
     angle = measured(fit["position_angle_deg"], errors["position_angle_deg"], "°")
     magnitude = measured(fit["delta_mag"], errors["delta_mag"], "\u00a0mag")
-    told = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
-    return told.replace(" ±", "\u00a0±")
+    text = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
+    return text.replace(" ±", "\u00a0±")
 
 
 def field(content: Json) -> str:
@@ -63,14 +63,14 @@ def _chance(content: Json) -> str:
     probability, draws = significance["false_alarm_probability"], significance["n_null_draws"]
     if probability is None:
         return (
-            "No data without a companion were simulated, so nothing is said of how often noise "
-            "alone would look like this."
+            "No data without a companion were simulated, so how often noise alone "
+            "would give this is not known."
         )
     low, high = significance["false_alarm_interval"]
     alpha = plain(significance["alpha"], 2)
     asked = f"a detection is claimed below {alpha}"
     if significance["detected"] is None:
-        asked = f"too few to tell anything below {alpha}"
+        asked = f"too few to measure anything below {alpha}"
     if low == 0.0:
         # Where the bound does not meet what is asked, the estimate does.
         decided = significance["detected"] and high >= significance["alpha"]
@@ -106,13 +106,13 @@ def _others(content: Json) -> str:
     others = [m for m in modes[1:] if m.get("probability", 1.0) >= 0.01]
     if not others:
         return ""
-    told = "; ".join(
+    text = "; ".join(
         f"{plain(m['separation_mas'], 4)} mas at {plain(m['position_angle_deg'], 4)}°"
         + (f" (probability {chance(m['probability'])})" if "probability" in m else "")
         for m in others[:3]
     )
     more = f" and {len(others) - 3} more" if len(others) > 3 else ""
-    return f"The data do not rule out another position: {told}{more}."
+    return f"The data do not rule out another position: {text}{more}."
 
 
 def _limits(content: Json) -> str:
@@ -156,14 +156,14 @@ def sky_of(content: Json) -> Sky:
     for mode in content["modes"][1:]:
         east, north = offset(mode["separation_mas"], mode["position_angle_deg"])
         marks.append(Mark(float(east), float(north), "mode"))
-    told = f"Sketch of the field, {field(content)} around the star, north up and east left"
+    text = f"Sketch of the field, {field(content)} around the star, north up and east left"
     if fit["contrast"] > 0.0:
         kind = "companion" if detected else "candidate"
         marks.append(Mark(fit["east_mas"], fit["north_mas"], kind))  # type: ignore[arg-type]
-        told += (
+        text += (
             f"; the {'companion' if detected else 'best fit'} is at "
             f"{plain(fit['separation_mas'], 4)} mas, {plain(fit['position_angle_deg'], 4)}°"
         )
     if content["modes"][1:]:
-        told += f"; {count(len(content['modes']) - 1, 'other local maximum', 'other local maxima')}"
-    return Sky(inner, outer, tuple(marks), told + ".")
+        text += f"; {count(len(content['modes']) - 1, 'other local maximum', 'other local maxima')}"
+    return Sky(inner, outer, tuple(marks), text + ".")

@@ -58,34 +58,49 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
 
 
 def _verdict(report: SearchReport) -> str:
-    weight = report.significance
-    if weight is None:
+    tested = report.significance
+    if tested is None:
         return "companion   not tested: no false-alarm probability was asked for"
-    if weight.detected is None:
-        return f"companion   undecided: {weight.n_draws} null draws are too few"
-    verdict = "DETECTED" if weight.detected else "not detected"
-    return f"companion   {verdict}; {_chance(weight)}"
+    if tested.detected is None:
+        return f"companion   undecided: {tested.n_draws} null draws are too few"
+    verdict = "DETECTED" if tested.detected else "not detected"
+    return f"companion   {verdict}; {_chance(tested)}"
 
 
-def _chance(weight: Significance) -> str:
+def _chance(tested: Significance) -> str:
+    """The false-alarm probability, with that by randomised residuals where there is one."""
+    check = tested.randomised
+    if check is None or check.probability is None:
+        return _parametric(tested)
+    if check.probability < tested.probability:
+        return f"{_parametric(tested)}; {check.note}"
+    low, high = tested.interval
+    return (
+        f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) by "
+        f"randomised residuals of {check.n_exposures} exposures; {tested.parametric:.2g} by "
+        f"{tested.n_draws} null searches"
+    )
+
+
+def _parametric(tested: Significance) -> str:
     """The false-alarm probability, and past the draws what is no more than extrapolated."""
-    low, high = weight.interval
-    tail = weight.tail
+    low, high = tested.interval
+    tail = tested.tail
     if tail is None:
         return (
-            f"false-alarm probability {weight.probability:.2g} (95%: {low:.2g} to {high:.2g}) "
-            f"in {weight.n_draws} null searches"
+            f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) "
+            f"in {tested.n_draws} null searches"
         )
-    above = int((weight.null >= weight.statistic).sum())
+    above = tested.n_above
     return (
-        f"{above or 'none'} of {weight.n_draws} null searches reach it: false-alarm probability "
+        f"{above or 'none'} of {tested.n_draws} null searches reach it: false-alarm probability "
         f"below {high:.2g} (95%); extrapolated {_power(tail.generalised_pareto)} (Pareto), "
         f"{_power(tail.extreme_value)} (extreme value)"
     )
 
 
 def _power(probability: float) -> str:
-    """An extrapolation is worth a power of ten."""
+    """An extrapolation is known to a power of ten."""
     if probability <= MIN_PROBABILITY:
         return f"< {MIN_PROBABILITY:.0e}"
     return f"{probability:.0e}"
@@ -152,7 +167,7 @@ def _evidence_lines(evidence: Evidence) -> list[str]:
 
 
 def _second_lines(report: SearchReport, evidence: Evidence) -> list[str]:
-    """The second companion, with what it is worth."""
+    """The second companion, with its false-alarm probability."""
     if evidence.two is None:
         return []
     first = report.result.companion
@@ -166,8 +181,8 @@ def _second_lines(report: SearchReport, evidence: Evidence) -> list[str]:
         f"contrast {other.contrast:.5f}: delta chi2 {gain:.1f}"
     )
     if report.second_significance is not None:
-        weight = report.second_significance
-        line += f" ({'detected' if weight.detected else 'NOT detected'}; {_chance(weight)})"
+        tested = report.second_significance
+        line += f" ({'detected' if tested.detected else 'NOT detected'}; {_chance(tested)})"
     return [line]
 
 

@@ -211,17 +211,17 @@ def write_picture(outcomes: Sequence[Outcome], folder: Path) -> None:
 
 
 def summary_lines(content: Json, folder: Path) -> list[str]:
-    """Say what came of the targets, failed ones first, in at most 20 lines."""
+    """List the targets, failed ones first, in at most 20 lines."""
     entries = sorted(content["targets"], key=lambda e: e["status"] != "failed")
     width = max(len(e["name"]) for e in entries)
-    lines = [f"{e['name']:<{width}}  {_said(e)}" for e in entries]
+    lines = [f"{e['name']:<{width}}  {_outcome(e)}" for e in entries]
     head = f"targets     {content['n_done']} of {content['n_targets']} done"
     head += f", {content['n_failed']} failed" if content["n_failed"] else ""
     last = [row("written to", str(folder))]
     return shortened([head, *lines], last, f"and {{}} more in {TABLE_NAME}")
 
 
-def _said(entry: Json) -> str:
+def _outcome(entry: Json) -> str:
     if entry["status"] != "done":
         return f"FAILED: {entry['error']}" if entry["status"] == "failed" else "not yet done"
     parts = []
@@ -234,7 +234,7 @@ def _said(entry: Json) -> str:
 
 
 def _verdict(entry: Json) -> str:
-    verdict = {True: "DETECTED", False: "not detected", None: "not judged"}[entry["detected"]]
+    verdict = {True: "DETECTED", False: "not detected", None: "not tested"}[entry["detected"]]
     if entry["detected"] is False or entry.get("separation_mas") is None:
         return verdict
     return (

@@ -32,9 +32,9 @@ COLUMNS = (
 )
 
 EXPLAINED = {
-    "ranks": "Truths drawn from the prior must stand at uniform ranks in their posteriors "
+    "ranks": "Truths drawn from the prior must have uniform ranks in their posteriors "
     "(simulation-based calibration, Talts et al. 2018). Measured is the Kolmogorov–Smirnov "
-    "distance; expected and error are its mean and scatter for a sound programme.",
+    "distance; expected and error are its mean and scatter for a correct implementation.",
     "coverage": "A 68 % interval must hold the truth 68 times in 100.",
     "false alarms": "Among stars without a companion, a false-alarm probability below p must "
     "come up with probability p.",
@@ -170,7 +170,7 @@ def _statement(n_checks: int, failed: list[Check]) -> Statement:
     chance = 1.0 - (1.0 - SURPRISING) ** n_checks
     return Statement(
         "none" if not failed else "open",
-        "Sound" if not failed else "Doubtful",
+        "Passed" if not failed else "Failed",
         verdict(n_checks, failed),
         (
             f"Each check fails by chance with probability {SURPRISING:g}; at least one of "
@@ -215,7 +215,7 @@ def _row(check: Check) -> tuple[str, ...]:
     def shown(x: float) -> str:
         return f"{x:.3f}" if np.isfinite(x) else "–"
 
-    said = "holds" if check.passed else "FAILS"
+    verdict_text = "holds" if check.passed else "FAILS"
     return (
         plainly(check.name),
         str(check.n),
@@ -223,7 +223,7 @@ def _row(check: Check) -> tuple[str, ...]:
         shown(check.expected),
         shown(check.error),
         f"{check.p_value:.2g}" if np.isfinite(check.measured) else "–",
-        said if np.isfinite(check.measured) else "too few",
+        verdict_text if np.isfinite(check.measured) else "too few",
     )
 
 
@@ -248,7 +248,7 @@ def _what_was_done(validation: Validation, folder: str) -> Section:
             "Every star is simulated as NIRISS images of a G2V star of magnitude 6 with photon, "
             "read and flat noise, jitter and dithers, together with its calibrators; visibilities "
             "and closure phases with their covariance are extracted from the images and "
-            "calibrated, and the field is searched and weighed by null draws as `amibayes "
+            "calibrated, and the field is searched and tested by null draws as `amibayes "
             "search` does. The posterior is integrated directly; the limits are injections.",
             f"Exposures, in turn: {exposures}. Field: {FIELD_MAS[0]:g} to {FIELD_MAS[1]:g} mas. "
             f"Contrasts, log-uniform: {ranges}. {plan.null_draws} null draws; detection at "

@@ -43,8 +43,8 @@ def _entry(vetted: Vetted, alpha: float) -> Json:
 
 
 def _companion(vetted: Vetted) -> Json | None:
-    found, weight = vetted.companion, vetted.significance
-    if found is None or weight is None:
+    found, tested = vetted.companion, vetted.significance
+    if found is None or tested is None:
         return None
     c = found.companion
     return {
@@ -53,8 +53,8 @@ def _companion(vetted: Vetted) -> Json | None:
         "contrast": c.contrast,
         "delta_mag": number(c.delta_mag),
         "delta_chi2": found.delta_chi2,
-        "false_alarm_probability": weight.probability,
-        "false_alarm_interval": list(weight.interval),
+        "false_alarm_probability": tested.probability,
+        "false_alarm_interval": list(tested.interval),
     }
 
 
@@ -62,8 +62,8 @@ def vetting_table(vetting: Vetting, last: Sequence[str] = ()) -> list[str]:
     """Write keep or drop, and why, one line each; ``last`` follows."""
     lines = [f"{'calibrator':<28} {'verdict':<7} {'agreement':>10} {'companion':>10} {'disc':>10}"]
     for name, v in _named(vetting):
-        weight = None if v.significance is None else v.significance.probability
-        numbers = " ".join(_cell(p) for p in (v.agreement, weight, v.diameter_probability))
+        tested = None if v.significance is None else v.significance.probability
+        numbers = " ".join(_cell(p) for p in (v.agreement, tested, v.diameter_probability))
         lines.append(f"{name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
         lines += [f"    {text}" for text in [v.reason, *notes(v, vetting.alpha)] if text]
     rule = (

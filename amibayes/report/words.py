@@ -7,7 +7,7 @@ import math
 NONE = "–"
 
 PLUS_MINUS, TIMES = " ±\u00a0", "\u00a0×\u00a0"
-"""Where it is narrow the error stands below its value; a number itself is not broken."""
+"""Where it is narrow the error goes below its value; a number itself is not broken."""
 
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -59,7 +59,7 @@ def _power(value: float) -> int:
 
 
 def chance(probability: float) -> str:
-    """Write a probability; 0 and 1 are said as what they are."""
+    """Write a probability; 0 and 1 are written as such."""
     if 0.001 <= probability < 0.01:
         return plain(probability, 2)
     if 0.01 <= probability <= 0.99:

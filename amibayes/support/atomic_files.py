@@ -72,7 +72,7 @@ def cannot_write(path: Path, error: OSError) -> RunError:
 
 
 def _reason(error: OSError) -> str:
-    """What the system said, without what a library wraps around it."""
+    """The message of the system, without what a library wraps around it."""
     return os.strerror(error.errno) if error.errno else str(error)
 
 
@@ -102,7 +102,7 @@ def sha256(path: str | Path) -> str:
 
 
 def short_names(paths: Sequence[str | Path]) -> list[str]:
-    """Names of files, with as many of their folders as it takes to tell each from the others."""
+    """Names of files, with as many of their folders as it takes to be distinct."""
     parts = [Path(path).parts for path in paths]
     names = []
     for mine in parts:

@@ -81,7 +81,7 @@ class Checkup:
 
 
 def checkup(seconds: float = 1.0) -> Checkup:
-    """Look at this installation and time a matrix product.
+    """Inspect this installation and time a matrix product.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ ExtractionCovariance = Literal["shrunk", "scatter", "physical"]
 """Scatter of the integrations and photon noise combined, or one of them alone."""
 
 Geometry = Literal["fitted", "stated"]
-"""Scale and rotation of the mask, where the image tells them."""
+"""Scale and rotation of the mask, where the image determines them."""
 
 CalibrationMethod = Literal["hierarchical", "weighted"]
 """How calibrators are combined; unless given, by how many share a baseline."""

@@ -1,7 +1,7 @@
 """Whether two runs were asked the same: what every ``--resume`` goes by.
 
 A request is the digest of all that an answer depends on: the version of amibayes, the content
-and the order of the files, and every option. It stands in the JSON of the answer, names the
+and the order of the files, and every option. It is part of the JSON of the answer, names the
 folder of a journal, and belongs to the chain of a posterior.
 """
 

@@ -1,4 +1,4 @@
-"""The summary on the terminal: at most twenty lines, whatever there is to tell."""
+"""The summary on the terminal: at most twenty lines, whatever there is."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ MAX_LINES = 20
 def shortened(
     lines: Sequence[str], last: Sequence[str] = (), more: str = "and {} more lines"
 ) -> list[str]:
-    """Leave out what does not fit, and say how much.
+    """Leave out what does not fit, and write how much.
 
     Parameters
     ----------
     lines : sequence of str
         Of which those at the end may be left out.
     last : sequence of str
-        Lines that always stand at the end.
+        Lines that are always at the end.
     more : str
-        Stands for what is left out, ``{}`` for how many.
+        Replaces what is left out, ``{}`` for how many.
 
     Returns
     -------
@@ -41,12 +41,12 @@ def with_warnings(lines: Sequence[str], warnings: Sequence[str], last: str, file
     lines : sequence of str
     warnings : sequence of str
     last : str
-        Stands at the end.
+        Always at the end.
     file : str
         Name of the file that holds all warnings.
     """
-    told = [row("WARNING", text) for text in warnings]
-    return shortened([*lines, *told], [last], row("WARNING", f"{{}} more warnings in {file}"))
+    written = [row("WARNING", text) for text in warnings]
+    return shortened([*lines, *written], [last], row("WARNING", f"{{}} more warnings in {file}"))
 
 
 def row(label: str, text: str) -> str:

@@ -120,19 +120,19 @@ def _analysed(
 ) -> dict[str, Any]:
     options = SearchOptions(separation_mas=FIELD_MAS, alpha=plan.alpha, null_draws=plan.null_draws)
     result = search_field(observables, options).result
-    weight = false_alarm(result, options, np.random.default_rng(seeds[0]), None, None)
-    answer: dict[str, Any] = {"false_alarm_probability": weight.probability}
+    tested = false_alarm(result, options, np.random.default_rng(seeds[0]), None, None)
+    answer: dict[str, Any] = {"false_alarm_probability": tested.probability}
     if truth is None:
         return answer
     grid = grid_posterior(result.likelihood, prior)
     limits = detection_limit(
-        result, weight, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
+        result, tested, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
     )
     found_at = result.companion
     place = np.array([found_at.east_mas, found_at.north_mas])
     rho = float(np.hypot(*truth[:2]))
     near = bool(at_its_place(place, truth[:2], resolution_mas(result.likelihood)))
-    found = bool(weight.detected) and (near or limits.counts_anywhere(rho))
+    found = bool(tested.detected) and (near or limits.counts_anywhere(rho))
     return answer | {
         "truth": truth,
         "rank": _ranks(grid, truth),

@@ -9,7 +9,7 @@ import time
 from fouriever import uvfit
 
 path = sys.argv[1]
-with contextlib.redirect_stdout(io.StringIO()) as said:
+with contextlib.redirect_stdout(io.StringIO()) as output:
     data = uvfit.data(os.path.dirname(path) + "/", [os.path.basename(path)])
 
     def search(step_mas):

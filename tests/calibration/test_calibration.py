@@ -23,7 +23,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.pipeline.warnings import calibration_cautions
+from amibayes.pipeline.warnings import calibration_warnings
 from amibayes.units import MAS
 
 HOLES = np.array(
@@ -726,7 +726,7 @@ def test_coverage_of_the_whole_calibration(
 def test_reader_is_told_what_one_calibrator_cannot_tell() -> None:
     rng = np.random.default_rng(5)
     target, *stars = (simulated(niriss(), [100.0, 0.0, 0.0], rng) for _ in range(3))
-    said = [calibration_cautions(calibrate(target, stars[:n])) for n in (1, 2)]
+    said = [calibration_warnings(calibrate(target, stars[:n])) for n in (1, 2)]
     assert len(said[0]) == 1
     assert "one calibrator says nothing" in said[0][0]
-    assert said[1] == calibration_cautions(None) == []
+    assert said[1] == calibration_warnings(None) == []

@@ -25,7 +25,7 @@ from amibayes.pipeline.prepare import prepare
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.search import search_companion
-from amibayes.pipeline.warnings import search_cautions
+from amibayes.pipeline.warnings import search_warnings
 from amibayes.report.limits import limits_summary
 from amibayes.report.result import result_json, upper_limit
 from amibayes.report.statement import statement_of
@@ -50,7 +50,7 @@ def report(path: Path) -> SearchReport:
         (80.0, 200.0),
         diameter="free",
         extra_noise=False,
-        null_draws=2000,
+        null_draws=3000,
         companions=(1, 2),
         posterior=False,
         limits=False,
@@ -83,17 +83,17 @@ def test_two_companions_and_a_disc_are_told(report: SearchReport) -> None:
     assert len(summary(report, Path("out"))) <= 20
 
 
-def test_what_was_not_judged_is_said_to_be(report: SearchReport) -> None:
+def test_what_was_not_tested_is_written_so(report: SearchReport) -> None:
     assert "DETECTED" in line(report, "companion")
-    unjudged = replace(report, significance=None)
-    assert line(unjudged, "companion") == (
+    untested = replace(report, significance=None)
+    assert line(untested, "companion") == (
         "companion   not tested: no false-alarm probability was asked for"
     )
     assert report.significance is not None
     few = replace(report, significance=few_draws(report.significance))
     assert line(few, "companion") == "companion   undecided: 3 null draws are too few"
-    said = search_cautions(report.observables, report.result, ExtraNoise(), few.significance, None)
-    assert any("3 null draws cannot tell a false-alarm probability" in text for text in said)
+    said = search_warnings(report.observables, report.result, ExtraNoise(), few.significance, None)
+    assert any("3 null draws cannot measure a false-alarm probability" in text for text in said)
 
 
 def few_draws(weight: Significance) -> Significance:
@@ -132,9 +132,9 @@ def test_noise_that_the_data_ask_for_is_told_and_other_is_not(report: SearchRepo
 
 def test_a_misfit_is_warned_of_where_no_noise_was_added(report: SearchReport) -> None:
     result = replace(report.result, chi2_binary=3.0 * report.result.ndof)
-    said = search_cautions(report.observables, result, ExtraNoise(), None, None)
+    said = search_warnings(report.observables, result, ExtraNoise(), None, None)
     assert any(text.startswith("reduced chi2 is 3.0 with the companion") for text in said)
-    noisy = search_cautions(report.observables, result, ExtraNoise(vis2=0.01), None, None)
+    noisy = search_warnings(report.observables, result, ExtraNoise(vis2=0.01), None, None)
     assert any("noise of 0.01 in V2" in text for text in noisy)
     assert not any(text.startswith("reduced chi2") for text in noisy)
 
@@ -267,7 +267,7 @@ def test_audit_and_export_in_words(alone: Path, tmp_path: Path, capsys) -> None:
         hdus.writeto(other)
     words = ("audit", other, "--fix", "--overwrite")
     assert run(*words, "--out", tmp_path / "a") == 1
-    assert f"mended in {tmp_path / 'a' / alone.name}" in capsys.readouterr().out
+    assert f"corrected in {tmp_path / 'a' / alone.name}" in capsys.readouterr().out
     assert run(*words, "--out", other.parent) == 2
     assert "would be written over itself" in error_of(capsys)
     twin = tmp_path / "twin" / alone.name

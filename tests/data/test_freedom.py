@@ -32,7 +32,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.pipeline.warnings import search_cautions
+from amibayes.pipeline.warnings import search_warnings
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.priors import Prior
 from amibayes.report.common import data_json
@@ -313,7 +313,7 @@ def test_plug_in_scatter_does_not_cover() -> None:
 
 def cautions(data: Observables) -> str:
     result = search(Likelihood(data), FIELD)
-    return " ".join(search_cautions(data, result, ExtraNoise(), None, None))
+    return " ".join(search_warnings(data, result, ExtraNoise(), None, None))
 
 
 def test_reader_is_warned_of_few_integrations_and_of_errors_far_too_large() -> None:

@@ -86,7 +86,7 @@ def test_posterior(found: SearchResult) -> None:
 
 
 def test_limits_and_weights_in_a_line(found: SearchResult) -> None:
-    options = SearchOptions(null_draws=2000)
+    options = SearchOptions(null_draws=3000)
     weight = false_alarm(found, options, np.random.default_rng(1), None, None)
     limit = detection_limit(
         found, weight, np.random.default_rng(2), trials_per_cell=20, separation_mas=[100.0, 300.0]

@@ -10,11 +10,8 @@ from scipy import stats
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import search
-from amibayes.detection.false_alarm import (
-    Significance,
-    clopper_pearson,
-    significance,
-)
+from amibayes.detection.binomial import clopper_pearson
+from amibayes.detection.false_alarm import Significance, significance
 from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
 from amibayes.detection.tails import extreme_value_survival, pareto_survival
 from amibayes.likelihood.likelihood import Likelihood

@@ -10,8 +10,8 @@ from helpers import niriss, simulated
 from noise_maker import Recipe
 from scipy import stats
 
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.search import search
-from amibayes.companion_search.template_bank import make_grid
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of

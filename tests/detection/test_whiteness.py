@@ -12,7 +12,7 @@ from amibayes.companion_search.search import search
 from amibayes.detection.whiteness import channel_correlation
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.pipeline.warnings import search_cautions
+from amibayes.pipeline.warnings import search_warnings
 
 TRUTH = [150.0, -80.0, 0.02]
 
@@ -40,7 +40,7 @@ def test_common_errors_of_channels_are_measured(share, rng) -> None:
     correlation, n_pairs = channel_correlation(result)
     assert n_pairs == 5 * 56
     assert correlation == pytest.approx(share, abs=0.3)
-    said = search_cautions(data, result, ExtraNoise(), None, None)
+    said = search_warnings(data, result, ExtraNoise(), None, None)
     assert any("neighbouring channels" in text for text in said) == (share > 0)
 
 

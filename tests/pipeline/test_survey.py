@@ -21,7 +21,7 @@ from amibayes.plots.survey import Found, LimitCurve, survey_plot
 
 TRUTH = [110.0, -75.0, 0.02]
 CLOSED = ("--criterion", "absil", "--separations", 5, "--null-draws", 0, "--observables", "cp")
-QUICK = ("--no-posterior", "--null-draws", 2000, "--no-limits", "--separation", "50:400")
+QUICK = ("--no-posterior", "--null-draws", 3000, "--no-limits", "--separation", "50:400")
 
 
 @pytest.fixture

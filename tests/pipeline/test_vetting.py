@@ -102,7 +102,7 @@ def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
 
 def test_legends_of_the_picture_cover_nothing_and_stay_on_the_page(rng) -> None:
     data = [calibrator(rng, name=f"some/long_name_of_calibrator_{k}.fits") for k in range(3)]
-    vetting = vet(data, separation_mas=FIELD, null_draws=500)
+    vetting = vet(data, separation_mas=FIELD, null_draws=1500)
     figure = vetting_picture(vetting)
     figure.draw_without_rendering()
     assert len(figure.legends) == 2
@@ -125,7 +125,7 @@ def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys
     assert main([*words, "--separation", "50:400", "--charge-levels", "1000,1000,5000"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert [Path(c["path"]).name for c in result["calibrators"]] == ["a.oifits", "b.oifits"]
-    said = [text for c in result["calibrators"] for text in [c["reason"], *c["doubts"]]]
+    said = [text for c in result["calibrators"] for text in [c["reason"], *c["notes"]]]
     assert any("charge level is 5 times" in text for text in said)
     assert any("disagrees" in text or "companion" in text for text in said)
     assert (tmp_path / "out" / "vetting.png").stat().st_size > 5000

@@ -47,7 +47,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(5 + k)))
     words = ["search", str(target), "--cal", *map(str, cals), "--separation", "50:400"]
     out = base / "out"
-    assert main([*words, "--null-draws", "2000", "--out", str(out), "--quiet"]) == 0
+    assert main([*words, "--null-draws", "3000", "--out", str(out), "--quiet"]) == 0
     return out
 
 
@@ -135,7 +135,7 @@ def test_the_answer_stands_in_words(page: Reader, content) -> None:
     for title in ("Data and calibration", "Search", "Significance", "Posterior", "Evidence",
                   "Detection limits", "How to run it again"):  # fmt: skip
         assert title in said
-    assert "--null-draws 2000" in said
+    assert "--null-draws 3000" in said
     assert "--seed 1" in said
     for warning in content["warnings"]:
         assert warning[1:] in page.said

@@ -1,0 +1,51 @@
+"""A point source seen by four telescopes through several spectral channels, night after night."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amibayes.data.observables import Observables, join
+from amibayes.data.point_source import point_source
+
+TELESCOPES_M = np.array([[0.0, 0.0], [35.0, 12.0], [-20.0, 60.0], [70.0, 85.0]])
+"""Baselines of 37 to 110 m: λ/B_max is 3.1 mas in H."""
+
+
+def four_telescopes(
+    n_exposures: int,
+    channels: int = 3,
+    *,
+    vis2_error: float = 0.02,
+    closure_error_deg: float = 1.0,
+    turn_deg: float = 60.0,
+    wavelength_m: tuple[float, float] = (1.55e-6, 1.75e-6),
+) -> Observables:
+    """Exposures ten minutes apart while the sky turns by ``turn_deg`` in all."""
+    band = (wavelength_m[1] - wavelength_m[0]) / max(channels - 1, 1)
+    parts = []
+    for k, angle in enumerate(np.radians(np.linspace(0.0, turn_deg, n_exposures))):
+        turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        parts.append(
+            point_source(
+                TELESCOPES_M @ turned.T,
+                np.linspace(*wavelength_m, channels),
+                band,
+                vis2_error=vis2_error,
+                closure_error_rad=np.radians(closure_error_deg),
+                mjd=60000.0 + k / 144.0,
+                insname="PIONIER",
+            )
+        )
+    return join(parts)
+
+
+def common_errors(
+    data: Observables, vis2: float, closure_rad: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Errors (n_data,) that the channels of an exposure share, one for each row of a table."""
+    out = []
+    for table, size in ((data.vis2, vis2), (data.closure_phase, closure_rad)):
+        key = np.stack([table.setup, table.row], axis=1)
+        row = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+        out.append(size * rng.standard_normal(row.max() + 1)[row])
+    return np.concatenate(out)
