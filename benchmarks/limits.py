@@ -28,13 +28,13 @@ from amibayes import Likelihood, load_instrument, open_executor, point_source
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import resolution_mas, search
-from amibayes.data.observables import BoolArray, Observables
+from amibayes.data.observables import Observables
 from amibayes.detection.statistic import BankStatistic, make_statistic
 from amibayes.limits.aliases import nearer_aliases
 from amibayes.limits.injection import TRIALS_AT_ONCE, recover
 from amibayes.models.parameters import Box
 from amibayes.parallel import Executor
-from amibayes.units import FloatArray, offset
+from amibayes.units import BoolArray, FloatArray, offset
 
 FIELD_MAS = (50.0, 400.0)
 POSITIONS = 10_000

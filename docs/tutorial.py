@@ -88,14 +88,13 @@ say(
 
 # [significance]
 rng = np.random.default_rng(2026)
-bank = ab.TemplateBank(result.likelihood, result.grid, result.single_theta)
-weight = ab.significance(bank, float(result.bank_delta_chi2.max()), 10_000, rng)
+significance = ab.significance(ab.statistic_of(result), 10_000, rng)
 # [/significance]
 say(
     "significance",
-    f"false-alarm probability {weight.probability:.1e} "
-    f"(95%: {weight.interval[0]:.1g} to {weight.interval[1]:.1g}), "
-    f"{weight.n_draws} null searches: detected is {weight.detected}",
+    f"false-alarm probability {significance.probability:.1e} "
+    f"(95%: {significance.interval[0]:.1g} to {significance.interval[1]:.1g}), "
+    f"{significance.n_draws} null searches: detected is {significance.detected}",
 )
 
 # [posterior]
@@ -110,7 +109,7 @@ lines.append(f"converged: {posterior.converged} (split R-hat {posterior.split_rh
 say("posterior", "\n".join(lines))
 
 # [limits]
-limits = ab.detection_limit(result, weight, rng)
+limits = ab.detection_limit(result, significance, rng)
 # [/limits]
 say(
     "limits",
@@ -123,7 +122,7 @@ say(
 # [figures]
 save(detection_map(result), "map.png")
 save(fit_plot(result), "fit.png")
-save(null_plot(weight.null, weight.statistic, alpha=weight.alpha), "null.png")
+save(null_plot(significance.null, significance.statistic, alpha=significance.alpha), "null.png")
 save(corner_plot(posterior.samples, posterior.names), "corner.png")
 curves = {"95 % recovered": Curve(limits.delta_mag)}
 save(limits_plot(limits.separation_mas, curves, found), "limits.png")
@@ -136,5 +135,5 @@ for value, error, truth in (
     (found.delta_mag, found.delta_mag_error, 5.5),
 ):
     assert abs(value - truth) < 4.0 * error, f"{value} +/- {error} is not {truth}"
-assert weight.detected
+assert significance.detected
 assert posterior.converged

@@ -32,7 +32,6 @@ from amibayes import (
     Instrument,
     Likelihood,
     Scene,
-    TemplateBank,
     calibrate,
     detection_limit,
     extract,
@@ -43,8 +42,10 @@ from amibayes import (
     significance,
     simulate,
 )
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.observables import Observables
+from amibayes.detection.statistic import statistic_of
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.pipeline.planning import PAPER, contrast_curve, expected_observables
 from amibayes.plots.style import MARKERS, SERIES, new_figure, save, styled
@@ -164,10 +165,10 @@ def recovered_once(filter: str, with_vis2: bool) -> Limit:
     if with_vis2:
         data = expected_observables(paper_plan(filter, 1e8), PRESETS["paper"])
     result = search(Likelihood(data), FIELD_MAS)
-    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
     rng = np.random.default_rng(1)
-    weight = significance(bank, 0.0, NULL_DRAWS, rng, ALPHA)
-    limit = detection_limit(result, weight, rng, n_separations=15, trials_per_cell=60)
+    test = statistic_of(result, stated_errors=True)
+    found = significance(test, NULL_DRAWS, rng, ALPHA)
+    limit = detection_limit(result, found, rng, n_separations=15, trials_per_cell=60)
     return Limit(limit.separation_mas, -2.5 * np.log10(limit.contrast_50))
 
 

@@ -292,7 +292,7 @@ def limits(content: Json) -> Section | None:
         (fixed(rho, 1), fixed(mag, 2), plain(contrast), fixed(half, 2))
         for rho, mag, contrast, half in zip(
             found["separation_mas"],
-            found["delta_mag_3sigma"],
+            found["delta_mag"],
             found.get("contrast") or [None] * len(found["separation_mas"]),
             found.get("delta_mag_50") or [None] * len(found["separation_mas"]),
             strict=True,

@@ -22,7 +22,7 @@ def limits_json(limits: Limit) -> Json:
     out: Json = {
         "method": limits.method,
         "separation_mas": list(limits.separation_mas),
-        "delta_mag_3sigma": numbers(limits.delta_mag),
+        "delta_mag": numbers(limits.delta_mag),
         "contrast": numbers(limits.contrast),
         "delta_mag_spread": [numbers(row) for row in contrast_to_delta_mag(limits.spread)],
     }
@@ -99,7 +99,7 @@ def limits_table(report: LimitsReport) -> Table:
 
 def _add_columns(table: Table, measured: MeasuredLimit, report: LimitsReport) -> None:
     limit, name = measured.limit, "_".join(measured.observables)
-    columns = {"delta_mag_3sigma": limit.delta_mag}
+    columns = {"delta_mag": limit.delta_mag}
     columns |= {
         f"delta_mag_{percent}": contrast_to_delta_mag(spread)
         for percent, spread in zip(("p16", "p50", "p84"), limit.spread.T, strict=True)
@@ -151,7 +151,7 @@ def _curve_line(curve: Json) -> str:
     name = NAMES[tuple(curve["observables"])]
     usable = [
         (rho, mag)
-        for rho, mag in zip(curve["separation_mas"], curve["delta_mag_3sigma"], strict=True)
+        for rho, mag in zip(curve["separation_mas"], curve["delta_mag"], strict=True)
         if mag is not None
     ]
     if not usable:

@@ -125,7 +125,7 @@ def _tiles(content: Json) -> tuple[Fact, ...]:
 def _excluded(content: Json) -> Iterator[Fact]:
     """What a search without a detection rules out."""
     limits, posterior = content["limits"], content["posterior"]
-    reached = [] if limits is None else [m for m in limits["delta_mag_3sigma"] if m is not None]
+    reached = [] if limits is None else [m for m in limits["delta_mag"] if m is not None]
     if reached:
         yield Fact(
             "Magnitude difference reached",

@@ -121,7 +121,7 @@ def _limits(content: Json) -> str:
         return ""
     curve = [
         (rho, mag)
-        for rho, mag in zip(limits["separation_mas"], limits["delta_mag_3sigma"], strict=True)
+        for rho, mag in zip(limits["separation_mas"], limits["delta_mag"], strict=True)
         if mag is not None
     ]
     if not curve:

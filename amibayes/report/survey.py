@@ -122,7 +122,7 @@ def _at(content: Json, path: str) -> Any:
 
 def _limits(content: Json) -> Json | None:
     """What a search says of its limits, or the main curve of ``limits``."""
-    if "delta_mag_3sigma" in content:
+    if "delta_mag" in content:
         return {key: content[key] for key in CURVE}
     return content.get("limits")
 
@@ -131,7 +131,7 @@ CURVE = (
     "method",
     "observables",
     "separation_mas",
-    "delta_mag_3sigma",
+    "delta_mag",
     "false_positive_rate",
     "completeness",
 )
@@ -154,7 +154,7 @@ def _curve(content: Json) -> LimitCurve | None:
     limits = _limits(content)
     if not limits:
         return None
-    values = [math.nan if x is None else x for x in limits["delta_mag_3sigma"]]
+    values = [math.nan if x is None else x for x in limits["delta_mag"]]
     return LimitCurve(np.array(limits["separation_mas"]), np.array(values, dtype=float))
 
 

@@ -25,7 +25,7 @@ def test_whole_job(star: Path, tmp_path: Path, capsys) -> None:
     content = json.loads((out / "limits.json").read_text())
     assert [c["observables"] for c in content["curves"]] == [["vis2", "cp"], ["vis2"], ["cp"]]
     assert content["method"] == "injection"
-    assert content["delta_mag_3sigma"] == content["curves"][0]["delta_mag_3sigma"]
+    assert content["delta_mag"] == content["curves"][0]["delta_mag"]
     assert content["separation_mas"] == pytest.approx(np.linspace(60, 400, 4))
     assert content["n_trials"] == np.sum(content["completeness_map"]["trials"]) == 4 * 14 * 20
     text = (out / "limits.json").read_text()
@@ -33,9 +33,7 @@ def test_whole_job(star: Path, tmp_path: Path, capsys) -> None:
     assert "timing" not in text
     table = Table.read(out / "limits.ecsv")
     assert table["separation"].unit == "mas"
-    np.testing.assert_allclose(
-        table["delta_mag_3sigma_cp"], content["curves"][2]["delta_mag_3sigma"]
-    )
+    np.testing.assert_allclose(table["delta_mag_cp"], content["curves"][2]["delta_mag"])
 
 
 @pytest.mark.parametrize("method", ["absil", "candid", "posterior", "closure-phase"])
@@ -46,7 +44,7 @@ def test_closed_criteria(star: Path, tmp_path: Path, capsys, method: str) -> Non
     assert content["method"] == method
     assert content["completeness_map"] is None
     assert len(content["curves"]) == (1 if method == "closure-phase" else 3)
-    assert all(3.5 < mag < 9.0 for mag in content["delta_mag_3sigma"])
+    assert all(3.5 < mag < 9.0 for mag in content["delta_mag"])
     assert {p.name for p in out.iterdir()} == {"limits.json", "limits.ecsv", "limits.png"}
 
 

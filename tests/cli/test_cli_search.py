@@ -52,7 +52,7 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
     assert [c["kept"] for c in result["calibration"]["calibrators"]] == [True] * 3
     assert result["calibration"]["method"] == "hierarchical"
     assert result["posterior"]["converged"] is True
-    assert len(result["limits"]["separation_mas"]) == len(result["limits"]["delta_mag_3sigma"])
+    assert len(result["limits"]["separation_mas"]) == len(result["limits"]["delta_mag"])
     assert [i["role"] for i in result["inputs"]] == ["target"] + ["calibrator"] * 3
     assert all(len(i["sha256"]) == 64 for i in result["inputs"])
     for name in (

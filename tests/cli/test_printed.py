@@ -143,7 +143,7 @@ def test_other_positions_and_lost_limits_stand_in_the_statement(report: SearchRe
     content = json.loads(json.dumps(result_json(report)))
     mode = content["modes"][0]
     content["modes"] = [mode, *({**mode, "probability": 0.1} for _ in range(5))]
-    content["limits"] = {"separation_mas": [100.0], "delta_mag_3sigma": [None]}
+    content["limits"] = {"separation_mas": [100.0], "delta_mag": [None]}
     said = " ".join(statement_of(content).sentences)
     assert "do not rule out another position" in said
     assert "and 2 more" in said
@@ -176,13 +176,13 @@ def test_limits_in_mass(alone: Path, tmp_path: Path, capsys) -> None:
     said = capsys.readouterr().out
     content = json.loads((tmp_path / "out" / "limits.json").read_text())
     curve = content["curves"][0]
-    ln_mass = np.interp(-np.array(curve["delta_mag_3sigma"]), [-12, -8, -2], np.log(mass))
+    ln_mass = np.interp(-np.array(curve["delta_mag"]), [-12, -8, -2], np.log(mass))
     assert curve["mass"] == pytest.approx(np.exp(ln_mass))
     assert f"mass {min(curve['mass']):.3g} to {max(curve['mass']):.3g} M_Jup" in said
     table = Table.read(tmp_path / "out" / "limits.ecsv")
     np.testing.assert_allclose(table["mass_vis2_cp"], curve["mass"])
     content["warnings"] = [f"doubt {k}" for k in range(30)]
-    content["curves"][1]["delta_mag_3sigma"] = [None] * 4
+    content["curves"][1]["delta_mag"] = [None] * 4
     lines = limits_summary(content, tmp_path)
     assert len(lines) == 20
     assert lines[-2].endswith("more warnings in limits.json")

@@ -155,7 +155,7 @@ def test_whole_joint_job_with_posterior_evidence_and_limits(files, tmp_path, cap
     assert result["evidence"]["method"] == ["quadrature", "importance", "importance"]
     assert result["evidence"]["probability"][0] < 1e-6
     assert result["limits"]["companion"] == "the same contrast in every band, at rest"
-    assert any(x is not None for x in result["limits"]["delta_mag_3sigma"])
+    assert any(x is not None for x in result["limits"]["delta_mag"])
 
 
 def test_noise_of_each_file_is_in_the_result(files) -> None:

@@ -176,7 +176,7 @@ def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
     first, second, third, _ = summary["targets"]
     assert [e["status"] for e in (first, second, third)] == ["done", "done", "failed"]
     assert first["limits"]["separation_mas"] == pytest.approx(np.linspace(80, 300, 5))
-    curve = first["limits"]["delta_mag_3sigma"]
+    curve = first["limits"]["delta_mag"]
     assert first["limit_delta_mag_best"] == max(curve)
     assert first["limit_delta_mag_worst"] == min(curve)
     assert Table.read(out / "summary.ecsv")["limit_delta_mag"].unit == "mag"

@@ -190,7 +190,7 @@ def test_no_detection_states_a_limit(content) -> None:
     first, *excluded = search_page(none).facts
     assert first.value == "34\u00a0%"
     assert [fact.value for fact in excluded][1:] == ["0.001"]
-    mags = [m for m in none["limits"]["delta_mag_3sigma"] if m is not None]
+    mags = [m for m in none["limits"]["delta_mag"] if m is not None]
     assert excluded[0].value == f"{min(mags):.1f} to {max(mags):.1f}"
     assert "Separation" not in " ".join(fact.name for fact in search_page(none).facts)
     none |= {"posterior": None, "limits": None}
