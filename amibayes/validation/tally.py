@@ -1,8 +1,8 @@
-"""What many trials say: ranks, coverage, false alarms and completeness, each with its chance.
+"""Checks of many trials: ranks, coverage, false alarms and completeness, each with its chance.
 
 Every check is a statement that holds for a correct implementation, and the probability that a
 correct implementation does as badly. References: Talts et al. (2018, arXiv:1804.06788) for the
-ranks; coverage and false alarms are binomial, completeness a sum of unequal coin tosses.
+ranks; coverage and false alarms are binomial, completeness Poisson binomial.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from amibayes.validation.plan import RANGES, ValidationPlan
 from amibayes.validation.trial import COVERED, LEVELS, RANKED
 
 FEWEST = 8
-"""Trials below which a check says nothing."""
+"""Trials below which a check has no result."""
 
 SURPRISING = 1e-3
 """A correct implementation fails a check with this probability."""
@@ -32,7 +32,7 @@ FALSE_ALARMS = (0.01, 0.05, 0.2)
 
 @dataclass(frozen=True)
 class Check:
-    """One statement about the programme, held against its trials.
+    """One statement about amibayes, tested on its trials.
 
     Parameters
     ----------
@@ -197,19 +197,8 @@ def unequal(group: str, name: str, hits: FloatArray, chance: FloatArray) -> Chec
     n = len(hits)
     if n < FEWEST:
         return Check(group, name, n, np.nan, np.nan, np.nan, 1.0)
-    below = sum_of_tosses(chance)[: int(hits.sum()) + 1].sum()
-    above = sum_of_tosses(chance)[int(hits.sum()) :].sum()
+    count, expected = int(hits.sum()), stats.poisson_binom(chance)
+    below, above = float(expected.cdf(count)), float(expected.sf(count - 1))
     error = float(np.sqrt((chance * (1.0 - chance)).sum())) / n
     p_value = float(np.clip(2.0 * min(below, above), 0.0, 1.0))
     return Check(group, name, n, float(hits.mean()), float(chance.mean()), error, p_value)
-
-
-def sum_of_tosses(chance: FloatArray) -> FloatArray:
-    """Distribution of the number of hits among tosses with a probability each, (n + 1,).
-
-    From its characteristic function at the n + 1 roots of unity (Fernández & Williams 2010).
-    """
-    n = len(chance)
-    root = np.exp(2j * np.pi * np.arange(n + 1) / (n + 1))
-    product = (1.0 - chance + chance * root[:, None]).prod(axis=1)
-    return np.clip(np.fft.fft(product).real / (n + 1), 0.0, 1.0)

@@ -23,7 +23,7 @@ from amibayes.report.validation import (
 )
 from amibayes.validation import QUICK, validate
 from amibayes.validation.plan import FIELD_MAS, RANGES, ValidationPlan
-from amibayes.validation.tally import rate, sum_of_tosses, tally, unequal, uniformity
+from amibayes.validation.tally import rate, tally, unequal, uniformity
 from amibayes.validation.trial import run_trial
 
 
@@ -63,12 +63,14 @@ def test_kinds_take_turns() -> None:
     assert half.count("alone") == 6
 
 
-def test_sum_of_tosses() -> None:
-    np.testing.assert_allclose(
-        sum_of_tosses(np.full(300, 0.3)), stats.binom.pmf(np.arange(301), 300, 0.3), atol=1e-13
-    )
-    both = sum_of_tosses(np.array([0.2, 0.9]))
-    np.testing.assert_allclose(both, [0.8 * 0.1, 0.2 * 0.1 + 0.8 * 0.9, 0.2 * 0.9], atol=1e-15)
+def test_unequal_chances_are_tested_exactly() -> None:
+    alike = unequal("g", "n", np.arange(300) < 70, np.full(300, 0.3))
+    binomial = stats.binom(300, 0.3)
+    expected = 2.0 * min(binomial.cdf(70), binomial.sf(69))
+    assert alike.p_value == pytest.approx(expected, rel=1e-9)
+    # Every one of sixteen hits of chance 0.2 or 0.9: a product.
+    chance = np.tile([0.2, 0.9], 8)
+    assert unequal("g", "n", np.ones(16), chance).p_value == pytest.approx(2 * chance.prod())
 
 
 def test_p_values_of_the_checks() -> None:
