@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
-from amibayes.support.options import NULL_DRAWS, OBSERVABLES, EvidenceMethod, choices
+from amibayes.support.options import EVIDENCE_METHODS, NULL_DRAWS, OBSERVABLES, SAMPLERS
 
 if TYPE_CHECKING:
     from amibayes.parallel import Journals
@@ -71,8 +71,8 @@ def _add_comparison(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--evidence-method",
-        choices=choices(EvidenceMethod),
-        default=choices(EvidenceMethod)[0],
+        choices=(*EVIDENCE_METHODS[:2], *SAMPLERS),
+        default=EVIDENCE_METHODS[0],
         help="integrate directly, or by Laplace's approximation, or by nested sampling with "
         "dynesty (default: %(default)s)",
     )

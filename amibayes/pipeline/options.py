@@ -11,6 +11,7 @@ from amibayes.posterior.priors import PriorSetting
 from amibayes.support.options import (
     ALPHA,
     CLIP_CALIBRATORS,
+    EVIDENCE_METHODS,
     NOISE_PRIOR,
     NULL_DRAWS,
     OBSERVABLES,
@@ -18,7 +19,6 @@ from amibayes.support.options import (
     CalibrationMethod,
     ClosureCovariance,
     ContrastSharing,
-    EvidenceMethod,
 )
 from amibayes.support.quantities import takes_quantities
 
@@ -125,7 +125,7 @@ class SearchOptions:
     posterior: bool = True
     limits: bool = True
     companions: tuple[int, ...] | None = None
-    evidence_method: EvidenceMethod = "direct"
+    evidence_method: str = EVIDENCE_METHODS[0]
     prior: tuple[PriorSetting, ...] = ()
     seed: int = SEED
     images: ImageOptions | None = None

@@ -26,7 +26,8 @@ from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
 from amibayes.posterior.priors import Prior
-from amibayes.support.options import EvidenceMethod
+from amibayes.posterior.sampler import draw_posterior
+from amibayes.support.options import SAMPLERS
 from amibayes.units import FloatArray
 
 MODEL_VALUES = 4e6
@@ -45,8 +46,6 @@ GRID_ERROR = 0.005
 
 HALO_BACKGROUND = 1.0
 """Largest over-resolved flux of the alternative, in units of the primary's; uniform from 0."""
-
-LIVE_POINTS = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +104,7 @@ def compare_models(
     companions: Sequence[int] = (0, 1),
     grid: GridPosterior | None = None,
     two: TwoCompanions | None = None,
-    method: EvidenceMethod = "direct",
+    method: str = "direct",
     model_prior: Sequence[float] | None = None,
 ) -> Evidence:
     """Weigh numbers of companions against each other and against over-resolved light.
@@ -122,7 +121,8 @@ def compare_models(
     two : TwoCompanions
         Needed for 2.
     method : {"direct", "laplace", "nested"}
-        Direct: quadrature, grid (or importance) and importance, for 0, 1 and 2.
+        Direct: quadrature, grid (or importance) and importance, for 0, 1 and 2. Otherwise
+        Laplace's approximation, or one of `amibayes.support.options.SAMPLERS`.
     model_prior : sequence of float, optional
         Prior probabilities of the numbers of companions; equal by default.
 
@@ -154,7 +154,7 @@ def _weigh(
     companions: int,
     grid: GridPosterior | None,
     two: TwoCompanions | None,
-    method: EvidenceMethod,
+    method: str,
 ) -> tuple[float, float, str]:
     """(ln Z, error, method) of one model."""
     none = single_likelihood(result.likelihood)
@@ -165,13 +165,14 @@ def _weigh(
         if two and companions == 2
         else (result.likelihood)
     )
-    if companions == 0 and (method != "nested" or not len(none.parameters)):
+    if companions == 0 and (method not in SAMPLERS or not len(none.parameters)):
         return log_evidence_none(result.likelihood, prior), GRID_ERROR, "quadrature"
     modes = two.modes if two and companions == 2 else result.modes
     if method == "laplace":
         return log_evidence_laplace(likelihood, modes, prior), float("nan"), "laplace"
-    if method == "nested":
-        return (*log_evidence_nested(likelihood, prior, rng), "nested")
+    if method in SAMPLERS:
+        found = draw_posterior(likelihood, prior, rng, method).diagnostics
+        return found["log_z"], found["log_z_error"], method
     if companions == 1 and grid is not None:
         return grid.log_z, GRID_ERROR, "grid"
     return (*log_evidence_importance(likelihood, modes, result.modes, prior, rng), "importance")
@@ -313,44 +314,3 @@ class _Gaussians:
             log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
         parts = [t.log_density(x) for t in self.mixture]
         return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
-
-
-def log_evidence_nested(
-    likelihood: Likelihood,
-    prior: Prior,
-    rng: np.random.Generator,
-    *,
-    live_points: int = LIVE_POINTS,
-) -> tuple[float, float]:
-    """ln Z and its error by nested sampling with dynesty (extra ``amibayes[evidence]``).
-
-    Raises
-    ------
-    UsageError
-        Where dynesty is not installed.
-    """
-    try:
-        import dynesty
-    except ImportError as error:
-        raise UsageError(
-            "nested sampling needs dynesty", remedy="pip install 'amibayes[evidence]'"
-        ) from error
-    parameters, k_all = likelihood.parameters, likelihood.model.companions
-
-    def theta_of(cube: FloatArray) -> FloatArray:
-        theta = prior.from_cube(cube[None])[0]
-        # Both orders are one solution: the brighter one first, at the same evidence.
-        bright = [theta[parameters.columns("flux", component=k + 1)[0]] for k in range(k_all)]
-        swap = k_all == 2 and bright[1] > bright[0]
-        return np.asarray(theta[parameters.swapped] if swap else theta)
-
-    sampler = dynesty.NestedSampler(
-        lambda theta: float(likelihood.log_prob(theta[None])[0]),
-        theta_of,
-        len(parameters),
-        nlive=live_points,
-        sample="rwalk",
-        rstate=rng,
-    )
-    sampler.run_nested(print_progress=False)
-    return float(sampler.results.logz[-1]), float(sampler.results.logzerr[-1])

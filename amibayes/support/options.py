@@ -38,8 +38,11 @@ ClosureCovariance = Literal["assumed", "diagonal"]
 ContrastSharing = Literal["tied", "per-filter"]
 """One contrast for all bands, or one for each; unless given, by the number of bands."""
 
-EvidenceMethod = Literal["direct", "laplace", "nested"]
-"""Integrate directly, by Laplace's approximation, or by nested sampling."""
+SAMPLERS: dict[str, str] = {"nested": "amibayes.posterior.nested:NestedSampler"}
+"""Samplers that measure the evidence, each a `amibayes.posterior.sampler.Sampler`."""
+
+EVIDENCE_METHODS = ("direct", "laplace", *SAMPLERS)
+"""Integrate directly, by Laplace's approximation, or by one of the samplers."""
 
 ContrastForm = Literal["log-uniform", "uniform"]
 """Prior of the contrast."""

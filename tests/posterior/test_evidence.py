@@ -15,10 +15,11 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.posterior.evidence import compare_models, log_evidence_importance, log_evidence_nested
+from amibayes.posterior.evidence import compare_models, log_evidence_importance
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.laplace import log_evidence_laplace
 from amibayes.posterior.priors import default_prior
+from amibayes.posterior.sampler import draw_posterior
 
 FIELD = (50.0, 400.0)
 
@@ -177,7 +178,7 @@ def test_impossible_requests_say_so(monkeypatch) -> None:
         compare_models(result, prior, rng, model_prior=(1.0, 0.0))
     monkeypatch.setitem(sys.modules, "dynesty", None)
     with pytest.raises(UsageError, match=r"pip install 'amibayes\[evidence\]'"):
-        log_evidence_nested(result.likelihood, prior, rng)
+        draw_posterior(result.likelihood, prior, rng, "nested")
     three = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]])
     sheet = point_source(three, [4.8e-6], 1e-8, vis2_error=0.1, closure_error_rad=0.1)
     few = search(Likelihood(sheet), (100.0, 300.0))
@@ -191,7 +192,8 @@ def test_nested_sampling_agrees_with_the_grid_everywhere(contrast) -> None:
     pytest.importorskip("dynesty")
     result, prior = problem([150.0, -80.0, contrast])
     grid = grid_posterior(result.likelihood, prior)
-    nested = log_evidence_nested(result.likelihood, prior, np.random.default_rng(6))
+    found = draw_posterior(result.likelihood, prior, np.random.default_rng(6), "nested").diagnostics
+    nested = found["log_z"], found["log_z_error"]
     assert agree(nested, (grid.log_z, 0.0))
 
 
@@ -203,7 +205,8 @@ def test_nested_sampling_agrees_on_two_companions(theta) -> None:
     two = search_second(result)
     rng = np.random.default_rng(2)
     by_draws = log_evidence_importance(two.likelihood, two.modes, result.modes, prior, rng)
-    nested = log_evidence_nested(two.likelihood, prior, np.random.default_rng(6))
+    found = draw_posterior(two.likelihood, prior, np.random.default_rng(6), "nested").diagnostics
+    nested = found["log_z"], found["log_z_error"]
     assert agree(nested, by_draws)
 
 

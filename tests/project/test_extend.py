@@ -11,15 +11,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import ROOT
-from scipy import stats
+from scipy import integrate, stats
 from test_docs import python_of
 
 from amibayes.extraction import reading
+from amibayes.models.binary import BinaryModel
+from amibayes.posterior.priors import Prior
+from amibayes.posterior.sampler import ModelPrior
 from amibayes.report.search_page import SECTIONS
-from amibayes.support.options import EXTRACTION_METHODS
+from amibayes.support.options import EXTRACTION_METHODS, SAMPLERS, entry
 from amibayes.units import MAS
 
-TABLES = {"_METHODS": EXTRACTION_METHODS, "_SECTIONS": SECTIONS}
+TABLES = (EXTRACTION_METHODS, SAMPLERS, SECTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -29,16 +32,17 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     for name in ("examples", "docs"):
         (folder / name).symlink_to(ROOT / name)
     (folder / "page.py").write_text("\n".join(python_of(ROOT / "docs" / "howto" / "extend.md")))
-    before = [copy.copy(table) for table in TABLES.values()]
+    before = [copy.copy(table) for table in TABLES]
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.syspath_prepend(str(folder))
         patch.setattr(reading, "FORMATS", reading.FORMATS)
         yield SimpleNamespace(**runpy.run_path(str(folder / "page.py")))
-    for table, content in zip(TABLES.values(), before, strict=True):
+    for table, content in zip(TABLES, before, strict=True):
         table.clear()
         table.update(content)
-    sys.modules.pop("plain_fringes", None)
+    for name in ("plain_fringes", "prior_draws"):
+        sys.modules.pop(name, None)
 
 
 def test_a_component_is_fitted_and_its_slopes_are_right(page: SimpleNamespace) -> None:
@@ -72,6 +76,19 @@ def test_a_statistic_is_tested_by_its_own_null_draws(page: SimpleNamespace) -> N
     assert found.probability == pytest.approx((1 + above) / 201)
 
 
+def test_a_sampler_measures_an_evidence_that_is_known(page: SimpleNamespace) -> None:
+    prior = Prior(60.0, 400.0, 1e-3, 1.0)
+    flat = ModelPrior(prior, BinaryModel().parameters)
+    found = entry("prior_draws:PriorDraws")().sample(
+        lambda theta: -theta[:, 2], flat, np.random.default_rng(1)
+    )
+    known = integrate.quad(lambda ln_c: np.exp(-np.exp(ln_c)), np.log(1e-3), 0.0)[0] / np.log(1e3)
+    error = found.diagnostics["log_z_error"]
+    assert abs(found.diagnostics["log_z"] - np.log(known)) < 4.0 * error < 0.01
+    assert found.n_effective > 100_000
+    assert "prior" in SAMPLERS
+
+
 def test_a_method_of_extraction_measures_a_star(page: SimpleNamespace) -> None:
     np.testing.assert_allclose(page.plain.vis2.value, 1.0, atol=0.02)
     assert np.abs(page.plain.closure_phase.value).max() < 0.01
@@ -91,7 +108,7 @@ def test_a_section_is_in_the_report(page: SimpleNamespace) -> None:
 def test_the_page_has_every_drill() -> None:
     text = Path(ROOT / "docs" / "howto" / "extend.md").read_text(encoding="utf-8")
     for kind in (
-        "source component", "noise model", "statistic", "method of extraction", "instrument",
-        "input format", "section of the report",
+        "source component", "noise model", "statistic", "sampler", "method of extraction",
+        "instrument", "input format", "section of the report",
     ):  # fmt: skip
         assert f"{kind}\n\n" in text
