@@ -12,6 +12,7 @@ from amibayes.support.terminal import row, shortened
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration
     from amibayes.data.observables import Observables
+    from amibayes.extraction.reading import ImageOptions
 
 RESULT = "calibrated.oifits"
 
@@ -71,13 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from amibayes.calibration import calibrate, diameters_of
-    from amibayes.extraction.reading import check_together
+    from amibayes.extraction.reading import check_together, of_one_visit
     from amibayes.oifits import write_oifits
     from amibayes.support.atomic_files import output_folder
 
     check_together(arguments.targets, arguments.cal)
-    calibrators = _prepared(arguments.cal, arguments, target=None, one_star=False)
-    targets = _prepared(arguments.targets, arguments, target=arguments.target)
+    images = of_one_visit([*arguments.targets, *arguments.cal], common.image_options_of(arguments))
+    calibrators = _prepared(arguments.cal, arguments, images, target=None, one_star=False)
+    targets = _prepared(arguments.targets, arguments, images, target=arguments.target)
     folder = output_folder(arguments.out, [RESULT], overwrite=arguments.overwrite)
     found = calibrate(
         targets,
@@ -98,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _prepared(
     paths: list[str],
     arguments: argparse.Namespace,
+    images: ImageOptions,
     target: str | None,
     *,
     one_star: bool = True,
@@ -108,7 +111,7 @@ def _prepared(
 
     found = read_observations(
         paths,
-        common.image_options_of(arguments),
+        images,
         one_star=one_star,
         insname=arguments.insname,
         target=target,

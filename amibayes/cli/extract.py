@@ -144,6 +144,15 @@ def _write(
     return {"path": str(path), **described(extraction)}
 
 
+def _geometry(found: dict[str, Any]) -> str:
+    """Map of the mask, or scale and rotation where the pixels are not known."""
+    if found["mask_map"] is None:
+        scale, turn = found["scale"], found["rotation_deg"]
+        return f"pixel {scale:.4f} of the stated, mask turned {turn:+.3f} deg"
+    (xx, xy), (yx, yy) = found["mask_map"]
+    return f"pixels of the header, mask magnified {xx:.5f}, {yy:.5f}, sheared {xy:+.5f}, {yx:+.5f}"
+
+
 def _summary(content: list[dict[str, Any]]) -> list[str]:
     lines = []
     for entry in content:
@@ -153,8 +162,7 @@ def _summary(content: list[dict[str, Any]]) -> list[str]:
             f"  star           x {entry['centre_px'][0][0]:+.3f}, "
             f"y {entry['centre_px'][0][1]:+.3f} pixels from the middle, "
             f"pointing {entry['jitter_px']:.3f} pixels rms",
-            f"  geometry       pixel {entry['geometry'][0]['scale']:.4f} of the stated, mask "
-            f"turned {entry['geometry'][0]['rotation_deg']:+.3f} deg",
+            f"  geometry       {_geometry(entry['geometry'][0])}",
             f"  bad pixels     {entry['bad_pixels'][0]} always, {entry['outliers']:.1f} more in "
             "an integration",
             f"  V²             σ {entry['sigma_vis2']:.2g}, photon and read noise "

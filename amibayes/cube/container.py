@@ -53,6 +53,11 @@ class Cube:
         Header keywords as they were read, or are to be written.
     source : str
         The file, for messages.
+    pixels_known : bool
+        Whether the pixel scale is known (a WCS, or the user) and not only usual: what the
+        fringes say of their size is then the mask's.
+    notes : tuple of str
+        What a reader of the result has to know of the headers.
 
     Raises
     ------
@@ -72,6 +77,8 @@ class Cube:
     mjd: FloatArray | None = None
     header: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     source: str = "cube"
+    pixels_known: bool = False
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self._hold("images", _real(self.images))

@@ -12,7 +12,7 @@ import numpy as np
 
 from amibayes.errors import DataError
 from amibayes.instrument import header_rules
-from amibayes.scene.orientation import Orientation
+from amibayes.scene.orientation import Orientation, orientation_of_matrix
 from amibayes.units import DEGREE, MAS, FloatArray
 
 Header = Mapping[str, Any]
@@ -65,20 +65,59 @@ def check_mask(header: Header, source: str) -> None:
         )
 
 
+DISAGREE_RAD = 0.1 * DEGREE
+"""WCS and roll of one JWST header agree to a hundredth of a degree."""
+
+DISAGREE_SCALE = 0.02
+"""Pixel scales of a WCS and of a keyword that differ by more are not of one image."""
+
+
 def orientation_of(header: Header, source: str) -> Orientation:
-    """Read the orientation: JWST keywords, else a celestial WCS, else north up, east left."""
-    roll = number(header, "ROLL_REF", source)
-    if roll is not None:
-        yang = number(header, "V3I_YANG", source) or 0.0
-        parity = number(header, "VPARITY", source) or -1.0
-        if abs(parity) != 1.0:
-            raise DataError(f"keyword VPARITY = {parity:g} is neither 1 nor -1", source=source)
-        return Orientation((roll + yang) * DEGREE, int(parity))
+    """Read the orientation: a celestial WCS, else JWST keywords, else north up, east left."""
     matrix = wcs_matrix(header, source)
+    if matrix is not None:
+        return orientation_of_matrix(matrix)
+    return _orientation_of_roll(header, source) or Orientation()
+
+
+def _orientation_of_roll(header: Header, source: str) -> Orientation | None:
+    """ROLL_REF, V3I_YANG and VPARITY, where there is a roll."""
+    roll = number(header, "ROLL_REF", source)
+    if roll is None:
+        return None
+    yang = number(header, "V3I_YANG", source) or 0.0
+    parity = number(header, "VPARITY", source) or -1.0
+    if abs(parity) != 1.0:
+        raise DataError(f"keyword VPARITY = {parity:g} is neither 1 nor -1", source=source)
+    return Orientation((roll + yang) * DEGREE, int(parity))
+
+
+def orientation_notes(header: Header, source: str, comments: Mapping[str, str]) -> tuple[str, ...]:
+    """Say where the WCS and the keywords of a header contradict each other."""
+    matrix, roll = wcs_matrix(header, source), _orientation_of_roll(header, source)
     if matrix is None:
-        return Orientation()
-    parity = -1 if np.linalg.det(matrix) < 0.0 else 1
-    return Orientation(float(np.arctan2(matrix[0, 1], matrix[1, 1])), int(parity))
+        return ()
+    found, notes = orientation_of_matrix(matrix), []
+    if roll is not None:
+        apart = found.position_angle_rad - roll.position_angle_rad
+        apart = float((apart + np.pi) % (2.0 * np.pi) - np.pi)
+        if abs(apart) > DISAGREE_RAD:
+            notes.append(
+                f"{source}: +y lies at {found.position_angle_rad / DEGREE % 360.0:.3f} deg by the "
+                f"WCS, {apart / DEGREE:+.3f} deg from ROLL_REF + V3I_YANG; the WCS is used"
+            )
+        if found.parity != roll.parity:
+            notes.append(
+                f"{source}: VPARITY is {roll.parity:+d}, the WCS has the other; it is used"
+            )
+    stated = _stated_scale(header, source, comments)
+    scale = float(np.sqrt(abs(np.linalg.det(matrix))))
+    if stated is not None and abs(stated / scale - 1.0) > DISAGREE_SCALE:
+        notes.append(
+            f"{source}: pixels of {stated / MAS:.3f} mas by a keyword, {scale / MAS:.3f} mas by "
+            "the WCS, which is used"
+        )
+    return tuple(notes)
 
 
 PIXEL_SCALES = ("PIXELSCL", "PIXSCL", "PIXSCALE", "PIXSCAL", "PIXSCAL1", "SECPIX", "SECPIX1")
@@ -95,16 +134,35 @@ PIXEL_UNITS = (
 """What the comment of such a keyword says of its unit; without a word it is arcsec."""
 
 
+def knows_pixels(header: Header, source: str) -> bool:
+    """Whether a header knows the pixels: a celestial WCS, or PIXELSCL of a telescope's file.
+
+    Simulations without any orientation carry a PIXELSCL that is what they were asked for,
+    and their images may be of other pixels.
+    """
+    if wcs_matrix(header, source) is not None:
+        return True
+    return "ROLL_REF" in header and any(key in header for key in PIXEL_SCALES)
+
+
 def pixel_scale_of(
     header: Header, source: str, comments: Mapping[str, str] = MappingProxyType({})
 ) -> float | None:
-    """Read the side of a pixel (rad) from one of `PIXEL_SCALES`, else a celestial WCS.
+    """Read the side of a pixel (rad) from a celestial WCS, else from one of `PIXEL_SCALES`.
 
     Parameters
     ----------
     comments : mapping of str to str
         Of the keywords, where programs write the unit.
     """
+    matrix = wcs_matrix(header, source)
+    if matrix is not None:
+        return float(np.sqrt(abs(np.linalg.det(matrix))))
+    return _stated_scale(header, source, comments)
+
+
+def _stated_scale(header: Header, source: str, comments: Mapping[str, str]) -> float | None:
+    """Side of a pixel by the first of `PIXEL_SCALES` that the header has."""
     for key in PIXEL_SCALES:
         scale = number(header, key, source)
         if scale is None:
@@ -119,8 +177,7 @@ def pixel_scale_of(
                 remedy="give --pixel-scale",
             )
         return side
-    matrix = wcs_matrix(header, source)
-    return None if matrix is None else float(np.sqrt(abs(np.linalg.det(matrix))))
+    return None
 
 
 def wcs_matrix(header: Header, source: str) -> FloatArray | None:

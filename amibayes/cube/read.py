@@ -18,7 +18,6 @@ from amibayes.cube import header as keys
 from amibayes.cube.container import Cube
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
-from amibayes.scene.orientation import Orientation
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import DEGREE, FloatArray
 
@@ -230,7 +229,7 @@ def _template(
     angle = given["position_angle_deg"]
     orientation = keys.orientation_of(header, source)
     if angle is not None:
-        orientation = Orientation(angle * DEGREE, orientation.parity)
+        orientation = replace(orientation, position_angle_rad=angle * DEGREE)
     scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source, comments)
     instrument = given["instrument"] or keys.text(header, "INSTRUME")
     filter_ = given["filter"] or keys.text(header, "FILTER")
@@ -243,13 +242,13 @@ def _template(
         pixel_scale_rad=scale,
         instrument=str(instrument),
         filter=str(filter_),
-        orientation=orientation
-        if angle is None
-        else Orientation(angle * DEGREE, orientation.parity),
+        orientation=orientation,
         unit=keys.unit_of(header),
         integration_time_s=keys.integration_time_of(header, source),
         header=MappingProxyType(header),
         source=source,
+        notes=keys.orientation_notes(header, source, comments) if angle is None else (),
+        pixels_known=given["pixel_scale_rad"] is not None or keys.knows_pixels(header, source),
     )
 
 

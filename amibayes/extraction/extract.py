@@ -21,17 +21,22 @@ from amibayes.data.shrinkage import Shrunk, shrunk_covariance
 from amibayes.errors import DataError
 from amibayes.extraction.averaging import Average, average
 from amibayes.extraction.frames import Frames, concatenated, measure_file, select
+from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
+from amibayes.extraction.visits import exposures, visit_maps
 from amibayes.support.options import EXTRACTION_METHODS
 from amibayes.units import ComplexArray, FloatArray
 
 NYQUIST = 0.5
 """Cycles per pixel beyond which fringes look like others."""
+
+TIMES = ("EXPMID", "MJD-AVG", "MJD-OBS")
+"""Keywords that tell when an exposure was made, the best first."""
 
 MAX_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
@@ -117,30 +122,26 @@ def extract_all(
     options: ExtractOptions | None = None,
     *,
     one_star: bool = True,
+    maps: Sequence[MaskMap | None] | None = None,
     **header: Any,
 ) -> list[Extraction]:
     """As `extract`, with everything that was found on the way, one for each exposure.
 
-    Cubes that name no star are exposures of ``one_star``, or each of another one.
+    Cubes that name no star are exposures of ``one_star``, or each of another one. ``maps`` of
+    the mask, one for each cube, are by default those of `visit_maps` of these cubes.
     """
     given = [cubes] if isinstance(cubes, Cube | str | Path) else list(cubes)
     if not given:
         raise DataError("no cube to extract", remedy="give at least one file")
     chosen = options or ExtractOptions()
     chosen.refuse_unused()
-    parts = [_measured(cube, index, chosen, header) for index, cube in enumerate(given)]
-    groups: dict[tuple[Any, ...], list[_Part]] = {}
-    for part in parts:
-        t = part.template
-        key = (
-            target_of(t).casefold() or (None if one_star else part.frames.file[0]),
-            t.instrument.upper(),
-            t.filter.upper(),
-            t.orientation,
-            round(t.pixel_scale_rad, 12),
-        )
-        groups.setdefault(key, []).append(part)
-    return [_finished(group, chosen) for group in groups.values()]
+    maps = visit_maps(given, chosen, header) if maps is None else maps
+    parts = [
+        _measured(cube, index, chosen, header, mask_map)
+        for index, (cube, mask_map) in enumerate(zip(given, maps, strict=True))
+    ]
+    groups = exposures(parts, lambda part: part.template, one_star=one_star)
+    return [_finished(_numbered(group), chosen) for group in groups]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +156,26 @@ class _Part:
     pointed: ComplexArray
 
 
+def _numbered(parts: list[_Part]) -> list[_Part]:
+    """Number the files of an exposure, in order of time."""
+    return [
+        replace(p, frames=replace(p.frames, file=np.full(len(p.frames), k)))
+        for k, p in enumerate(parts)
+    ]
+
+
 def _measured(
-    cube: Cube | str | Path, index: int, options: ExtractOptions, header: dict[str, Any]
+    cube: Cube | str | Path,
+    index: int,
+    options: ExtractOptions,
+    header: dict[str, Any],
+    mask_map: MaskMap | None,
 ) -> _Part:
     with opened(cube, **header) as file:
-        operator = make_operator(file, options)
+        operator = make_operator(file, options, mask_map)
         frames, samples, flux = measure_file(operator, file, index)
     template = file.template
+    frames = _with_times(frames, template)
     if not options.keep_all:
         frames = replace(frames, reason=select(frames, options.clip, MAX_SHIFT_PX))
     if not frames.used.any():
@@ -181,6 +195,14 @@ def _measured(
     )
 
 
+def _with_times(frames: Frames, template: Cube) -> Frames:
+    """Give integrations without a time that of the middle of their exposure."""
+    middle = next(
+        (v for k in TIMES if isinstance(v := template.header.get(k), int | float)), np.nan
+    )
+    return replace(frames, mjd=np.where(np.isnan(frames.mjd), middle, frames.mjd))
+
+
 def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     """One exposure out of its files: average, covariance, table."""
     view = parts[0].operator.view
@@ -188,7 +210,7 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     n_vis2 = view.instrument.mask.n_baselines
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
-    notes = _unnamed(parts) + _notes(view, frames, shrunk)
+    notes = _unnamed(parts) + _of_headers(parts) + _notes(view, frames, shrunk)
     sources = tuple(p.template.source for p in parts)
     observables = _tabled(parts[0], frames, mean, shrunk, basis, notes, sources)
     operators = tuple(p.operator for p in parts)
@@ -234,22 +256,16 @@ def _tabled(
         freedom=shrunk.carried,
         scatter=scatter,
         response=part.response,
-        mjd=_mjd(frames, part.template),
+        mjd=_mjd(frames),
         integration_s=n * (part.template.integration_time_s or 0.0),
         notes=notes,
     )
 
 
-def _mjd(frames: Frames, template: Cube) -> float:
+def _mjd(frames: Frames) -> float:
     """Mean time of what was used; 0 where nothing tells it."""
     known = frames.mjd[frames.used & np.isfinite(frames.mjd)]
-    if len(known):
-        return float(known.mean())
-    for key in ("EXPMID", "MJD-AVG", "MJD-OBS"):
-        value = template.header.get(key)
-        if isinstance(value, int | float):
-            return float(value)
-    return 0.0
+    return float(known.mean()) if len(known) else 0.0
 
 
 def _unnamed(parts: list[_Part]) -> tuple[str, ...]:
@@ -257,6 +273,18 @@ def _unnamed(parts: list[_Part]) -> tuple[str, ...]:
     if len(parts) == 1 or target_of(parts[0].template):
         return ()
     return (f"{len(parts)} files that name no star are taken as exposures of one",)
+
+
+def _of_headers(parts: list[_Part]) -> tuple[str, ...]:
+    """What the headers are in doubt of, and how the images were taken to lie on the sky."""
+    notes = dict.fromkeys(note for p in parts for note in p.template.notes)
+    found = parts[0].operator.geometry.mask_map
+    if found is not None:
+        a, b = (f"{found.matrix[k, k]:.5f}" for k in (0, 1))
+        c, d = (f"{x:+.5f}" for x in (found.matrix[0, 1], found.matrix[1, 0]))
+        text = f"pixels taken as the header has them; mask magnified {a}, {b} and sheared {c}, {d}"
+        notes[text] = None
+    return tuple(notes)
 
 
 def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ import numpy as np
 
 from amibayes.extraction.fourier.fine_image import fine_image
 from amibayes.extraction.image_plane import FringeFit, FringeModel, weighted_fit
+from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.view import View
 from amibayes.optics import FringeBasis
 from amibayes.units import FloatArray
@@ -50,7 +51,8 @@ ROUNDED = 1e-4
 class Geometry:
     """Pixel scale in units of the stated one and rotation of the mask, with 1σ errors.
 
-    ``told`` is False where the image does not tell them, or was not asked.
+    ``told`` is False where the image does not tell them, or was not asked. Where the pixels
+    are known the mask has a ``mask_map`` instead.
     """
 
     scale: float = 1.0
@@ -58,11 +60,12 @@ class Geometry:
     scale_error: float = np.inf
     rotation_error_rad: float = np.inf
     told: bool = False
+    mask_map: MaskMap | None = None
 
     @property
     def stated(self) -> bool:
         """Whether it is what the file says."""
-        return self.scale == 1.0 and self.rotation_rad == 0.0
+        return self.scale == 1.0 and self.rotation_rad == 0.0 and self.mask_map is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from amibayes.extraction.image_plane import (
     fringe_fit,
     shift_of,
 )
+from amibayes.extraction.mask_map import MapEstimate, MaskMap, combined, estimate_map
 from amibayes.extraction.noise import (
     NoiseModel,
     cropped,
@@ -26,6 +27,7 @@ from amibayes.extraction.noise import (
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.view import View, look_at
+from amibayes.instrument import Distortion
 from amibayes.optics import FringeBasis
 from amibayes.support.options import EXTRACTION_METHODS, entry
 from amibayes.units import BoolArray, FloatArray, SingleArray
@@ -40,18 +42,50 @@ JITTER_SLACK = 0.01
 """Share of the light about a pixel by which the pointing may change its residual, 1σ."""
 
 
-def make_operator(file: Source, options: ExtractOptions) -> ExtractionOperator:
-    """Prepare all that the integrations of a cube go through."""
+def maps_mask(file: Source, options: ExtractOptions) -> bool:
+    """Whether what fringes say of scale and rotation is the mask's: the pixels are known."""
+    return options.geometry == "fitted" and file.template.pixels_known
+
+
+def map_estimate(file: Source, options: ExtractOptions) -> tuple[MapEstimate | None, Distortion]:
+    """What the images of one file say of the map of the mask, and the prior of it."""
     template = file.template
     reference = reference_of(file)
     view = look_at(reference.image, template, options)
+    prior = view.instrument.distortion
+    view = view.mapped(prior.matrix)
+    image, good = reference.image[view.part], reference.good[view.part]
+    view, _, even = centre_on(view, image, good, template.source)
+    return estimate_map(view, image, _fit_of_median(view, even, reference)), prior
+
+
+def make_operator(
+    file: Source, options: ExtractOptions, mask_map: MaskMap | None = None
+) -> ExtractionOperator:
+    """Prepare all that the integrations of a cube go through.
+
+    Parameters
+    ----------
+    file : Source
+    options : ExtractOptions
+    mask_map : MaskMap, optional
+        That of the visit; by default what this file alone says, where its pixels are known.
+    """
+    template = file.template
+    if mask_map is None and maps_mask(file, options):
+        estimate, prior = map_estimate(file, options)
+        mask_map = combined([estimate], prior)
+    reference = reference_of(file)
+    view = look_at(reference.image, template, options)
+    if mask_map is not None:
+        view = view.mapped(mask_map.matrix)
     image, good = reference.image[view.part], reference.good[view.part]
     view, basis, even = centre_on(view, image, good, template.source)
-    geometry = Geometry()
-    if options.geometry == "fitted":
+    geometry = Geometry(mask_map=mask_map)
+    if options.geometry == "fitted" and mask_map is None:
         median = _fit_of_median(view, even, reference)
         view, geometry, basis = fit_geometry(view, image, median, basis)
-    if not geometry.stated:
+    if not geometry.stated and mask_map is None:
         view, basis, even = centre_on(view, image, good, template.source, basis)
     noise, level, scatter = _noise_and_misfit(view, even, reference)
     fit = fringe_fit(even.model, _fit_variance(basis, image, noise, good) + level, good)

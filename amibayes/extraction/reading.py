@@ -15,7 +15,9 @@ from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.extraction.extract import extract_all
+from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.visits import visit_maps
 from amibayes.oifits import OIFits, observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
@@ -41,10 +43,13 @@ class ImageOptions:
     header : mapping
         ``instrument``, ``filter``, ``pixel_scale_rad``, ``position_angle_deg`` in place of
         what the files say.
+    maps : mapping of path to MaskMap
+        Maps of the mask that targets and calibrators share, from `of_one_visit`.
     """
 
     extraction: ExtractOptions = field(default_factory=ExtractOptions)
     header: Mapping[str, Any] = field(default_factory=dict)
+    maps: Mapping[str, MaskMap | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,8 @@ def _is_cube(contents: Contents) -> bool:
 def _extracted(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    found = extract_all(paths, images.extraction, one_star=one_star, **images.header)
+    known = [images.maps.get(path) for path in paths] if images.maps else None
+    found = extract_all(paths, images.extraction, one_star=one_star, maps=known, **images.header)
     return [e.observables for e in found]
 
 
@@ -261,3 +267,17 @@ def check_together(
 def _given(path: str | Path) -> Given:
     contents = contents_of(path)
     return Given(contents.path, contents.header, contents.names, contents.columns)
+
+
+def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None) -> ImageOptions:
+    """Find what the image cubes among files share, target's and calibrators': maps of the mask.
+
+    Raises
+    ------
+    DataError
+        Where a cube cannot be read.
+    """
+    chosen = images or ImageOptions()
+    cubes = [str(path) for path in paths if format_of(path).read is _extracted]
+    maps = visit_maps(cubes, chosen.extraction, chosen.header)
+    return replace(chosen, maps=dict(zip(cubes, maps, strict=True)))

@@ -85,7 +85,7 @@ def off_axis_response(
     between[a, b], between[b, a] = spline[1:], spline[1:].conj()
     pointing = orientation.to_sky(pixel * centre_px)
     single = sampling.n_samples == view.instrument.mask.n_baselines
-    return OffAxisResponse(between, orientation.matrix.T / (step * cell), pointing, single, method)
+    return OffAxisResponse(between, orientation.inverse / (step * cell), pointing, single, method)
 
 
 def _interpolating(values: ComplexArray) -> ComplexArray:

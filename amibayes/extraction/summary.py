@@ -63,13 +63,16 @@ def _from_middle(operator: ExtractionOperator) -> list[float]:
     return [0.5 * (part.start + part.stop - size) + at for part, size, at in sides]
 
 
-def _geometry(found: Geometry) -> dict[str, float | None]:
-    """Scale of the stated pixel and rotation of the mask, errors where the image told them."""
+def _geometry(found: Geometry) -> dict[str, Any]:
+    """Scale of the stated pixel and rotation of the mask, or its map, with errors."""
+    mask_map = found.mask_map
     return {
         "scale": found.scale,
         "rotation_deg": found.rotation_rad / DEGREE,
         "scale_error": found.scale_error if found.told else None,
         "rotation_error_deg": found.rotation_error_rad / DEGREE if found.told else None,
+        "mask_map": None if mask_map is None else mask_map.matrix.tolist(),
+        "mask_map_error": None if mask_map is None else mask_map.error.tolist(),
     }
 
 

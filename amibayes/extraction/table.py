@@ -51,7 +51,7 @@ def observables_of(
 ) -> Observables:
     """Lay one average out as a table; ``covariance`` is that of the mean."""
     mask = view.instrument.mask
-    holes = template.orientation.to_sky(mask.rotated(view.rotation_rad).holes_m)
+    holes = template.orientation.baselines_to_sky(mask.rotated(view.rotation_rad).holes_m)
     setup = _setup(view, template, holes, response)
     timing = (mjd, integration_s)
     vis2 = _rows(setup, holes, mask.pairs, [(0, 1)], average.vis2, timing)

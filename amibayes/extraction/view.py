@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.signal import fftconvolve
 from amibayes.cube import Cube
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.options import ExtractOptions
-from amibayes.instrument import Channels, Instrument, load_instrument
+from amibayes.instrument import Channels, Instrument, Mask, load_instrument
 from amibayes.optics import FringeBasis, fringe_field, fringe_image
 from amibayes.scene.spectrum import Blackbody
 from amibayes.units import FloatArray
@@ -39,6 +39,10 @@ class View:
         Place of the star relative to the middle of that part.
     rotation_rad : float
         Of the mask in the image.
+    drawing : Mask, optional
+        The instrument's own, where that of ``instrument`` was mapped.
+    mask_map : (2, 2) array
+        From the drawing to the mask of ``instrument``.
     """
 
     instrument: Instrument
@@ -47,6 +51,8 @@ class View:
     columns: slice
     centre_px: tuple[float, float] = (0.0, 0.0)
     rotation_rad: float = 0.0
+    drawing: Mask | None = None
+    mask_map: FloatArray = field(default_factory=lambda: np.eye(2))
 
     @property
     def part(self) -> tuple[slice, slice]:
@@ -77,6 +83,12 @@ class View:
         """The same with the star elsewhere, by (x, y)."""
         x, y = (float(c) for c in self.centre_px + by_px)
         return replace(self, centre_px=(x, y))
+
+    def mapped(self, matrix: FloatArray) -> View:
+        """The same with the mask's drawing under another map (2, 2)."""
+        drawing = self.drawing or self.instrument.mask
+        mapped = self.instrument.with_mask(drawing.mapped(matrix))
+        return replace(self, instrument=mapped, drawing=drawing, mask_map=np.array(matrix))
 
     def basis(self) -> FringeBasis:
         """Make the fringe model of this image."""

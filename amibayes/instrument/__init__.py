@@ -2,6 +2,7 @@
 
 from amibayes.instrument.bandpass import Bandpass, Channels
 from amibayes.instrument.catalogue import (
+    Distortion,
     HeaderRules,
     Instrument,
     Planning,
@@ -14,6 +15,7 @@ from amibayes.instrument.mask import Mask
 __all__ = [
     "Bandpass",
     "Channels",
+    "Distortion",
     "HeaderRules",
     "Instrument",
     "Mask",

@@ -18,9 +18,13 @@ from amibayes.instrument.bandpass import Bandpass
 from amibayes.instrument.mask import SHAPES, Mask
 from amibayes.scene.spectrum import Spectrum
 from amibayes.support.toml import Section, read_toml
-from amibayes.units import DEGREE, MAS, FloatArray
+from amibayes.units import DEGREE, MAS, FloatArray, read_only
 
 _JANSKY = 1e-26
+
+MAX_DISTORTION = 0.2
+"""A mask whose area is changed by more belongs into another file."""
+
 _PLANCK = float(constants.h.value)
 
 
@@ -40,6 +44,25 @@ class HeaderRules:
     mask_keyword: str = ""
     mask_value: str = ""
     simulated: Mapping[str, str | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """What is known before of the affine map from the mask's drawing to the mask in images.
+
+    Parameters
+    ----------
+    matrix : (2, 2) array
+        Times x and y of the drawing.
+    error : float
+        Standard deviation of each of the four numbers.
+    """
+
+    matrix: FloatArray = field(default_factory=lambda: np.eye(2))
+    error: float = 0.01
+
+    def __post_init__(self) -> None:
+        read_only(self, "matrix")
 
 
 @dataclass(frozen=True)
@@ -79,6 +102,7 @@ class Instrument:
         Side of the usual subarray.
     header : HeaderRules
     planning : Planning, optional
+    distortion : Distortion
     """
 
     name: str
@@ -88,6 +112,7 @@ class Instrument:
     n_pixels: int = 80
     header: HeaderRules = field(default_factory=HeaderRules)
     planning: Planning | None = None
+    distortion: Distortion = field(default_factory=Distortion)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.pixel_scale_rad < 1.0:
@@ -206,6 +231,7 @@ def _loaded(path: Path, filter: str | None) -> Instrument:
         n_pixels=int(top.number("n_pixels", 80, at_least=2)),
         header=_header(top.section("header")) if "header" in top else HeaderRules(),
         planning=_planning(top.section("planning")) if "planning" in top else None,
+        distortion=_distortion(top.section("distortion")) if "distortion" in top else Distortion(),
     )
     top.refuse_unknown(("source", "note"))
     return instrument
@@ -251,6 +277,15 @@ def _header(section: Section) -> HeaderRules:
         section.text("mask_value", ""),
         MappingProxyType({} if simulated is None else simulated.scalars()),
     )
+    section.refuse_unknown(("source", "note"))
+    return found
+
+
+def _distortion(section: Section) -> Distortion:
+    matrix = section.numbers("matrix", columns=2)
+    if matrix.shape != (2, 2) or abs(np.linalg.det(matrix) - 1.0) > MAX_DISTORTION:
+        raise section.fault("matrix", "is not two rows of two numbers, nearly the unit matrix")
+    found = Distortion(matrix, section.number("error", above=0.0))
     section.refuse_unknown(("source", "note"))
     return found
 

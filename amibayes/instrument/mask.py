@@ -7,7 +7,7 @@ the fringe Re[V e^{+2πi (ux + vy)/λ}], and a Fourier transform of the image at
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -35,6 +35,8 @@ class Mask:
         Flat to flat of a hexagon, diameter of a circle, metres.
     orientation_rad : float
         Direction of a corner of the hexagon, from +x towards +y; 0 has flat top and bottom.
+    hole_map : (2, 2) array
+        Linear map that every hole, of that shape and size, has gone through.
     """
 
     name: str
@@ -42,9 +44,10 @@ class Mask:
     shape: str
     size_m: float
     orientation_rad: float = 0.0
+    hole_map: FloatArray = field(default_factory=lambda: np.eye(2))
 
     def __post_init__(self) -> None:
-        read_only(self, "holes_m")
+        read_only(self, "holes_m", "hole_map")
         if self.holes_m.ndim != 2 or self.holes_m.shape[1] != 2 or len(self.holes_m) < 2:
             raise DataError(f"mask {self.name} needs two holes or more, each with x and y")
         if self.shape not in SHAPES:
@@ -105,13 +108,13 @@ class Mask:
     def extent_m(self) -> float:
         """Largest |u| or |v| at which two points of the holes interfere, metres."""
         reach = self.size_m * (2.0 / np.sqrt(3.0) if self.shape == "hexagon" else 1.0)
-        return float(np.abs(self.uv_m).max() + reach)
+        return float(np.abs(self.uv_m).max() + reach * np.linalg.norm(self.hole_map, 2))
 
     @property
     def hole_area_m2(self) -> float:
         """Area of one hole, m²."""
         factor = np.sqrt(3.0) / 2.0 if self.shape == "hexagon" else np.pi / 4.0
-        return float(factor * self.size_m**2)
+        return float(factor * self.size_m**2 * abs(np.linalg.det(self.hole_map)))
 
     @property
     def area_m2(self) -> float:
@@ -127,13 +130,18 @@ class Mask:
         hexagon = self.shape == "hexagon"
         count, radius = (6, self.size_m / np.sqrt(3.0)) if hexagon else (720, self.size_m / 2.0)
         angle = self.orientation_rad + np.arange(count) * (2.0 * np.pi / count)
-        return np.asarray(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        corners = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.asarray(corners @ self.hole_map.T)
 
     def rotated(self, angle_rad: float) -> Mask:
         """Return the mask turned by ``angle_rad`` from +x towards +y."""
         c, s = np.cos(angle_rad), np.sin(angle_rad)
-        holes = self.holes_m @ np.array([[c, s], [-s, c]])
-        return Mask(self.name, holes, self.shape, self.size_m, self.orientation_rad + angle_rad)
+        return self.mapped(np.array([[c, -s], [s, c]]))
+
+    def mapped(self, matrix: FloatArray) -> Mask:
+        """Return the mask under a linear map (2, 2), its holes with it."""
+        a = np.asarray(matrix, dtype=float)
+        return replace(self, holes_m=self.holes_m @ a.T, hole_map=a @ self.hole_map)
 
     def redundant_pairs(self, tolerance_m: float | None = None) -> IntArray:
         """Pairs of baselines that are the same within a tolerance, up to their sign.

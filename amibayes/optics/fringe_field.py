@@ -174,7 +174,15 @@ class _Recipe:
         mask = instrument.mask
         numbers = np.concatenate(
             [
-                *(a.ravel() for a in (mask.holes_m, channels.wavelength_m, channels.weight)),
+                *(
+                    a.ravel()
+                    for a in (
+                        mask.holes_m,
+                        mask.hole_map,
+                        channels.wavelength_m,
+                        channels.weight,
+                    )
+                ),
                 [mask.size_m, mask.orientation_rad, instrument.pixel_scale_rad, rotation_rad],
             ]
         )

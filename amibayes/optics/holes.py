@@ -28,7 +28,8 @@ def hole_transform(mask: Mask, fx: FloatArray, fy: FloatArray) -> FloatArray:
         m²; the hole's area at zero frequency.
     """
     if mask.shape == "circle":
-        return _disc(mask, np.hypot(fx, fy))
+        (xx, xy), (yx, yy) = mask.hole_map
+        return _disc(mask, np.hypot(xx * fx + yx * fy, xy * fx + yy * fy))
     # The spokes to three corners sum to zero: a rhombus, sinc·sinc along two of them, has
     # its centre at minus the third.
     pairs = [_cosine_and_sinc(fx, fy, *spoke) for spoke in mask.corners_m[::2]]

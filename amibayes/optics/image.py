@@ -269,7 +269,7 @@ def _extended(
     reach = widest + float(np.abs(shifts).max()) + float(np.abs(centre_px).max()) + 1.0
     width = side + 2 * int(np.ceil(reach))
     frequency, spectrum = _transfer(instrument, channels, width, wavefront)
-    sky = orientation.to_sky(np.stack(np.meshgrid(frequency, frequency), axis=-1))
+    sky = orientation.baselines_to_sky(np.stack(np.meshgrid(frequency, frequency), axis=-1))
     source = sum(part.transform(sky[..., 0], sky[..., 1]) for part in scene.extended)
     box = pixel_transform(frequency * pixel, pixel_response)
     spectrum = spectrum * source * np.outer(box, box)

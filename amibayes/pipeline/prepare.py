@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from amibayes.calibration import (
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
-from amibayes.extraction.reading import check_together, read_observations
+from amibayes.extraction.reading import check_together, of_one_visit, read_observations
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
@@ -72,8 +72,9 @@ def prepare(
         raise UsageError("no target given", remedy="name at least one file")
     together = check_together(targets, calibrators)
     with run.stage("read"):
-        parts = read(targets, options)
-        references = read(calibrators, options, one_star=False)
+        images = of_one_visit([*targets, *calibrators], options.images)
+        parts = read(targets, replace(options, images=images))
+        references = read(calibrators, replace(options, images=images), one_star=False)
     parts = in_order(parts)
     joined = (
         *together,

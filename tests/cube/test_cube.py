@@ -347,3 +347,30 @@ def test_failed_writing_leaves_nothing(tmp_path: Path, rng: np.random.Generator)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(RunError, match="cannot be written"):
         write_cube(tmp_path / "no" / "a.fits", cube)
+
+
+def wcs_file(path: Path, matrix: np.ndarray, **keywords: Any) -> Path:
+    header = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "INSTRUME": "NIRISS"})
+    header.update({"FILTER": "F480M"} | keywords)
+    for i, j in np.ndindex(2, 2):
+        header[f"PC{i + 1}_{j + 1}"] = matrix[i, j] / (1.8e-5, 1.7e-5)[i]
+    header["CDELT1"], header["CDELT2"] = 1.8e-5, 1.7e-5
+    image = np.random.default_rng(1).normal(size=(2, 80, 80))
+    fits.PrimaryHDU(image, header).writeto(path)
+    return path
+
+
+def test_orientation_is_that_of_the_wcs_and_contradictions_are_named(tmp_path: Path) -> None:
+    angle = 37.0 * DEGREE
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = 1.82e-5 * np.array([[-c, s], [s, c]]) @ np.array([[1.0, 0.0], [0.004, 1.003]])
+    same = read_cube(wcs_file(tmp_path / "a.fits", matrix, ROLL_REF=36.5, V3I_YANG=0.5))
+    assert same.notes == ()
+    assert same.pixels_known
+    np.testing.assert_allclose(
+        same.orientation.matrix * same.pixel_scale_rad, matrix * DEGREE, rtol=1e-10
+    )
+    other = read_cube(wcs_file(tmp_path / "b.fits", matrix, ROLL_REF=35.5, V3I_YANG=0.5, VPARITY=1))
+    assert "from ROLL_REF" in other.notes[0]
+    assert "VPARITY" in other.notes[1]
+    assert other.orientation == same.orientation

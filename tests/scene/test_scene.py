@@ -14,7 +14,7 @@ from amibayes import load_scene
 from amibayes.errors import DataError
 from amibayes.instrument import Channels, Instrument, Mask, load_instrument
 from amibayes.optics import fringe_basis, psf, scene_image
-from amibayes.scene.orientation import Orientation
+from amibayes.scene.orientation import Orientation, orientation_of_matrix
 from amibayes.scene.sources import (
     Component,
     GaussianDisc,
@@ -362,3 +362,17 @@ def test_bad_components_are_refused() -> None:
     ):
         with pytest.raises(DataError, match=fault):
             make()
+
+
+def test_skewed_pixels_keep_phases_and_places() -> None:
+    matrix = np.array([[-1.69289e-5, 6.52976e-6], [6.58057e-6, 1.7058e-5]])
+    found = orientation_of_matrix(matrix)
+    scale = np.sqrt(abs(np.linalg.det(matrix)))
+    np.testing.assert_allclose(found.matrix * scale, matrix, rtol=1e-12)
+    place, baseline = np.array([3.0, -7.0]), np.array([1.5, 2.5])
+    assert found.to_sky(place) @ found.baselines_to_sky(baseline) == pytest.approx(place @ baseline)
+    np.testing.assert_allclose(found.to_image(found.to_sky(place)), place)
+    assert found.parity == -1
+    upright = orientation_of_matrix(Orientation(0.3, 1).matrix)
+    assert upright.skew == pytest.approx((1.0, 0.0, 0.0, 1.0), abs=1e-12)
+    assert upright.parity == 1

@@ -17,12 +17,9 @@ from amibayes.oifits.products.repairs import Repair, repaired
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits, open_oifits, plain
 from amibayes.oifits.writer import write_oifits
+from amibayes.scene.orientation import SAME_ORIENTATION_RAD
 from amibayes.support.options import ClosureCovariance
-from amibayes.units import DEGREE, FloatArray
-
-SAME_ORIENTATION_RAD = 0.05 * DEGREE
-"""Dithers of a visit differ by arcseconds, rolls of two visits by degrees; at 400 mas this is
-0.35 mas for one of two exposures, and nothing for their mean."""
+from amibayes.units import FloatArray
 
 USED = ("OI_VIS", "OI_Q4", "ASDF")
 """Tables that need not be said to be set aside: used for repairs, or derived from others."""

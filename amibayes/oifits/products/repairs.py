@@ -183,9 +183,49 @@ def _divided(error: str, amplitude: str, code: str) -> Any:
     return repair
 
 
+def _closure(product: Product, table: OITable, done: list[Repair]) -> dict[str, Any]:
+    """T3PHIERR over T3AMP; over those of target and calibrator where both are in it.
+
+    `ami_normalize` adds the two scatters in quadrature and keeps the target's T3AMP. With
+    noise of like size in both, the variance of the difference is the mean of what either
+    amplitude makes of it; the calibrator's follows from the calibrated amplitudes.
+    """
+    if not {"T3PHIERR", "T3AMP"} <= set(table.columns):
+        return {}
+    amplitude = np.abs(np.asarray(table.columns["T3AMP"], dtype=float))
+    ratio = _amplitude_ratio(product, table) if product.kind == "aminorm-oi" else None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gain = 1.0 / amplitude
+        if ratio is not None:
+            other = gain * ratio.reshape(gain.shape)
+            gain = np.sqrt(0.5 * (gain**2 + other**2))
+        sigma = table.columns["T3PHIERR"] * gain
+    if np.isfinite(sigma).any():
+        what = "T3PHIERR divided by T3AMP"
+        done.append(Repair("product-closure-error", table.name, what))
+    return {"T3PHIERR": sigma}
+
+
+def _amplitude_ratio(product: Product, table: OITable) -> FloatArray | None:
+    """Product around each triangle of VISAMP, which `ami_normalize` has divided, (n,)."""
+    rows = product.table("OI_VIS")
+    if rows is None or not {"VISAMP", "STA_INDEX"} <= set(rows.columns):
+        return None
+    amplitude = np.abs(np.asarray(rows.columns["VISAMP"], dtype=float)).reshape(len(rows), -1)
+    known = {
+        frozenset(pair.tolist()): a
+        for pair, a in zip(rows.columns["STA_INDEX"], amplitude[:, 0], strict=True)
+    }
+    triangles = table.columns.get("STA_INDEX")
+    if triangles is None:
+        return None
+    legs = [[frozenset(t[[i, j]].tolist()) for i, j in ((0, 1), (1, 2), (0, 2))] for t in triangles]
+    return np.array([np.prod([known.get(leg, np.nan) for leg in each]) for each in legs])
+
+
 ERRORS = {
     "OI_VIS2": _vis2,
-    "OI_T3": _divided("T3PHIERR", "T3AMP", "product-closure-error"),
+    "OI_T3": _closure,
     "OI_VIS": _divided("VISPHIERR", "VISAMP", "product-phase-error"),
 }
 """What makes the errors of each table right."""
