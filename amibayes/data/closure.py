@@ -7,8 +7,10 @@ triangles but only (n−1)(n−2)/2 independent combinations (kernel phases, Mar
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
-from scipy.optimize import lsq_linear
+from scipy.optimize import nnls
 
 from amibayes.units import FloatArray, IntArray
 
@@ -78,7 +80,14 @@ def closure_matrix(triangles: IntArray) -> tuple[FloatArray, IntArray]:
     baselines : (n_baselines, 2) int array
         The baselines that the triangles use, each with its lower station first.
     """
-    a, b, c = np.asarray(triangles, dtype=np.intp).T
+    matrix, baselines = _closure_matrix(np.ascontiguousarray(triangles, dtype=np.intp).tobytes())
+    return matrix.copy(), baselines.copy()
+
+
+@lru_cache(maxsize=512)
+def _closure_matrix(triangles: bytes) -> tuple[FloatArray, IntArray]:
+    """`closure_matrix`, remembered: the exposures of a file repeat few sets of triangles."""
+    a, b, c = np.frombuffer(triangles, dtype=np.intp).reshape(-1, 3).T
     legs = np.stack([np.stack([a, b], 1), np.stack([b, c], 1), np.stack([a, c], 1)], axis=1)
     sign = np.where(legs[..., 0] < legs[..., 1], 1.0, -1.0) * np.array([1.0, 1.0, -1.0])
     baselines, column = np.unique(np.sort(legs, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
@@ -118,7 +127,8 @@ def baseline_variances(matrix: FloatArray, closure_variance: FloatArray) -> Floa
     right = np.vstack([target / mean, np.full((share.shape[1], target.shape[1]), np.sqrt(RIDGE))])
     solution = np.linalg.lstsq(system, right, rcond=None)[0]
     for column in np.flatnonzero((solution < FLOOR).any(axis=0)):
-        solution[:, column] = lsq_linear(system, right[:, column], bounds=(FLOOR, np.inf)).x
+        above = right[:, column] - FLOOR * system.sum(axis=1)
+        solution[:, column] = FLOOR + nnls(system, above)[0]
     return np.asarray((solution * mean).reshape(share.shape[1:] + closure_variance.shape[1:]))
 
 

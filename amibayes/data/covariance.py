@@ -15,6 +15,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
+from amibayes.data.blocks import Block, BlockCovariance, Stack
 from amibayes.errors import DataError
 from amibayes.units import FloatArray, IntArray
 
@@ -129,147 +130,6 @@ class DiagonalCovariance:
         return DiagonalCovariance(self.variance[keep])
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """A correlated group of entries.
-
-    Parameters
-    ----------
-    index : (m,) int array
-        Where the group stands in the data vector.
-    matrix : (m, m) float array
-        Its covariance.
-    basis : (m, r) float array, optional
-        Orthonormal basis of the combinations that carry information (all, where absent).
-        For closure phases it is their kernel basis.
-    """
-
-    index: IntArray
-    matrix: FloatArray
-    basis: FloatArray | None = None
-
-    def select(self, position: IntArray, inside: IntArray) -> Block:
-        """Keep the entries ``inside`` of the block, which then stand at ``position``."""
-        basis = self.basis
-        if basis is not None:
-            left, singular, _ = np.linalg.svd(basis[inside], full_matrices=False)
-            basis = left[:, singular > 1e-8]
-        return Block(position, self.matrix[np.ix_(inside, inside)], basis)
-
-
-def _factors(blocks: Sequence[Block]) -> tuple[FloatArray, FloatArray]:
-    """Whitening (g, r, m) and colouring (g, r, m)ᵀ factors of g blocks of one shape."""
-    bases = np.array([np.eye(len(b.index)) if b.basis is None else b.basis for b in blocks])
-    inner = bases.swapaxes(1, 2) @ np.array([b.matrix for b in blocks]) @ bases
-    try:
-        lower = np.linalg.cholesky(inner)
-    except np.linalg.LinAlgError as error:
-        raise DataError("the covariance is not positive definite") from error
-    if not np.isfinite(lower).all():
-        raise DataError("the covariance has entries that are not finite")
-    return np.linalg.solve(lower, bases.swapaxes(1, 2)), bases @ lower
-
-
-class BlockCovariance:
-    """Independent groups of correlated entries; one block makes it dense.
-
-    Parameters
-    ----------
-    size : int
-        Length of the data vector.
-    blocks : sequence of Block
-        Every entry stands in exactly one block.
-
-    Raises
-    ------
-    DataError
-        Where a block is not positive definite on its basis.
-    ValueError
-        Where the blocks do not tile the vector.
-    """
-
-    def __init__(self, size: int, blocks: Sequence[Block]) -> None:
-        everywhere = np.concatenate([b.index for b in blocks]) if blocks else np.empty(0, np.intp)
-        if len(everywhere) != size or not np.array_equal(np.sort(everywhere), np.arange(size)):
-            raise ValueError("the blocks of a covariance have to tile the data vector")
-        self.size = size
-        self.blocks = tuple(blocks)
-        self.whitening, colouring, self._logdet = self._assemble()
-        self.colouring = csr_array(colouring.T)
-        self._unwhitening = self.whitening.T.tocsr()
-        self.rank = int(self.whitening.shape[0])
-
-    def _alike(self) -> list[list[Block]]:
-        kinds: dict[tuple[int, int], list[Block]] = {}
-        for block in self.blocks:
-            rank = len(block.index) if block.basis is None else block.basis.shape[1]
-            kinds.setdefault((len(block.index), rank), []).append(block)
-        return list(kinds.values())
-
-    def _assemble(self) -> tuple[csr_array, csr_array, float]:
-        row = 0
-        places, whitening, colouring, logdet = [], [], [], 0.0
-        for blocks in self._alike():
-            white, colour = _factors(blocks)
-            g, r, m = white.shape
-            rows = row + np.arange(g * r).reshape(g, r, 1)
-            columns = np.array([b.index for b in blocks]).reshape(g, 1, m)
-            places.append([np.broadcast_to(x, (g, r, m)).ravel() for x in (rows, columns)])
-            whitening.append(white.ravel())
-            colouring.append(colour.swapaxes(1, 2).ravel())
-            logdet += float(np.linalg.slogdet(colour.swapaxes(1, 2) @ colour)[1].sum())
-            row += g * r
-        where = tuple(np.concatenate(x) for x in zip(*places, strict=True)) if row else ([], [])
-        shape = (row, self.size)
-        return (
-            csr_array((np.concatenate([np.empty(0), *whitening]), where), shape=shape),
-            csr_array((np.concatenate([np.empty(0), *colouring]), where), shape=shape),
-            logdet,
-        )
-
-    @property
-    def variance(self) -> FloatArray:
-        """Diagonal of the matrix, (size,)."""
-        diagonal = np.empty(self.size)
-        for block in self.blocks:
-            diagonal[block.index] = np.diag(block.matrix)
-        return diagonal
-
-    def whiten(self, x: FloatArray) -> FloatArray:
-        """Independent, unit-variance combinations, (rank, …)."""
-        return np.asarray(self.whitening @ x)
-
-    def solve(self, x: FloatArray) -> FloatArray:
-        """(Pseudo-)inverse of the covariance times x, (size, …)."""
-        return np.asarray(self._unwhitening @ (self.whitening @ x))
-
-    def logdet(self) -> float:
-        """Logarithm of the determinant of the covariance of the independent combinations."""
-        return self._logdet
-
-    def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
-        """Noise vectors, (size, n)."""
-        return np.asarray(self.colouring @ rng.standard_normal((self.rank, n)))
-
-    def dense(self) -> FloatArray:
-        """The full matrix, (size, size)."""
-        matrix = np.zeros((self.size, self.size))
-        for block in self.blocks:
-            matrix[np.ix_(block.index, block.index)] = block.matrix
-        return matrix
-
-    def select(self, keep: IntArray) -> BlockCovariance:
-        """Covariance of the entries ``keep``, in that order."""
-        place = np.full(self.size, -1, dtype=np.intp)
-        place[keep] = np.arange(len(keep))
-        kept = []
-        for block in self.blocks:
-            inside = np.flatnonzero(place[block.index] >= 0)
-            if len(inside):
-                kept.append(block.select(place[block.index[inside]], inside))
-        return BlockCovariance(len(keep), kept)
-
-
 def dense_covariance(matrix: FloatArray, basis: FloatArray | None = None) -> BlockCovariance:
     """Covariance of one fully correlated data vector, (size, size)."""
     return BlockCovariance(len(matrix), [Block(np.arange(len(matrix)), np.asarray(matrix), basis)])
@@ -288,17 +148,12 @@ def as_blocks(covariance: Covariance, shift: int = 0) -> list[Block]:
 
 def sparse_covariance(covariance: Covariance) -> csr_array:
     """Write a covariance as a sparse matrix."""
-    rows, columns, values = [], [], []
-    for block in as_blocks(covariance):
-        m = len(block.index)
-        rows.append(np.repeat(block.index, m))
-        columns.append(np.tile(block.index, m))
-        values.append(block.matrix.ravel())
     shape = (covariance.size, covariance.size)
-    if not rows:
-        return csr_array(shape)
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return coo_array(entries, shape=shape).tocsr()
+    if isinstance(covariance, BlockCovariance):
+        return coo_array(covariance.entries, shape=shape).tocsr()
+    if isinstance(covariance, DiagonalCovariance):
+        return csr_array(diags_array(covariance.variance))
+    return csr_array(covariance.dense())
 
 
 def scaled(covariance: Covariance, factors: FloatArray) -> Covariance:
@@ -310,14 +165,7 @@ def scaled(covariance: Covariance, factors: FloatArray) -> Covariance:
         None of them zero.
     """
     if isinstance(covariance, BlockCovariance):
-        blocks = []
-        for block in covariance.blocks:
-            f = factors[block.index]
-            basis = block.basis
-            if basis is not None and not (f == f[0]).all():
-                basis = np.linalg.qr(f[:, None] * basis)[0]
-            blocks.append(Block(block.index, f[:, None] * block.matrix * f, basis))
-        return BlockCovariance(covariance.size, blocks)
+        return BlockCovariance(covariance.size, [s.scaled(factors) for s in covariance.stacks])
     return DiagonalCovariance(covariance.variance * factors**2)
 
 
@@ -326,8 +174,19 @@ def stack_covariances(parts: Sequence[Covariance]) -> Covariance:
     if all(isinstance(part, DiagonalCovariance) for part in parts):
         return DiagonalCovariance(np.concatenate([part.variance for part in parts]))
     starts = np.concatenate([[0], np.cumsum([part.size for part in parts])])
-    blocks = [b for part, s in zip(parts, starts, strict=False) for b in as_blocks(part, int(s))]
-    return BlockCovariance(int(starts[-1]), blocks)
+    stacks = [s for part, at in zip(parts, starts, strict=False) for s in _stacks(part, int(at))]
+    return BlockCovariance(int(starts[-1]), stacks)
+
+
+def _stacks(covariance: Covariance, shift: int) -> list[Stack]:
+    if not covariance.size:
+        return []
+    if isinstance(covariance, BlockCovariance):
+        return [s.moved(shift) for s in covariance.stacks]
+    if isinstance(covariance, DiagonalCovariance):
+        index = shift + np.arange(covariance.size)[:, None]
+        return [Stack(index, covariance.variance[:, None, None])]
+    return [Stack(shift + np.arange(covariance.size)[None], covariance.dense()[None])]
 
 
 def covariance_from_matrix(matrix: FloatArray) -> Covariance:

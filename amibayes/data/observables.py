@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -11,6 +11,7 @@ import numpy as np
 from astropy.table import QTable
 from scipy.sparse import csr_array
 
+from amibayes.data.closure import closure_matrix
 from amibayes.data.covariance import Covariance, stack_covariances
 from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.data.off_axis_response import OffAxisResponse
@@ -123,6 +124,28 @@ class Measurements:
     def select(self, keep: IntArray | BoolArray) -> Measurements:
         """The entries ``keep``, in that order."""
         return Measurements(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    @cached_property
+    def sets(self) -> tuple[IntArray, ...]:
+        """Of closure phases: the entries of each exposure and channel, which share baselines."""
+        if not len(self):
+            return ()
+        key = np.stack([exposure_labels(self), self.channel], axis=1)
+        order = np.lexsort((self.row, key[:, 1], key[:, 0]))
+        cuts = np.flatnonzero(np.any(np.diff(key[order], axis=0) != 0, axis=1)) + 1
+        return tuple(np.split(order, cuts))
+
+    @cached_property
+    def shared_noise(self) -> csr_array:
+        """Covariance K Kᵀ/3 of closure phases whose baseline phases have variance 1/3 each."""
+        rows, columns, values = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
+        for entries in self.sets:
+            matrix, _ = closure_matrix(self.stations[entries])
+            rows.append(np.repeat(entries, len(entries)))
+            columns.append(np.tile(entries, len(entries)))
+            values.append((matrix @ matrix.T / 3.0).ravel())
+        where = np.concatenate(rows), np.concatenate(columns)
+        return csr_array((np.concatenate(values), where), shape=(len(self), len(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,14 +330,9 @@ def _far_in_time(rows: Measurements, i: int) -> bool:
     return bool(gap > max(SIMULTANEOUS_S, overlap))
 
 
-def closure_sets(closure_phase: Measurements) -> Iterator[IntArray]:
-    """Yield the entries of each exposure and channel: the closure phases that share baselines."""
-    if not len(closure_phase):
-        return
-    key = np.stack([exposure_labels(closure_phase), closure_phase.channel], axis=1)
-    order = np.lexsort((closure_phase.row, key[:, 1], key[:, 0]))
-    cuts = np.flatnonzero(np.any(np.diff(key[order], axis=0) != 0, axis=1)) + 1
-    yield from np.split(order, cuts)
+def closure_sets(closure_phase: Measurements) -> Sequence[IntArray]:
+    """The entries of each exposure and channel: the closure phases that share baselines."""
+    return closure_phase.sets
 
 
 def join(parts: Sequence[Observables]) -> Observables:

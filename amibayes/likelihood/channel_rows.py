@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.sparse import csr_array
 
 from amibayes.data.covariance import Block, Covariance, DiagonalCovariance, as_blocks
@@ -142,11 +141,14 @@ def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
     """Variance of rows of channels in order, correlated by φ^|i−j| and of unit variance each."""
     if phi == 0.0:
         return np.asarray(np.bincount(row, value**2), dtype=float)
-    before = np.zeros(len(value))
-    cuts = np.append(np.flatnonzero(np.diff(row, prepend=-1)), len(row)).tolist()
-    for first, last in pairwise(cuts):
-        # Sum of all channels before, each times φ to the power of its distance.
-        before[first:last] = lfilter([0.0, phi], [1.0, -phi], value[first:last])
+    # Sum of all channels before, each times φ to the power of its distance, by doubling.
+    before = np.concatenate([[0.0], phi * value[:-1]]) * (np.diff(row, prepend=-1) == 0)
+    step, power = 1, phi
+    longest = int(np.bincount(row).max(initial=1))
+    while step < longest:
+        same = row[step:] == row[:-step]
+        before[step:] += np.where(same, power * before[:-step], 0.0)
+        step, power = 2 * step, power**2
     return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
 
 
@@ -156,6 +158,13 @@ def haar(weight: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
     The other rows are differences between the two halves of a range of channels, of the
     halves of these, and so on: n log n entries.
     """
+    return _haar(np.ascontiguousarray(weight, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=8192)
+def _haar(content: bytes) -> tuple[IntArray, IntArray, FloatArray]:
+    """`haar`, remembered: it is asked for at every noise that is tried."""
+    weight = np.frombuffer(content)
     n = len(weight)
     rows, columns, values = [np.zeros(n, dtype=np.intp)], [np.arange(n)], [weight / _norm(weight)]
     ranges, row = [(0, n)], 1

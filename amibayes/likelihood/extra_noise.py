@@ -9,15 +9,13 @@ one with calibration errors of its own then does not spoil the others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array, diags_array
 
-from amibayes.data.closure import closure_matrix
 from amibayes.data.covariance import (
-    Block,
     BlockCovariance,
     Covariance,
     DiagonalCovariance,
@@ -25,11 +23,11 @@ from amibayes.data.covariance import (
     sparse_covariance,
 )
 from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
-from amibayes.data.observables import Observables, closure_sets
+from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_noise import ChannelShare, noise_with_channels
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import FloatArray
 
 UNLIKELY = 1e-3
 """Probability of a χ² as large as that of a kind of observable, below which noise is added."""
@@ -164,33 +162,19 @@ def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
     if isinstance(data.covariance, DiagonalCovariance):
         diagonal[n_vis2:] = closure
         return replace(data, covariance=DiagonalCovariance(data.covariance.variance + diagonal))
-    blocks = as_blocks(data.covariance)
-    matrices = [b.matrix + np.diag(diagonal[b.index]) for b in blocks]
-    home, place = _places(blocks, data.covariance.size)
-    for entries, shared in _shared_noise(data):
-        at, block = place[entries + n_vis2], home[entries + n_vis2]
-        # A covariance may hold triangles of one exposure apart (independent errors).
-        for number in np.unique(block):
-            own = np.flatnonzero(block == number)
-            noise = closure[entries[0]] * shared[np.ix_(own, own)]
-            matrices[number][np.ix_(at[own], at[own])] += noise
-    noisy: Covariance = BlockCovariance(
-        data.covariance.size,
-        [Block(b.index, m, b.basis) for b, m in zip(blocks, matrices, strict=True)],
-    )
+    noise = block_diag([diags_array(diagonal[:n_vis2]), _shared_noise(data, closure)])
+    noisy = _in_blocks(data.covariance).plus(csr_array(noise))
     return replace(data, covariance=noisy)
 
 
-def _places(blocks: list[Block], size: int) -> tuple[IntArray, IntArray]:
-    """The block each datum stands in, and where in it."""
-    home, place = np.empty(size, dtype=np.intp), np.empty(size, dtype=np.intp)
-    for number, block in enumerate(blocks):
-        home[block.index], place[block.index] = number, np.arange(len(block.index))
-    return home, place
+def _in_blocks(covariance: Covariance) -> BlockCovariance:
+    """Any covariance as blocks."""
+    if isinstance(covariance, BlockCovariance):
+        return covariance
+    return BlockCovariance(covariance.size, as_blocks(covariance))
 
 
-def _shared_noise(data: Observables) -> Iterator[tuple[IntArray, FloatArray]]:
-    """Covariance K Kᵀ/3 of closure phases whose baseline phases have variance 1/3 each."""
-    for entries in closure_sets(data.closure_phase):
-        matrix, _ = closure_matrix(data.closure_phase.stations[entries])
-        yield entries, matrix @ matrix.T / 3.0
+def _shared_noise(data: Observables, closure: FloatArray) -> csr_array:
+    """`Measurements.shared_noise` of closure phases, of variances ``closure`` (n_closure,)."""
+    root = diags_array(np.sqrt(closure))
+    return csr_array(root @ data.closure_phase.shared_noise @ root)

@@ -25,7 +25,8 @@ from amibayes.data.covariance import scaled
 from amibayes.errors import UsageError
 from amibayes.oifits import read_oifits
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.prepare import Clock, prepare
+from amibayes.pipeline.prepare import prepare
+from amibayes.pipeline.run import Run
 from amibayes.scene.disc import uniform_disc
 
 WORDS = ["--flag", "vis2>0.9", "--bin-channels", "2", "--merge-epochs", "1"]
@@ -95,7 +96,7 @@ def test_every_command_has_the_options(command: str, tmp_path: Path) -> None:
 def test_a_search_reduces_its_data(path: Path) -> None:
     options = SearchOptions(flag=("vis2>0.9",), bin_channels=2, merge_epochs_days=1.0)
     rng = np.random.default_rng(1)
-    found = prepare([path], [], options, rng, Clock(lambda name: None)).observables
+    found = prepare([path], [], options, rng, Run()).observables
     expected = reduce_data(read_oifits(path), flag=["vis2>0.9"], channels=2, epochs_days=1.0)
     np.testing.assert_array_equal(found.data, expected.data)
     np.testing.assert_allclose(found.covariance.dense(), expected.covariance.dense())
@@ -109,7 +110,7 @@ def test_a_search_takes_diameters_of_calibrators(
     found = {}
     for diameter in (None, "30"):
         options = SearchOptions(calibrator_diameters=diameter)
-        prepared = prepare([path], [cal], options, rng, Clock(lambda name: None))
+        prepared = prepare([path], [cal], options, rng, Run())
         found[diameter] = prepared.observables
     m = found["30"].vis2
     disc = uniform_disc(np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m, 30.0)[0]

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from amibayes.data.closure import (
     assumed_covariance,
@@ -137,3 +138,35 @@ def test_bad_covariances_are_refused() -> None:
         dense_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]))
     with pytest.raises(ValueError, match="tile"):
         BlockCovariance(3, [Block(np.array([0, 1]), np.eye(2))])
+
+
+def test_sum_with_a_sparse_covariance_and_selection_are_those_of_the_matrices(
+    rng: np.random.Generator,
+) -> None:
+    """Blocks of several shapes, with and without basis, in any order."""
+    matrix, _ = closure_matrix(np.array(list(combinations(range(4), 3))))
+    basis = kernel_basis(matrix)
+    places = np.split(rng.permutation(20), [4, 8, 12, 14, 16, 17, 18, 19])
+    bases = [basis, basis, basis, *[None] * 6]
+    blocks = []
+    for place, b in zip(places, bases, strict=True):
+        inner = random_matrix(rng, len(place) if b is None else b.shape[1])
+        blocks.append(Block(place, inner if b is None else b @ inner @ b.T, b))
+    covariance = BlockCovariance(20, blocks)
+    dense = covariance.dense()
+    np.testing.assert_allclose(covariance.variance, np.diag(dense))
+    added = np.zeros((20, 20))
+    for place, b in zip(places, bases, strict=True):
+        added[np.ix_(place, place)] = np.eye(len(place)) if b is None else matrix @ matrix.T / 3
+    found = covariance.plus(csr_array(0.5 * added))
+    np.testing.assert_allclose(found.dense(), dense + 0.5 * added, atol=1e-14)
+    assert found.rank == covariance.rank == 3 * 3 + 8
+    keep = rng.permutation(20)[:13]
+    chosen = covariance.select(keep)
+    np.testing.assert_allclose(chosen.dense(), dense[np.ix_(keep, keep)], atol=1e-14)
+    x = rng.normal(size=(20, 2))
+    np.testing.assert_allclose(
+        found.solve(x)[np.concatenate(places[3:])],
+        np.linalg.pinv(dense + 0.5 * added, rcond=1e-10)[np.concatenate(places[3:])] @ x,
+        atol=1e-8,
+    )

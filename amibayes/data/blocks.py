@@ -1,0 +1,278 @@
+"""Covariances of independent groups of correlated data, whitened group by group of one shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from amibayes.errors import DataError
+from amibayes.units import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A correlated group of entries.
+
+    Parameters
+    ----------
+    index : (m,) int array
+        Where the group stands in the data vector.
+    matrix : (m, m) float array
+        Its covariance.
+    basis : (m, r) float array, optional
+        Orthonormal basis of the combinations that carry information (all, where absent).
+        For closure phases it is their kernel basis.
+    """
+
+    index: IntArray
+    matrix: FloatArray
+    basis: FloatArray | None = None
+
+    def select(self, position: IntArray, inside: IntArray) -> Block:
+        """Keep the entries ``inside`` of the block, which then stand at ``position``."""
+        basis = self.basis
+        if basis is not None:
+            left, singular, _ = np.linalg.svd(basis[inside], full_matrices=False)
+            basis = left[:, singular > 1e-8]
+        return Block(position, self.matrix[np.ix_(inside, inside)], basis)
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """Blocks of one size and rank side by side: thousands are handled as one array.
+
+    Parameters
+    ----------
+    index : (g, m) int array
+    matrix : (g, m, m) float array
+    basis : (g, m, r) float array, optional
+        As those of `Block`; absent where all combinations carry information.
+    """
+
+    index: IntArray
+    matrix: FloatArray
+    basis: FloatArray | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Size and rank of each block."""
+        m = self.index.shape[1]
+        return m, m if self.basis is None else self.basis.shape[2]
+
+    @classmethod
+    def of(cls, blocks: Sequence[Block]) -> Stack:
+        """Lay blocks of one size and rank together."""
+        basis = None
+        if any(b.basis is not None for b in blocks):
+            eye = np.eye(len(blocks[0].index))
+            basis = np.array([eye if b.basis is None else b.basis for b in blocks])
+        return cls(np.array([b.index for b in blocks]), np.array([b.matrix for b in blocks]), basis)
+
+    @classmethod
+    def joined(cls, stacks: Sequence[Stack]) -> Stack:
+        """Stacks of one shape as one."""
+        if len(stacks) == 1:
+            return stacks[0]
+        index, matrix = (
+            np.concatenate([getattr(s, n) for s in stacks]) for n in ("index", "matrix")
+        )
+        if all(s.basis is None for s in stacks):
+            return cls(index, matrix)
+        eye = np.eye(index.shape[1])
+        bases = [
+            np.broadcast_to(eye, s.matrix.shape) if s.basis is None else s.basis for s in stacks
+        ]
+        return cls(index, matrix, np.concatenate(bases))
+
+    def moved(self, shift: int) -> Stack:
+        """The same blocks ``shift`` entries down the data vector."""
+        return Stack(self.index + shift, self.matrix, self.basis)
+
+    def scaled(self, factors: FloatArray) -> Stack:
+        """Blocks of data that are multiplied by numbers (size,)."""
+        f = factors[self.index]
+        basis = None if self.basis is None else np.linalg.qr(f[:, :, None] * self.basis)[0]
+        return Stack(self.index, f[:, :, None] * self.matrix * f[:, None], basis)
+
+    def select(self, place: IntArray) -> list[Stack]:
+        """Entries that have a place (size,) of 0 or more, there."""
+        new = place[self.index]
+        inside = new >= 0
+        whole = inside.all(axis=1)
+        kept = []
+        if whole.any():
+            basis = None if self.basis is None else self.basis[whole]
+            kept.append(Stack(new[whole], self.matrix[whole], basis))
+        for k in np.flatnonzero(inside.any(axis=1) & ~whole):
+            block = Block(
+                self.index[k], self.matrix[k], None if self.basis is None else self.basis[k]
+            )
+            at = np.flatnonzero(inside[k])
+            kept.append(Stack.of([block.select(new[k][at], at)]))
+        return kept
+
+    def factors(self) -> tuple[FloatArray, FloatArray]:
+        """Whitening (g, r, m) and colouring (g, m, r) factors.
+
+        Raises
+        ------
+        DataError
+            Where a block is not positive definite on its basis.
+        """
+        m, _ = self.shape
+        basis = np.eye(m)[None] if self.basis is None else self.basis
+        inner = basis.swapaxes(1, 2) @ self.matrix @ basis
+        try:
+            lower = np.linalg.cholesky(inner)
+        except np.linalg.LinAlgError as error:
+            raise DataError("the covariance is not positive definite") from error
+        if not np.isfinite(lower).all():
+            raise DataError("the covariance has entries that are not finite")
+        right = np.broadcast_to(basis.swapaxes(1, 2), (len(lower), *basis.shape[:0:-1]))
+        return np.linalg.solve(lower, right), basis @ lower
+
+
+class BlockCovariance:
+    """Independent groups of correlated entries; one block makes it dense.
+
+    Parameters
+    ----------
+    size : int
+        Length of the data vector.
+    blocks : sequence of Block or Stack
+        Every entry stands in exactly one block.
+
+    Raises
+    ------
+    DataError
+        Where a block is not positive definite on its basis.
+    ValueError
+        Where the blocks do not tile the vector.
+    """
+
+    def __init__(self, size: int, blocks: Sequence[Block | Stack]) -> None:
+        self.size = size
+        self.stacks = _stacked(blocks)
+        everywhere = np.concatenate([np.empty(0, np.intp), *(s.index.ravel() for s in self.stacks)])
+        if len(everywhere) != size or not np.array_equal(np.sort(everywhere), np.arange(size)):
+            raise ValueError("the blocks of a covariance have to tile the data vector")
+        self.whitening, colouring, self._logdet = self._assemble()
+        self.colouring = csr_array(colouring.T)
+        self._unwhitening = self.whitening.T.tocsr()
+        self.rank = int(self.whitening.shape[0])
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Its groups, those of one size and rank together."""
+        return tuple(
+            Block(s.index[k], s.matrix[k], None if s.basis is None else s.basis[k])
+            for s in self.stacks
+            for k in range(len(s.index))
+        )
+
+    def _assemble(self) -> tuple[csr_array, csr_array, float]:
+        row = 0
+        places, whitening, colouring, logdet = [], [], [], 0.0
+        for stack in self.stacks:
+            white, colour = stack.factors()
+            g, r, m = white.shape
+            rows = row + np.arange(g * r).reshape(g, r, 1)
+            columns = stack.index.reshape(g, 1, m)
+            places.append([np.broadcast_to(x, (g, r, m)).ravel() for x in (rows, columns)])
+            whitening.append(white.ravel())
+            colouring.append(colour.swapaxes(1, 2).ravel())
+            logdet += float(np.linalg.slogdet(colour.swapaxes(1, 2) @ colour)[1].sum())
+            row += g * r
+        where = tuple(np.concatenate(x) for x in zip(*places, strict=True)) if row else ([], [])
+        shape = (row, self.size)
+        return (
+            csr_array((np.concatenate([np.empty(0), *whitening]), where), shape=shape),
+            csr_array((np.concatenate([np.empty(0), *colouring]), where), shape=shape),
+            logdet,
+        )
+
+    @property
+    def variance(self) -> FloatArray:
+        """Diagonal of the matrix, (size,)."""
+        diagonal = np.empty(self.size)
+        for stack in self.stacks:
+            diagonal[stack.index] = np.einsum("gmm->gm", stack.matrix)
+        return diagonal
+
+    @property
+    def entries(self) -> tuple[FloatArray, tuple[IntArray, IntArray]]:
+        """Every number of the blocks, with its row and column in the matrix."""
+        values, rows, columns = [np.empty(0)], [np.empty(0, np.intp)], [np.empty(0, np.intp)]
+        for s in self.stacks:
+            values.append(s.matrix.ravel())
+            rows.append(np.broadcast_to(s.index[:, :, None], s.matrix.shape).ravel())
+            columns.append(np.broadcast_to(s.index[:, None], s.matrix.shape).ravel())
+        return np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+
+    def whiten(self, x: FloatArray) -> FloatArray:
+        """Independent, unit-variance combinations, (rank, …)."""
+        return np.asarray(self.whitening @ x)
+
+    def solve(self, x: FloatArray) -> FloatArray:
+        """(Pseudo-)inverse of the covariance times x, (size, …)."""
+        return np.asarray(self._unwhitening @ (self.whitening @ x))
+
+    def logdet(self) -> float:
+        """Logarithm of the determinant of the covariance of the independent combinations."""
+        return self._logdet
+
+    def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """Noise vectors, (size, n)."""
+        return np.asarray(self.colouring @ rng.standard_normal((self.rank, n)))
+
+    def dense(self) -> FloatArray:
+        """The full matrix, (size, size)."""
+        matrix = np.zeros((self.size, self.size))
+        values, where = self.entries
+        matrix[where] = values
+        return matrix
+
+    def select(self, keep: IntArray) -> BlockCovariance:
+        """Covariance of the entries ``keep``, in that order."""
+        place = np.full(self.size, -1, dtype=np.intp)
+        place[keep] = np.arange(len(keep))
+        return BlockCovariance(len(keep), [s for old in self.stacks for s in old.select(place)])
+
+    def plus(self, addition: csr_array) -> BlockCovariance:
+        """The sum with a covariance (size, size), of which what lies in the blocks counts."""
+        stacks = []
+        for s in self.stacks:
+            rows = np.broadcast_to(s.index[:, :, None], s.matrix.shape)
+            columns = np.broadcast_to(s.index[:, None], s.matrix.shape)
+            more = np.asarray(addition[rows.ravel(), columns.ravel()]).reshape(s.matrix.shape)
+            stacks.append(Stack(s.index, s.matrix + more, s.basis))
+        return BlockCovariance(self.size, stacks)
+
+
+def _stacked(blocks: Sequence[Block | Stack]) -> tuple[Stack, ...]:
+    """Blocks by size and rank, in the order in which these first appear."""
+    kinds: dict[tuple[int, int], list[Block | Stack]] = {}
+    for block in blocks:
+        if isinstance(block, Stack):
+            shape = block.shape
+        else:
+            m = len(block.index)
+            shape = m, m if block.basis is None else block.basis.shape[1]
+        kinds.setdefault(shape, []).append(block)
+    out = []
+    for alike in kinds.values():
+        parts: list[Stack] = []
+        waiting: list[Block] = []
+        for block in alike:
+            if isinstance(block, Block):
+                waiting.append(block)
+                continue
+            parts += [Stack.of(waiting)] if waiting else []
+            waiting = []
+            parts.append(block)
+        out.append(Stack.joined([*parts, *([Stack.of(waiting)] if waiting else [])]))
+    return tuple(out)
