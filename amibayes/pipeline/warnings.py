@@ -12,8 +12,9 @@ from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes
-from amibayes.posterior.ensemble import Posterior, modes_to_sample
+from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.grid import integrable
+from amibayes.posterior.modes import modes_to_sample
 from amibayes.posterior.priors import Prior
 
 MAX_NAMED = 3

@@ -7,10 +7,8 @@ goes on from there and ends with the same samples.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,166 +16,40 @@ import emcee
 import numpy as np
 from astropy.table import QTable
 
-from amibayes.companion_search.result import Mode, SearchResult
-from amibayes.companion_search.search import resolution_mas
+from amibayes.companion_search.result import SearchResult
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.chain_file import load_chain, save_chain
 from amibayes.posterior.grid import GridPosterior
+from amibayes.posterior.independence import IndependenceProposal
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
+from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.priors import Prior
 from amibayes.support import request
 from amibayes.support.ensemble_moves import along_others
 from amibayes.units import (
-    BoolArray,
     FloatArray,
-    IntArray,
     contrast_to_delta_mag,
     position_angle_deg,
     separation,
 )
 
-STRONG = 30.0
-"""Δχ² above which a mode is an island in the sea of noise."""
-
-
-def modes_to_sample(result: SearchResult) -> tuple[Mode, ...]:
-    """Choose the modes that one chain explores.
-
-    Where there are strong ones it is that of the reported one: a mean over positions apart
-    is no position. Weak ones are joined by the sea of noise around them.
-    """
-    strong = result.modes[0].delta_chi2 > STRONG
-    return result.modes[:1] if strong else result.modes
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Where a chain is at home: nearer to the reported mode than to any that it leaves out.
-
-    Parameters
-    ----------
-    places : (n, 2) float array
-        East and north of the modes, mas, the reported one first; it alone where the chain
-        explores all of the field.
-    """
-
-    places: FloatArray
-
-    @classmethod
-    def of(cls, result: SearchResult) -> Region:
-        """Region of the chain of a search's result."""
-        reported, *others = (mode.place for mode in result.modes)
-        if modes_to_sample(result) == result.modes:
-            others = []
-        least = 0.5 * resolution_mas(result.likelihood)  # nearer ones are of the same position
-        apart = [place for place in others if math.dist(place, reported) > least]
-        return cls(np.array([reported, *apart]))
-
-    def holds(self, east: FloatArray, north: FloatArray) -> BoolArray:
-        """Whether positions (n,) are in it."""
-        away = np.hypot(east[:, None] - self.places[:, 0], north[:, None] - self.places[:, 1])
-        return np.asarray(away.argmin(axis=1) == 0)
-
-
-@dataclass(frozen=True, eq=False)
-class IndependenceProposal:
-    """Proposals for `emcee.moves.MHMove` from a grid posterior.
-
-    Every box of a cell in contrast is filled evenly in ln contrast, every cell evenly in
-    area; nuisance parameters are drawn by themselves.
-    """
-
-    grid: GridPosterior
-
-    def __call__(
-        self, walkers: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose places (n, n_dim) for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
-        places, log_density = self.draw(len(walkers), random)
-        return places, self.log_density(walkers) - log_density
-
-    def draw(self, n: int, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
-        """Draw (n, n_dim) of (east, north, ln contrast, nuisance…), and their ln q, (n,)."""
-        cells, nuisance = self.grid.cells, self.grid.nuisance
-        flat = np.searchsorted(self._cumulated, random.random_sample(n), side="right")
-        cell, box = np.divmod(flat, self.grid.contrast_probability.shape[1])
-        node = np.searchsorted(self._nodes_cumulated, random.random_sample(n), side="right")
-        out, around, up = random.random_sample((3, n))
-        inner, outer = cells.inner[cell] ** 2, cells.outer[cell] ** 2
-        rho = np.sqrt(inner + out * (outer - inner))
-        angle = cells.first[cell] + around * (cells.last[cell] - cells.first[cell])
-        low, high = (np.log(self.grid.contrast_edges[cell, box + k]) for k in (0, 1))
-        size = nuisance.high[node] - nuisance.low[node]
-        further = nuisance.low[node] + random.random_sample(size.shape) * size
-        parameters = self.grid.parameters
-        places = np.empty((n, len(parameters)))
-        places[:, parameters.place()] = np.stack([rho * np.sin(angle), rho * np.cos(angle)]).T
-        places[:, parameters.contrasts[0]] = low + up * (high - low)
-        places[:, parameters.nuisance] = further
-        return places, self._log_density(cell, box, node)
-
-    def log_density(self, places: FloatArray) -> FloatArray:
-        """Logarithm of q at (n, n_dim) places; −inf where the grid holds nothing."""
-        cells, nuisance = self.grid.cells, self.grid.nuisance
-        parameters = self.grid.parameters
-        east, north = places[:, parameters.place()].T
-        ln_contrast = places[:, parameters.contrasts[0]]
-        rho, angle = np.hypot(east, north)[:, None], np.arctan2(east, north)[:, None] % (2 * np.pi)
-        across = (cells.first <= angle) & (angle < cells.last)
-        in_cell = across & (cells.inner <= rho) & (rho < cells.outer)
-        cell = in_cell.argmax(axis=1)
-        edges = np.log(self.grid.contrast_edges[cell])
-        in_box = (edges[:, :-1] <= ln_contrast[:, None]) & (ln_contrast[:, None] < edges[:, 1:])
-        box = in_box.argmax(axis=1)
-        value = places[:, None, parameters.nuisance]
-        in_node = np.all((nuisance.low <= value) & (value < nuisance.high), axis=2)
-        node = in_node.argmax(axis=1)
-        inside = np.any(in_cell, axis=1) & np.any(in_box, axis=1) & np.any(in_node, axis=1)
-        return np.where(inside, self._log_density(cell, box, node), -np.inf)
-
-    def _log_density(self, cell: IntArray, box: IntArray, node: IntArray) -> FloatArray:
-        grid, cells, nuisance = self.grid, self.grid.cells, self.grid.nuisance
-        width = cells.last[cell] - cells.first[cell]
-        area = 0.5 * (cells.outer[cell] ** 2 - cells.inner[cell] ** 2) * width
-        depth = np.log(grid.contrast_edges[cell, box + 1] / grid.contrast_edges[cell, box])
-        volume = np.prod(nuisance.high[node] - nuisance.low[node], axis=1)
-        share = grid.contrast_probability[cell, box] * grid.nuisance_probability[node]
-        with np.errstate(divide="ignore"):
-            return np.asarray(np.log(share / (area * depth * volume)))
-
-    @cached_property
-    def _cumulated(self) -> FloatArray:
-        """Of all boxes, cell by cell."""
-        return _cumulated(self.grid.contrast_probability.ravel())
-
-    @cached_property
-    def _nodes_cumulated(self) -> FloatArray:
-        return _cumulated(self.grid.nuisance_probability)
-
-
-def _cumulated(probability: FloatArray) -> FloatArray:
-    """Sums up to 1, the last of which no draw from [0, 1) reaches."""
-    total = np.cumsum(probability)
-    return np.asarray(total / total[-1])
-
-
 N_WALKERS = 32
-
+"""Some ten times the number of parameters: moves take their directions from the others."""
 
 SEGMENT = 500
-
+"""Steps between two checks of the length of the chain, and between two writes of it."""
 
 MAX_STEPS = 30_000
-
+"""Steps after which a chain is given up: a minute or two."""
 
 ENOUGH = 50.0
 """Autocorrelation times a chain must be long (Foreman-Mackey et al. 2013)."""
 
 
 GOOD_RHAT = 1.02
-
+"""Means of parts of the chain then differ by a fifth of the posterior's width at most."""
 
 START_WIDTH = 0.05
 """Longest scatter of the walkers' start, in units of the field."""
@@ -417,33 +289,6 @@ def _log_posterior(
     return log_posterior
 
 
-def mode_probabilities(
-    result: SearchResult, prior: Prior, grid: GridPosterior | None = None
-) -> FloatArray:
-    """Probability of each mode among the modes, (n_modes,).
-
-    By the grid posterior within λ/2B of each mode, where there is one; else by Laplace's
-    approximation.
-    """
-    if grid is not None:
-        mass = mode_masses(result, grid)
-        if mass.sum() > 0.0:
-            return np.asarray(mass / mass.sum())
-    log_mass = log_masses(result.likelihood, result.modes, prior)
-    weight = np.exp(log_mass - log_mass.max())
-    return np.asarray(weight / weight.sum())
-
-
-def mode_masses(result: SearchResult, grid: GridPosterior) -> FloatArray:
-    """Posterior probability within λ/2B of each mode; what is missing to 1 is elsewhere."""
-    places = np.array([m.place for m in result.modes])
-    return grid.mass_near(places, 0.5 * resolution_mas(result.likelihood))
-
-
-def _elsewhere(result: SearchResult, grid: GridPosterior) -> float:
-    return max(1.0 - float(mode_masses(result, grid).sum()), 0.0)
-
-
 def _start(
     result: SearchResult, prior: Prior, region: Region, rng: np.random.Generator
 ) -> FloatArray:
@@ -523,7 +368,7 @@ def _posterior(
         prior=prior,
         mode_probability=mode_probabilities(result, prior, grid),
         mode_method="laplace" if grid is None else "grid",
-        elsewhere=float("nan") if grid is None else _elsewhere(result, grid),
+        elsewhere=float("nan") if grid is None else elsewhere(result, grid),
         times=times,
         rhats=_split_rhat(sampler),
     )

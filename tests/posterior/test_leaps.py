@@ -12,8 +12,9 @@ from helpers import niriss, simulated
 from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.posterior.ensemble import IndependenceProposal, sample
+from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import GridPosterior, grid_posterior
+from amibayes.posterior.independence import IndependenceProposal
 from amibayes.posterior.priors import default_prior
 from amibayes.support.ensemble_moves import along_others
 

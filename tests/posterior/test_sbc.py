@@ -15,8 +15,9 @@ from scipy import stats
 
 from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.posterior.ensemble import Region, sample
+from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import grid_posterior
+from amibayes.posterior.modes import Region
 from amibayes.posterior.priors import Prior
 
 FIELD = (50.0, 400.0)
