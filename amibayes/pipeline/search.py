@@ -187,7 +187,7 @@ def _inferred(
         extra_noise=options.extra_noise,
         per_file=options.file_noise is not False,
         channels=found.noise.channels,
-        prior=noise_prior(options),
+        prior=noise_prior(ready.observables.only(options.observables), options),
     )
     prior, counts = _prior(result, options), _counts(options)
     grid = samples = evidence = None
