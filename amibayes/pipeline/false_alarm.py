@@ -18,6 +18,10 @@ MAX_RANDOMISED = 5000
 """Randomised data sets: enough for an upper bound of 7e-4 where none is above."""
 
 
+STRUCTURE_DRAWS = 2000
+"""Null draws of the structure that a fit leaves: a probability of 5e-4 is enough to reject."""
+
+
 def false_alarm(
     result: SearchResult,
     options: SearchOptions,
@@ -65,3 +69,20 @@ def second_false_alarm(
     return significance(
         test, options.null_draws, rng, options.alpha, executor=executor, progress=progress
     )
+
+
+def structure(
+    result: SearchResult,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    executor: Executor | None = None,
+) -> Significance:
+    """Find the chance that noise alone leaves as much structure beside the best fit.
+
+    That of a second companion, with fewer draws, and randomised residuals where they say
+    something.
+    """
+    test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
+    draws = min(options.null_draws, STRUCTURE_DRAWS)
+    found = significance(test, draws, rng, options.alpha, executor=executor)
+    return found.beside(randomised(test, draws, rng, executor=executor))

@@ -54,6 +54,10 @@ def result_json(report: SearchReport, request: str = "") -> Json:
     result = report.result
     return {
         "amibayes": __version__,
+        "verdict": None if report.verdict is None else asdict(report.verdict),
+        "consistency": [
+            asdict(split) | {"parts": list(split.parts)} for split in report.consistency
+        ],
         "seed": report.options.seed,
         "request": request,
         "options": report.options.to_json(),

@@ -30,6 +30,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
         f"{len(result.grid)} positions",
+        *_statement(report),
         _verdict(report),
         "best fit    no companion improves the fit"
         if c.contrast <= 0.0
@@ -55,6 +56,12 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")
+
+
+def _statement(report: SearchReport) -> list[str]:
+    """The verdict, with its reason."""
+    found = report.verdict
+    return [] if found is None else [row("verdict", f"{found.statement.upper()}: {found.because}")]
 
 
 def _verdict(report: SearchReport) -> str:
