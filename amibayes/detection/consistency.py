@@ -4,7 +4,7 @@ At the best fit of all data together each part asks for a change of the companio
 its own star and background free. What the parts gain in χ² by going their own ways, over going
 one way, is the test; its probability is the share of data sets drawn from the model and its
 noise whose parts go as far apart. To first order in the changes: the same for the data and for
-the draws, and no part has to be searched again.
+the draws.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from typing import Literal
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
+from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
+from amibayes.models.binary import BinaryModel
 from amibayes.units import BoolArray, FloatArray
 
 Split = Literal["observables", "files", "epochs", "calibrators"]
@@ -28,6 +31,9 @@ EPOCH_GAP_DAYS = 0.5
 
 SIMULATIONS = 4000
 """Draws: a probability of 0.0013 is then known to 45 %."""
+
+MAX_PARTS = 12
+"""Parts of a split that are compared: each is searched by itself."""
 
 SINGULAR = 1e-10
 """Directions that a part measures so much worse than its best one it does not measure."""
@@ -53,7 +59,13 @@ class Consistency:
     p: float
 
 
-def consistency(result: SearchResult, rng: np.random.Generator) -> tuple[Consistency, ...]:
+def consistency(
+    result: SearchResult,
+    rng: np.random.Generator,
+    *,
+    stated: Observables | None = None,
+    prior: NoisePrior | None = None,
+) -> tuple[Consistency, ...]:
     """Compare all the parts that the data of a search have.
 
     Parameters
@@ -61,19 +73,44 @@ def consistency(result: SearchResult, rng: np.random.Generator) -> tuple[Consist
     result : SearchResult
         Its best fit has a companion.
     rng : numpy.random.Generator
+    stated : Observables, optional
+        The data with their stated errors: each file and each night then has the noise that its
+        own best fit leaves. The noise of a joint fit would hide that they disagree.
+    prior : NoisePrior, optional
+        Of that noise.
     """
-    data = result.likelihood.observables
+    whole, theta = result.likelihood, result.theta
+    data = whole.observables
     files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
-    splits: list[tuple[Split, dict[str, BoolArray]]] = [
-        ("observables", _kinds(data)),
-        ("files", files),
-        ("epochs", _epochs(data)),
-    ]
-    return tuple(
-        compare(result.likelihood, result.theta, name, parts, rng)
-        for name, parts in splits
-        if len(parts) > 1
-    )
+    found = []
+    kinds, nights = _kinds(data), _epochs(data)
+    if len(kinds) > 1:
+        found.append(compare(whole, theta, "observables", kinds, rng))
+    splits: list[tuple[Split, dict[str, BoolArray]]] = [("files", files), ("epochs", nights)]
+    for name, parts in splits:
+        if not 1 < len(parts) <= MAX_PARTS:
+            continue
+        own = [_own_noise(result, mask, stated, prior) for mask in parts.values()]
+        found.append(compare(whole, theta, name, parts, rng, own=own))
+    return tuple(found)
+
+
+def _own_noise(
+    result: SearchResult, mask: BoolArray, stated: Observables | None, prior: NoisePrior | None
+) -> Likelihood:
+    """Likelihood of a part with the noise of its own best fit, if it has data enough for one."""
+    whole = result.likelihood
+    if stated is None:
+        return _selected(whole.observables, whole.model, mask)
+    part = _selected(stated.unflagged(), whole.model, mask)
+    field = result.grid.inner_mas, result.grid.outer_mas
+    if part.n_independent <= len(part.parameters):
+        return part
+    return search_with_noise(part, field, prior=prior)[0].likelihood
+
+
+def _selected(data: Observables, model: BinaryModel, mask: BoolArray) -> Likelihood:
+    return Likelihood(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), model)
 
 
 def _kinds(data: Observables) -> dict[str, BoolArray]:
@@ -113,10 +150,8 @@ class _Part:
     likelihood: Likelihood
 
     @classmethod
-    def of(cls, whole: Likelihood, theta: FloatArray, mask: BoolArray) -> _Part:
-        n = whole.observables.n_vis2
-        part = Likelihood(whole.observables.select(mask[:n], mask[n:]), whole.model)
-        jacobian, star = part.jacobian(theta), whole.parameters.nuisance
+    def of(cls, part: Likelihood, theta: FloatArray, mask: BoolArray) -> _Part:
+        jacobian, star = part.jacobian(theta), part.parameters.nuisance
         left, singular, _ = np.linalg.svd(_scaled(jacobian[:, star]), full_matrices=False)
         basis = left[:, singular > np.sqrt(SINGULAR)] if len(star) else np.empty((len(jacobian), 0))
         rows = np.delete(jacobian, star, axis=1)
@@ -139,13 +174,35 @@ def compare(
     split: Split,
     parts: dict[str, BoolArray],
     rng: np.random.Generator,
+    simulations: int = SIMULATIONS,
+    own: Sequence[Likelihood] | None = None,
 ) -> Consistency:
-    """Compare some parts of the data, masks (n_data,) by name, at a best fit (n_dim,)."""
-    made = [_Part.of(likelihood, theta, mask) for mask in parts.values()]
-    residual = likelihood.difference(np.atleast_2d(theta))
-    ratio, gain = _apart(made, residual)
-    drawn, _ = _apart(made, likelihood.noise.draw(SIMULATIONS, rng))
-    p = (1 + int((drawn >= ratio[0]).sum())) / (1 + SIMULATIONS)
+    """Compare some parts of the data.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of all data.
+    theta : (n_dim,) float array
+        Its best fit.
+    split : str
+    parts : dict of str to (n_data,) bool array
+    rng : numpy.random.Generator
+    simulations : int
+    own : sequence of Likelihood, optional
+        Of the parts, with noise of their own.
+    """
+    data, model, masks = likelihood.observables, likelihood.model, list(parts.values())
+    each = own or [_selected(data, model, mask) for mask in masks]
+    made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
+    ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
+    noise = likelihood.noise.draw(simulations, rng)
+    for one, mask in zip(own or (), masks, strict=False):
+        noise[mask] = one.noise.draw(simulations, rng)
+    drawn, by_noise = _apart(made, noise)
+    # What a part cannot explain by itself is no excuse for going apart, once its noise is known.
+    above = (by_noise >= gain[0]) if own else (drawn >= ratio[0])
+    p = (1 + int(above.sum())) / (1 + simulations)
     return Consistency(split, tuple(parts), float(gain[0]), p)
 
 

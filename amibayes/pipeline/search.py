@@ -12,15 +12,15 @@ from threadpoolctl import threadpool_limits
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
 from amibayes.companion_search.with_extra_noise import noise_averaged
-from amibayes.detection.consistency import Consistency, consistency
+from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
-from amibayes.detection.verdict import Verdict, verdict
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
-from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, structure
+from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
@@ -86,7 +86,7 @@ def search_companion(
     with threadpool_limits(1):
         ready = prepare(targets, calibrators, options, rng["calibration"], run)
         found = _searched(ready, options, run)
-        tests = _tested(found, options, rng, run)
+        tests = _tested(ready, found, options, rng, run)
         limits = _limits(found, tests, options, rng["limits"], run)
         posterior = _inferred(ready, found, options, rng, run, (chain, resume))
     return replace(
@@ -131,7 +131,7 @@ class Tests:
     splits: tuple[Consistency, ...] = ()
 
 
-def _tested(found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
+def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
     if not options.null_draws:
         return Tests()
     with run.stage("significance"):
@@ -148,9 +148,10 @@ def _tested(found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tes
     if first.detected is None:
         return Tests(first, second)
     with run.stage("verdict"):
-        splits = consistency(found.result, rng["verdict"]) if first.detected else ()
-        rest = structure(found.result, options, rng["verdict"], run.executor)
-        return Tests(first, second, verdict(found.result, first, rest, splits), splits)
+        statement, splits = verdict_of(
+            found.result, first, ready.observables, options, rng["verdict"], run.executor
+        )
+    return Tests(first, second, statement, splits)
 
 
 def _limits(
