@@ -104,6 +104,6 @@ def verdict_of(
     splits: tuple[Consistency, ...] = ()
     if tested.detected:
         data = stated.only(options.observables) if options.extra_noise else None
-        splits = consistency(result, rng, stated=data, prior=noise_prior(options))
+        splits = consistency(result, rng, stated=data, prior=noise_prior(stated, options))
     rest = structure(result, options, rng, executor)
     return verdict(result, tested, rest, splits), splits
