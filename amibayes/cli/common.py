@@ -162,7 +162,7 @@ def without(words: list[str], flags: dict[str, int]) -> list[str]:
 
 
 def command_line(arguments: argparse.Namespace) -> str:
-    """Say how to get the same numbers again: what was asked for, with its seed."""
+    """Give the command that gets the same numbers again, with its seed."""
     import shlex
 
     words = without(arguments.words, OF_THE_RUN)

@@ -77,7 +77,7 @@ def add_reduction(group: argparse._ActionsContainer) -> None:
 
 
 def reduction_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Collect what `add_reduction` says, as `reduce_data` takes it."""
+    """Collect the options of `add_reduction`, as `reduce_data` takes it."""
     return {
         "flag": tuple(rule for given in arguments.flag for rule in _rules(given)),
         "polarisations": arguments.average_polarisations,
@@ -197,7 +197,7 @@ def add_joint(group: argparse._ActionsContainer) -> None:
 
 
 def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Collect what `add_model`, `add_joint`, `add_data`, images and seed say to `SearchOptions`.
+    """Collect what `add_model`, `add_joint`, `add_data`, images and seed give `SearchOptions`.
 
     Raises
     ------

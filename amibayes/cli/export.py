@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the file and say how to use it."""
+    """Write the file and explain its use."""
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.files)
     from amibayes import __version__

@@ -74,7 +74,7 @@ class _Worker:
 
 def _work(connection: Connection) -> None:
     """Compute what comes through the pipe until its other end closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     _end_with_parent()
     function: Any = None
     while True:
@@ -187,7 +187,7 @@ class ProcessExecutor:
         return idle
 
     def _collect(self, job: _Job) -> None:
-        """Wait until a worker has something to say, be it its death."""
+        """Wait until a worker has sent something or ended."""
         busy: dict[Any, _Worker] = {w.connection: w for w in self._workers if w.piece is not None}
         for connection in wait(list(busy)) if busy else []:
             worker = busy[connection]

@@ -16,7 +16,7 @@ def _report(line: str) -> None:
 
 
 Progress = Callable[[int, int], None]
-"""Called with (pieces done, pieces in all); the first call says where the run starts."""
+"""Called with (pieces done, pieces in all); the first call gives where the run starts."""
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from amibayes.pipeline.vetting import Vetting, vet
 from amibayes.pipeline.warnings import calibration_warnings, vetting_warnings
 
 MIN_TO_VET = 3
-"""Of two calibrators that disagree nothing says which is the bad one."""
+"""Of two calibrators that disagree the bad one cannot be known."""
 
 VETTING_DRAWS = 1000
 
@@ -90,7 +90,7 @@ def prepare(
 def read(
     paths: Sequence[str | Path], options: SearchOptions, *, one_star: bool = True
 ) -> list[Observables]:
-    """Read files of any format, one table for each exposure, as the options say."""
+    """Read files of any format, one table for each exposure, as the options ask."""
     found = read_observations(
         paths,
         options.images,

@@ -41,7 +41,7 @@ CHARGE_FACTOR = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Vetted:
-    """What vetting says of one calibrator.
+    """The result of vetting for one calibrator.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Vetted:
 
 @dataclass(frozen=True, eq=False)
 class Vetting:
-    """What vetting says of a set of calibrators, in the order given."""
+    """The results of vetting a set of calibrators, in the order given."""
 
     calibrators: tuple[Vetted, ...]
     alpha: float
@@ -281,7 +281,7 @@ def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
 
 
 def notes(vetted: Vetted, alpha: float) -> list[str]:
-    """Say what does not drop a calibrator and should be known."""
+    """List what does not drop a calibrator and should be known."""
     found = []
     if vetted.kept and vetted.agreement is not None and vetted.agreement < alpha:
         found.append("disagrees with the only other calibrator left: either may be wrong")

@@ -36,10 +36,10 @@ def calibration_warnings(calibration: Calibration | None) -> list[str]:
     if len(used) != 1:
         return []
     return [
-        "one calibrator says nothing of how well it calibrates: the errors hold the noise of both "
+        "how well one calibrator calibrates cannot be measured: the errors hold the noise of both "
         "stars, but not what else differs between them (pointing on the flat field, drift, air); "
-        "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators what "
-        "they say"
+        "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators "
+        "their nominal share"
     ]
 
 

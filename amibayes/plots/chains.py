@@ -37,7 +37,7 @@ def trace_plot(
     Returns
     -------
     matplotlib.figure.Figure
-        With at most 64 walkers and 2000 steps of each drawn, and the title says so.
+        With at most 64 walkers and 2000 steps of each drawn, as the title states.
     """
     steps, walkers, _ = chain.shape
     every, apart = -(-steps // MAX_STEPS), -(-walkers // MAX_WALKERS)

@@ -103,7 +103,7 @@ def corner_plot(
 
 
 def _scales(draws: FloatArray, labels: Sequence[str]) -> tuple[FloatArray, list[str]]:
-    """Powers of a thousand that make small numbers readable, and labels that say so."""
+    """Powers of a thousand that make small numbers readable, and labels with them."""
     largest = np.abs(draws).max(axis=0)
     power = np.where(
         (largest > 0) & (largest < 0.02), -np.floor(np.log10(np.maximum(largest, 1e-300)) / 3), 0
@@ -113,7 +113,7 @@ def _scales(draws: FloatArray, labels: Sequence[str]) -> tuple[FloatArray, list[
 
 
 def _scaled(label: str, power: int) -> str:
-    """Say by which power of ten the numbers are multiplied, in the first line."""
+    """Write the power of ten that the numbers are multiplied by, in the first line."""
     name, comma, band = label.partition(",\n")
     return f"{name} × 10$^{{{power}}}${comma}{band}" if power else label
 

@@ -84,7 +84,7 @@ def null_plot(
 def _extrapolate(
     ax: Axes, tails: Mapping[str, tuple[FloatArray, FloatArray]], largest: float, end: float
 ) -> None:
-    """Draw the fits, and shade where nothing but them says anything."""
+    """Draw the fits, and shade where there is nothing but them."""
     for (name, (x, p)), colour, dash in zip(tails.items(), TAILS, DASHES[1:], strict=False):
         marker = "D" if len(x) == 1 else ""
         ax.plot(x, p, color=colour, ls=dash, lw=2.0, marker=marker, label=name)

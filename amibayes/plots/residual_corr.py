@@ -28,7 +28,7 @@ def correlation_plot(observables: Observables) -> Figure:
     -------
     matplotlib.figure.Figure
         Of more than 160 data the first are drawn, correlated ones beside each other, and
-        the title says so.
+        the title has it.
     """
     data = observables.unflagged()
     vis2, closure = _chosen(data)

@@ -1,4 +1,4 @@
-"""Whether the numbers mean what they say: ranks, coverage, false alarms, completeness."""
+"""Pictures of a validation: ranks, coverage, false alarms, completeness."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def alarm_plot(probability: FloatArray) -> Figure:
 
 @styled()
 def completeness_plot(chance: FloatArray, found: FloatArray) -> Figure:
-    """Draw the share of companions found against what the limits promised.
+    """Draw the share of companions found against the completeness that the limits state.
 
     Parameters
     ----------
@@ -86,10 +86,10 @@ def completeness_plot(chance: FloatArray, found: FloatArray) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        In bins of the promise; the error bars are those of the promise.
+        In bins of the stated completeness, with its error bars.
     """
     figure = new_figure(4.8, 5.4)
-    _promised(figure.subplots(), chance, found)
+    _stated(figure.subplots(), chance, found)
     return figure
 
 
@@ -121,7 +121,7 @@ def _wander(ax: Axes, ranks: FloatArray, colour: str, dash: str, label: str) -> 
     ax.step(x, share - x, where="post", color=colour, ls=dash, label=label)
 
 
-def _promised(ax: Axes, chance: FloatArray, found: FloatArray) -> None:
+def _stated(ax: Axes, chance: FloatArray, found: FloatArray) -> None:
     known = np.isfinite(chance)
     chance, found = chance[known], found[known]
     place = np.clip((chance * N_BINS).astype(int), 0, N_BINS - 1)
@@ -131,7 +131,7 @@ def _promised(ax: Axes, chance: FloatArray, found: FloatArray) -> None:
     y = np.bincount(place, found, N_BINS)[filled] / count[filled]
     spread = np.bincount(place, chance * (1.0 - chance), N_BINS)[filled]
     error = np.sqrt(spread) / count[filled]
-    ax.plot([0, 1], [0, 1], color=BLACK, ls=":", label="promised = found")
+    ax.plot([0, 1], [0, 1], color=BLACK, ls=":", label="stated = found")
     ax.errorbar(x, y, error, fmt="o", color=BLUE, capsize=3, label=f"{len(chance)} companions")
     for xx, yy, k in zip(x, y, count[filled], strict=True):
         ax.annotate(f"{k}", (xx, yy), xytext=(6, -10), textcoords="offset points", fontsize=9)

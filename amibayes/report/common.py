@@ -33,13 +33,13 @@ def numbers(values: Iterable[float]) -> list[float | None]:
 
 
 def inputs_json(targets: Sequence[str], calibrators: Sequence[str]) -> list[Json]:
-    """Say which files went in, and what they were."""
+    """List the input files with their checksums and roles."""
     files = [(p, "target") for p in targets] + [(p, "calibrator") for p in calibrators]
     return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
 
 
 def data_json(result: SearchResult) -> Json:
-    """Say what data were fitted, and over which field."""
+    """Describe the data that were fitted, and the field."""
     used = result.likelihood.observables
     freedom = used.freedom
     return {
@@ -66,11 +66,11 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
     for key in ("vis2", "closure_phase"):
         shares = [getattr(s, key) for s in noise.channels]
         value, error = (np.array([getattr(s, n) for s in shares]) for n in ("value", "error"))
-        told = np.isfinite(error)
-        found[key] = float(value[told].mean()) if told.any() else 0.0
-        spread = np.sqrt((error[told] ** 2).sum()) / told.sum() if told.any() else np.nan
+        known = np.isfinite(error)
+        found[key] = float(value[known].mean()) if known.any() else 0.0
+        spread = np.sqrt((error[known] ** 2).sum()) / known.sum() if known.any() else np.nan
         found[f"{key}_error"] = number(float(spread))
-        common = [s.common for s, ok in zip(shares, told, strict=True) if ok]
+        common = [s.common for s, ok in zip(shares, known, strict=True) if ok]
         found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
     return found
 

@@ -129,7 +129,7 @@ def _false_alarm(s: Json) -> Fact:
 
 
 def _extrapolated(s: Json) -> tuple[Fact, ...]:
-    """What fitted laws say of a statistic that too few draws reach."""
+    """What fitted laws give for a statistic that too few draws reach."""
     laws = s.get("extrapolation")
     if not laws:
         return ()

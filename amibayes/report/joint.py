@@ -1,4 +1,4 @@
-"""What ``result.json`` says of a joint fit: bands, motion, and each file by itself."""
+"""A joint fit in ``result.json``: bands, motion, and each file by itself."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def noise_files_json(report: SearchReport) -> Json:
 
 
 def joint_lines(report: SearchReport) -> list[str]:
-    """Say in the summary what the files share and what they do not."""
+    """Lines of the summary on what the files share."""
     result, lines = report.result, []
     model, bands = result.likelihood.model, bands_of(result.likelihood.observables)
     if is_joint(report):

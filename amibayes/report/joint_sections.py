@@ -1,4 +1,4 @@
-"""What ``report.html`` says of a joint fit: bands, motion, and each file by itself."""
+"""A joint fit in ``report.html``: bands, motion, and each file by itself."""
 
 from __future__ import annotations
 

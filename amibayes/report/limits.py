@@ -1,4 +1,4 @@
-"""What `amibayes limits` says: ``limits.json``, ``limits.ecsv`` and the summary."""
+"""What `amibayes limits` writes: ``limits.json``, ``limits.ecsv`` and the summary."""
 
 from __future__ import annotations
 

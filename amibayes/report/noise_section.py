@@ -17,7 +17,7 @@ MAX_OUTLIERS = 20
 
 
 def noise(content: Json) -> Section:
-    """Say whether the stated errors explain the residuals, and what was made of them."""
+    """Show whether the stated errors explain the residuals, and the noise that was added."""
     found = content["noise"]
     tables = (*_posterior(found.get("posterior")), *_outliers(content.get("robust")))
     text = (_added(found), *_robust(content.get("robust")))

@@ -25,7 +25,7 @@ Kind = Literal["found", "none", "open"]
 """Of a statement: something is there, nothing is, or nothing is claimed."""
 
 MAX_ON_A_TELEPHONE = 4
-"""Columns of named rows that stand beside each other on a telephone."""
+"""Columns of named rows that fit beside each other on a telephone."""
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
@@ -170,7 +170,7 @@ class Page:
     sections : tuple of Section
     sky : Sky, optional
     warnings : tuple of str, optional
-        None where the page has none to give; empty says that there are none.
+        None where the page has none to give; empty where there are none.
     """
 
     command: str

@@ -80,7 +80,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
 
 
 def _noise(report: SearchReport) -> Json:
-    """Extra noise: the most likely, and what the posterior says of it."""
+    """Extra noise: the most likely, and its posterior."""
     found = report.noise_posterior or {}
     posterior = {
         key: noise_interval(found[name], unit)

@@ -28,7 +28,7 @@ LABELS = {True: "Companion detected", False: "No companion detected", None: "No 
 
 
 def statement_of(content: Json) -> Statement:
-    """Say what was found, how sure that is, and what could have been seen.
+    """State what was found, its probability, and what could have been seen.
 
     Parameters
     ----------

@@ -121,7 +121,7 @@ def _at(content: Json, path: str) -> Any:
 
 
 def _limits(content: Json) -> Json | None:
-    """What a search says of its limits, or the main curve of ``limits``."""
+    """The limits of a search, or the main curve of ``limits``."""
     if "delta_mag" in content:
         return {key: content[key] for key in CURVE}
     return content.get("limits")

@@ -1,4 +1,4 @@
-"""What a validation says: ``validation.json``, its pictures and ``validation.html``."""
+"""The results of a validation: ``validation.json``, its pictures and ``validation.html``."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ EXPLAINED = {
     "false alarms": "Among stars without a companion, a false-alarm probability below p must "
     "come up with probability p.",
     "completeness": "Companions must be found as often as the detection limits of the same data "
-    "promise.",
+    "state.",
 }
 
 PICTURES = {
@@ -56,8 +56,8 @@ PICTURES = {
     "coverage": ("coverage", "Coverage", "Share of intervals that hold the truth."),
     "completeness": (
         "completeness",
-        "Promised and found",
-        "Share of companions found against the promise of the limits.",
+        "Expected and found",
+        "Share of companions found against the completeness that the limits state.",
     ),
 }
 """Group of checks → file name, title and description of its picture."""
@@ -150,7 +150,7 @@ def validation_page(validation: Validation, figures: dict[str, Figure], folder: 
     sections = [_section(validation, group, figures) for group in EXPLAINED]
     return Page(
         "amibayes validate",
-        "Do the numbers mean what they say?",
+        "Coverage and error rates on simulated exposures",
         f"{len(validation.kind)} simulated stars from photons to limits, "
         f"{validation.plan.name} plan, seed {validation.seed}",
         _statement(len(checks), failed),
@@ -160,7 +160,7 @@ def validation_page(validation: Validation, figures: dict[str, Figure], folder: 
 
 
 def verdict(n_checks: int, failed: list[Check]) -> str:
-    """Say in one sentence how it went."""
+    """Sum the outcome up in one sentence."""
     if not failed:
         return f"All {n_checks} checks hold."
     return f"{len(failed)} of {n_checks} checks fail: {'; '.join(c.name for c in failed)}."
@@ -186,7 +186,7 @@ def _tiles(validation: Validation) -> tuple[Fact, ...]:
     return (
         Fact("Separations in their 68 % interval", _share(wide)),
         Fact("Lone stars below a false-alarm probability of 0.05", _share(alarm)),
-        Fact("Companions near the limit that were found", _share(found), _promise(found)),
+        Fact("Companions near the limit that were found", _share(found), _stated_share(found)),
     )
 
 
@@ -196,8 +196,8 @@ def _share(check: Check) -> str:
     return f"{check.measured:.3f} ± {check.error:.3f}"
 
 
-def _promise(check: Check) -> str:
-    return f"promised: {check.expected:.3f}" if np.isfinite(check.expected) else ""
+def _stated_share(check: Check) -> str:
+    return f"stated: {check.expected:.3f}" if np.isfinite(check.expected) else ""
 
 
 def _section(validation: Validation, group: str, figures: dict[str, Figure]) -> Section:

@@ -1,4 +1,4 @@
-"""What vetting says: `vetting.json`, the table on the terminal, and its picture."""
+"""The results of vetting: `vetting.json`, the table on the terminal, and its picture."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class Section:
         return list(self._values)
 
     def fault(self, key: str, what: str, remedy: str = "") -> DataError:
-        """Make the error that says what is wrong with ``key``."""
+        """Make the error that describes what is wrong with ``key``."""
         dotted = f"{self.name}.{key}" if self.name else key
         return DataError(f"key '{dotted}' {what}", source=self.source, remedy=remedy)
 

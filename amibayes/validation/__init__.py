@@ -1,4 +1,4 @@
-"""Whether the numbers mean what they say: the whole way, on exposures whose truth is known."""
+"""Coverage and error rates of the whole analysis, on exposures whose truth is known."""
 
 from amibayes.validation.plan import FULL, QUICK, SimulatedExposure, ValidationPlan
 from amibayes.validation.run import validate

@@ -44,7 +44,7 @@ def validate(
     resume : bool
         Go on from the trials that are there.
     progress : callable, optional
-        Told (trials done, trials in all).
+        Called with (trials done, trials in all).
 
     Returns
     -------

@@ -63,7 +63,7 @@ class Check:
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """The trials of a validation and what they say.
+    """The trials of a validation and their checks.
 
     Parameters
     ----------
