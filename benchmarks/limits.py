@@ -25,9 +25,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes import Likelihood, load_instrument, open_executor, point_source
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
-from amibayes.companion_search.search import resolution_mas, search
+from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.detection.statistic import BankStatistic, make_statistic
 from amibayes.limits.aliases import nearer_aliases

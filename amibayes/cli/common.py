@@ -241,11 +241,6 @@ def pair_of_numbers(text: str) -> tuple[float, float]:
     return first, second
 
 
-def systematics(text: str) -> str | tuple[float, float]:
-    """Parse ``table``, ``none`` or ``VIS2,DEG``."""
-    return text if text in ("table", "none") else pair_of_numbers(text)
-
-
 def configure_logging(arguments: argparse.Namespace) -> None:
     """Send the program's log and the libraries' warnings where they belong: standard error."""
     level = logging.DEBUG if arguments.verbose else logging.WARNING
@@ -283,6 +278,11 @@ def number_or_free(text: str) -> float | str:
     if not 0.0 <= value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is negative or not finite")
     return value
+
+
+def any_number_or_free(text: str) -> float | str:
+    """Parse a finite number of any sign, or the word ``free``."""
+    return text if text == "free" else finite_float(text)
 
 
 def probability(text: str) -> float:

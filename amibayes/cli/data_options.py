@@ -150,8 +150,29 @@ def add_model(group: argparse._ActionsContainer) -> None:
         "--diameter",
         type=common.number_or_free,
         metavar="MAS|free",
-        help="uniform-disc diameter of the primary (default: 0; free where V2 is used and the "
-        "longest baseline would notice a disc of 0.3 mas)",
+        help="diameter of the primary (default: free where V2 is used, else 0)",
+    )
+    group.add_argument(
+        "--limb-darkening",
+        type=common.number_or_free,
+        default=0.0,
+        metavar="ALPHA|free",
+        help="brightness of the primary's disc goes as mu to the power of ALPHA (default: 0, a "
+        "uniform disc)",
+    )
+    group.add_argument(
+        "--companion-diameter",
+        type=common.number_or_free,
+        metavar="MAS|free",
+        help="uniform-disc diameter of companions (default: 0; free where V2 shows the disc of the "
+        "companion that is found)",
+    )
+    group.add_argument(
+        "--contrast-slope",
+        type=common.any_number_or_free,
+        default=0.0,
+        metavar="P|free",
+        help="the flux ratio goes with wavelength to the power of P (default: 0)",
     )
     group.add_argument(
         "--background",
@@ -222,6 +243,9 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "separation_mas": arguments.separation,
         "diameter": arguments.diameter,
         "background": arguments.background,
+        "limb_darkening": arguments.limb_darkening,
+        "companion_diameter": arguments.companion_diameter,
+        "contrast_slope": arguments.contrast_slope,
         "smearing": arguments.smearing,
         "closure_covariance": arguments.closure_covariance,
         "calibration": arguments.calibration,
@@ -235,7 +259,6 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "extra_noise": arguments.extra_noise,
         "channel_noise": arguments.channel_noise,
         "noise_prior": arguments.noise_prior,
-        "systematics": arguments.systematics,
         "robust": arguments.robust,
         "file_noise": arguments.file_noise,
         "seed": arguments.seed,
@@ -284,14 +307,6 @@ def add_data(group: argparse._ActionsContainer) -> None:
         metavar="VIS2,DEG",
         help="widths of the prior of extra noise, of V² as a share of it and of closure phases; "
         "three times as much is the most (default: 0.05,3)",
-    )
-    group.add_argument(
-        "--systematics",
-        type=common.systematics,
-        default="table",
-        metavar="VIS2,DEG|table|none",
-        help="floor of calibration errors that channels of an exposure share: of a table by "
-        "instrument, for files of fewer than 10 exposures (default), or share of V² and degrees",
     )
     add_insname(group)
     group.add_argument(

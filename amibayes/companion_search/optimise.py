@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import nlopt
 import numpy as np
@@ -20,11 +21,29 @@ EVALUATIONS_PER_FRINGE, MIN_EVALUATIONS, MAX_EVALUATIONS = 40, 400, 3000
 """Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
 
 
-CONVERGED = 1e-9
-"""Relative change of χ² at which a local fit stops."""
+@dataclass(frozen=True)
+class Stop:
+    """When a local fit ends.
+
+    Parameters
+    ----------
+    rounds : int
+        How often it is taken up again with new scales.
+    tolerance : float
+        Relative change of χ².
+    evaluations : int
+        Of each round.
+    """
+
+    rounds: int
+    tolerance: float
+    evaluations: int
 
 
-MAX_ROUNDS, SETTLED = 3, 1e-3
+FULL, ROUGH = Stop(3, 1e-9, 200), Stop(1, 1e-3, 30)
+"""Fits that are reported, and fits that only have to tell seeds apart."""
+
+CONVERGED = 1e-3
 """A fit is taken up again, with new scales, until a round gains less than this in χ²."""
 
 
@@ -33,6 +52,11 @@ CONSTRAINT_SLACK = 1e-7
 
 
 EMPTY = np.empty(0)
+
+
+SHAPE_START, LARGE_DISC = 0.4, 1.3
+"""Diameters of a companion, in units of λ/B_max, at which fits of it begin: at 0 χ² has no slope,
+and a disc beyond its first null is another minimum."""
 
 
 def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
@@ -48,20 +72,81 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
     return _minimise(_objective(without, scale), start, scale, bounds)
 
 
-def refine(likelihood: Likelihood, seed: FloatArray, box: Box, deviance_single: float) -> Mode:
-    """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
+def starting_points(
+    likelihood: Likelihood,
+    places: FloatArray,
+    tails: FloatArray,
+    nuisance: FloatArray,
+    box: Box,
+) -> FloatArray:
+    """Parameter vectors (n, n_dim) of one companion.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+    places : (n, 2) float array
+        East and north.
+    tails : (n, k) float array
+        Contrasts and rates.
+    nuisance : (n_nuisance,) float array
+    box : Box
+        Where a disc of a companion is free, it begins at a part of λ/B_max.
+    """
+    parameters = likelihood.parameters
+    theta = np.zeros((len(places), len(parameters)))
+    theta[:, parameters.place()] = places
+    theta[:, np.concatenate([parameters.contrasts, parameters.rates])] = tails
+    theta[:, parameters.nuisance] = nuisance
+    for k in np.intersect1d(parameters.columns("shape"), parameters.discs):
+        theta[:, k] = min(SHAPE_START * box.fringe_mas, parameters[k].upper)
+    return theta
+
+
+def with_large_discs(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
+    """Parameter vectors (n, n_dim) again with large discs of companions, where these are free."""
+    parameters = likelihood.parameters
+    discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
+    large = np.array(theta)[: len(theta) if len(discs) else 0]
+    large[:, discs] = LARGE_DISC * box.fringe_mas
+    return large
+
+
+def with_disc(likelihood: Likelihood, point: FloatArray, box: Box) -> FloatArray:
+    """Parameter vector of a model whose companion has a free disc, from that of a point."""
+    parameters = likelihood.parameters
+    theta = np.zeros(len(parameters))
+    discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
+    theta[np.setdiff1d(np.arange(len(theta)), discs)] = point
+    theta[discs] = SHAPE_START * box.fringe_mas
+    return theta
+
+
+def refine(
+    likelihood: Likelihood,
+    seed: FloatArray,
+    box: Box,
+    deviance_single: float,
+    *,
+    rough: bool = False,
+) -> Mode:
+    """Fit all free parameters from a seed (n_dim,), staying near it and inside the field.
+
+    A ``rough`` fit stops early: enough to tell seeds apart.
+    """
     parameters = likelihood.parameters
     bounds = np.array(parameters.bounds(parameters.columns()))
     places = parameters.columns("position")
     bounds[places] = seed[places, None] + box.fringe_mas * np.array([-1.0, 1.0])
     theta, deviance = seed, np.inf
-    for _ in range(MAX_ROUNDS):
+    stop = ROUGH if rough else FULL
+    for _ in range(stop.rounds):
         scale = _natural_scale(likelihood, theta, box)
         each = [parameters.place(k + 1) for k in range(parameters.companions)]
         limits = [x for place in each for x in _field_limits(seed, box, scale, place)]
         before = deviance
-        theta, deviance = _minimise(_objective(likelihood, scale), theta, scale, bounds, limits)
-        if deviance > before - SETTLED:
+        objective = _objective(likelihood, scale)
+        theta, deviance = _minimise(objective, theta, scale, bounds, limits, stop)
+        if deviance > before - CONVERGED:
             break
     return mode_of(parameters, theta, deviance_single - deviance)
 
@@ -74,6 +159,8 @@ def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> Float
     widest[parameters.columns("position")] = 0.3 * box.fringe_mas
     widest[parameters.contrasts] = 0.3
     widest[parameters.rates] = 0.5 * likelihood.model.fastest_mas_yr
+    discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
+    widest[discs] = 0.3 * box.fringe_mas
     return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
 
 
@@ -105,7 +192,8 @@ def global_check(
     start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
-    seed = np.concatenate([position, best_at(position)[0], single])
+    tail = best_at(position)[0][None]
+    seed = starting_points(likelihood, position[None], tail, single, box)[0]
     low, high = np.array(likelihood.parameters.bounds(likelihood.parameters.contrasts)).T
     bright = likelihood.parameters.contrasts
     seed[bright] = np.clip(seed[bright], low, high)
@@ -161,6 +249,7 @@ def _minimise(
     scale: FloatArray,
     bounds: FloatArray,
     limits: Sequence[Objective] = (),
+    stop: Stop = FULL,
 ) -> tuple[FloatArray, float]:
     """Minimise inside bounds (n, 2); what counts is the best allowed point seen.
 
@@ -184,8 +273,8 @@ def _minimise(
         optimiser.set_min_objective(watched)
         for limit in limits:
             optimiser.add_inequality_constraint(limit, CONSTRAINT_SLACK)
-        optimiser.set_ftol_rel(CONVERGED)
-        optimiser.set_maxeval(200)
+        optimiser.set_ftol_rel(stop.tolerance)
+        optimiser.set_maxeval(stop.evaluations)
         try:
             optimiser.optimize(best)
         except nlopt.RoundoffLimited:

@@ -208,7 +208,7 @@ class SearchResult:
         return float(east), float(north)
 
     def nuisance(self, name: str) -> float:
-        """Value of the diameter or background in the best fit, free or fixed."""
+        """Value in the best fit, free or fixed, of a field of the model such as the diameter."""
         if name in self.likelihood.parameters.names:
             return float(self.theta[self.likelihood.parameters.index(name)])
         return float(getattr(self.likelihood.model, name))

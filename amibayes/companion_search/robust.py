@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolution_mas, search
+from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.likelihood.combinations import combination_of, require
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, mean_of_files

@@ -3,131 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
+from amibayes.companion_search.field import default_separation, resolution_mas
 from amibayes.companion_search.grid import Grid, make_grid
-from amibayes.companion_search.optimise import fit_single, global_check, refine
+from amibayes.companion_search.optimise import fit_single, global_check
 from amibayes.companion_search.result import Mode, SearchResult, companions_of
 from amibayes.companion_search.scan import ScanResult
+from amibayes.companion_search.seeds import (
+    MODE_LIMIT,
+    NOT_FAINT,
+    bright_seeds,
+    coarse_likelihood,
+    linear_seeds,
+    may_be_bright,
+    peaks,
+    refine_all,
+    trial_stars,
+)
 from amibayes.companion_search.template_bank import TemplateBank, rates_per_axis
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.support.quantities import takes_quantities
-from amibayes.units import MAS, FloatArray, IntArray
+from amibayes.units import FloatArray
 
 GRID_STEPS_PER_FRINGE = 8
 """Lattice points per λ/B_max."""
 
-MIN_SEEDS, MAX_SEEDS = 5, 24
-"""How many peaks of the map are refined."""
-
-MODE_LIMIT = 25.0
-"""Modes within this Δχ² of the best one are left standing."""
-
-SURELY_NOT_NOISE = 30.0
-"""Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
-
-MAX_LOOKED_AT = 40_000
-"""Positions of the look around the field."""
-
 MAX_POSITIONS = 2_000_000
 """Positions of a search: more would take hours and all the memory."""
 
-BRIGHT = 0.1
-"""Above this contrast the templates are no longer linear enough to rank positions."""
+MAX_NUISANCE_ROUNDS = 3
+"""How often the exact map is made with the nuisance parameters of the best fit so far."""
 
-BRIGHT_CONTRASTS = (0.15, 0.3, 0.6, 1.0)
-
-
-def default_separation(likelihood: Likelihood) -> tuple[float, float]:
-    """Range of separations the data can see: λ/2B_max to λ/B_min, mas."""
-    frequency = likelihood.samples.frequency
-    with np.errstate(divide="ignore"):
-        return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
-
-
-def resolution_mas(likelihood: Likelihood) -> float:
-    """λ/B of the longest baseline in wavelengths, mas."""
-    return float(1.0 / likelihood.samples.frequency.max() / MAS)
-
-
-def look_outside(result: SearchResult) -> float | None:
-    """Find where outside the field a companion would fit much better.
-
-    The scan reaches to where the width of the channels smears a companion out, or as far
-    as `MAX_LOOKED_AT` positions go. It is coarse: half the field's sampling.
-
-    Returns
-    -------
-    float or None
-        Its separation in mas; None where nothing outside is better.
-    """
-    likelihood, grid = result.likelihood, result.grid
-    data = likelihood.observables
-    bands = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase)]
-    reach = resolution_mas(likelihood) / max(float(np.concatenate(bands).min()), 1e-6)
-    step = 2.0 * grid.step_mas
-    area = MAX_LOOKED_AT / np.pi
-    farthest = min(reach, float(np.hypot(grid.outer_mas, step * np.sqrt(area))))
-    around = make_grid(grid.outer_mas, farthest, step)
-    if not len(around):
-        return None
-    gain, place = _best_on(around, result)
-    inside = float(result.bank_gain.max())
-    return place if gain >= inside + max(MODE_LIMIT, 0.1 * inside) else None
-
-
-def look_inside(result: SearchResult) -> float | None:
-    """Find where nearer the star than the field a companion would fit as well.
-
-    What was found may then be an alias of that. Only a gain that noise alone does not give
-    counts.
-
-    Returns
-    -------
-    float or None
-        Its separation in mas; None where nothing inside is as good.
-    """
-    nearest = default_separation(result.likelihood)[0]
-    if nearest >= result.grid.inner_mas:
-        return None
-    inner = result.grid.inner_mas
-    step = max(result.grid.step_mas, inner * float(np.sqrt(np.pi / MAX_LOOKED_AT)))
-    within = make_grid(nearest, inner, step)
-    if not len(within):
-        return None
-    gain, place = _best_on(within, result)
-    # A peak falls between the positions of either grid, which costs it up to 5 %.
-    as_good = 0.95 * float(result.bank_gain.max()) - MODE_LIMIT
-    return place if gain >= max(as_good, SURELY_NOT_NOISE) else None
-
-
-def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
-    """Largest gain in χ² at the positions of a grid, and the separation where it is, mas."""
-    likelihood = result.likelihood
-    # A moving companion is looked for at rest there: a first look has no time for more.
-    still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0))
-    bank = TemplateBank(still, grid, result.single_theta)
-    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
-    gain = bank.survey(residuals).gain
-    best = int(gain.argmax())
-    return float(gain[best]), float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
-
-
-def resolves_stars(likelihood: Likelihood) -> bool:
-    """Whether V² would notice a disc of 0.3 mas: by 1 % at the longest baseline, (πθB/λ)²/4."""
-    z = np.pi * 0.3 * MAS * likelihood.samples.frequency.max()
-    return likelihood.observables.n_vis2 > 0 and bool(z * z / 4.0 > 0.01)
+NUISANCE_HOLDS = 0.02
+"""Change of the star's visibility with which the exact map need not be made again."""
 
 
 @takes_quantities
 def search(
     likelihood: Likelihood,
     separation_mas: tuple[float, float] | None = None,
+    *,
+    known: FloatArray | None = None,
 ) -> SearchResult:
     """Find the companion that explains the data best.
 
@@ -137,6 +57,9 @@ def search(
         With a model of one companion.
     separation_mas : (inner, outer), optional
         Annulus that is searched; by default `default_separation`.
+    known : (n, n_dim) float array, optional
+        Solutions of nearly the same problem. Fits begin from them too, and the field is not
+        gone through for bright companions again.
 
     Returns
     -------
@@ -157,8 +80,7 @@ def search(
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
-    seeds = _seeds(likelihood, grid, survey, single, box)
-    found = [refine(likelihood, theta, box, deviance_single) for theta in seeds]
+    found = _fits(likelihood, grid, survey, single, box, deviance_single, known)
     check = global_check(likelihood, bank, box, single, deviance_single)
     every = distinct_modes([*found, check], box.fringe_mas)
     modes, aliases = innermost_first(likelihood, every, single)
@@ -233,75 +155,48 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
         )
 
 
-def _seeds(
+def _fits(
     likelihood: Likelihood,
     grid: Grid,
     survey: ScanResult,
     single: FloatArray,
     box: Box,
-) -> FloatArray:
-    """Starting points (n, n_dim): peaks of the linear map, and of the exact one if bright."""
-    best = peaks(grid, survey.gain, box.fringe_mas)
-    rest = np.broadcast_to(single, (len(best), len(single)))
-    places = grid.east_mas[best], grid.north_mas[best]
-    seeds = np.column_stack([*places, survey.bounded(best), rest])
-    if survey.contrasts[best].max(initial=0.0) < BRIGHT:
-        return seeds
-    chi2, brightness = _exact_map(likelihood, grid, single)
-    best = peaks(grid, chi2.max() - chi2, box.fringe_mas)
-    return np.vstack([seeds, _thetas(likelihood, grid, best, brightness[best], single)])
+    deviance_single: float,
+    known: FloatArray | None,
+) -> list[Mode]:
+    """Local fits from the peaks of the linear map, and of the exact one where it may differ.
 
-
-def _thetas(
-    likelihood: Likelihood, grid: Grid, at: IntArray, contrast: FloatArray, single: FloatArray
-) -> FloatArray:
-    """Parameter sets (n, n_dim) of companions at rest, of one contrast in every band."""
-    rest = np.broadcast_to(single, (len(at), len(single)))
-    three = np.column_stack([grid.east_mas[at], grid.north_mas[at], np.clip(contrast, 0.0, 1.0)])
-    return np.hstack([likelihood.model.at_rest(three), rest])
-
-
-def _exact_map(
-    likelihood: Likelihood, grid: Grid, single: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Least χ² over a few bright contrasts, and that contrast, at every position."""
-    everywhere = np.arange(len(grid))
-    pieces = np.array_split(everywhere, 1 + len(grid) * len(likelihood.samples) // 1_000_000)
-    chi2 = np.array(
-        [
-            np.concatenate(
-                [
-                    likelihood.chi2(_thetas(likelihood, grid, p, np.full(len(p), c), single))
-                    for p in pieces
-                ]
-            )
-            for c in BRIGHT_CONTRASTS
-        ]
-    )
-    return chi2.min(axis=0), np.array(BRIGHT_CONTRASTS)[chi2.argmin(axis=0)]
-
-
-def peaks(grid: Grid, gain: FloatArray, fringe_mas: float) -> IntArray:
-    """Positions of the highest distinct local maxima of a map, best first.
-
-    At least `MIN_SEEDS` (if there are as many), further ones while within
-    `MODE_LIMIT` of the best, at most `MAX_SEEDS`.
+    The star alone takes a part of a bright companion's light for its own disc: the exact map
+    is made again with the star of the best fit, until that stays.
     """
-    image = grid.image(gain)
-    lowest = np.where(np.isnan(image), -np.inf, image)
-    top = (lowest == maximum_filter(lowest, size=3, mode="constant", cval=-np.inf)) & (lowest > 0)
-    on_grid = top[grid.rows + grid.half_width, grid.columns + grid.half_width]
-    candidates = np.flatnonzero(on_grid)
-    candidates = candidates[np.argsort(-gain[candidates], kind="stable")]
-    chosen: list[int] = []
-    for i in candidates:
-        enough = len(chosen) >= MIN_SEEDS and gain[i] < gain[candidates[0]] - MODE_LIMIT
-        if enough or len(chosen) == MAX_SEEDS:
+    seeds = linear_seeds(likelihood, grid, survey, single, box)
+    if known is not None:
+        return refine_all(likelihood, np.vstack([seeds, known]), box, deviance_single)
+    found = refine_all(likelihood, seeds, box, deviance_single)
+    if not may_be_bright(survey, peaks(grid, survey.gain, box.fringe_mas)):
+        return found
+    coarse = coarse_likelihood(likelihood, box)
+    tried: list[FloatArray] = []
+    bright = survey.contrasts[peaks(grid, survey.gain, box.fringe_mas)].max() > NOT_FAINT
+    stars = trial_stars(likelihood, single, box) if bright else [single]
+    for _ in range(MAX_NUISANCE_ROUNDS):
+        new = [star for star in stars if _is_new(likelihood, star, tried)]
+        if not new:
             break
-        away = np.hypot(grid.columns[chosen] - grid.columns[i], grid.rows[chosen] - grid.rows[i])
-        if not (away * grid.step_mas < 0.5 * fringe_mas).any():
-            chosen.append(int(i))
-    return np.array(chosen, dtype=np.intp)
+        starts = np.vstack([bright_seeds(coarse, star, box) for star in new])
+        found += refine_all(likelihood, starts, box, deviance_single)
+        best = max(found, key=lambda m: m.delta_chi2)
+        stars = [np.array(best.theta)[likelihood.parameters.nuisance]]
+    return found
+
+
+def _is_new(likelihood: Likelihood, nuisance: FloatArray, tried: list[FloatArray]) -> bool:
+    """Whether a star differs from those tried, to which it is added."""
+    star = likelihood.model.linear_response(likelihood.samples, nuisance).star
+    if any(np.abs(star - other).max() < NUISANCE_HOLDS for other in tried):
+        return False
+    tried.append(star)
+    return True
 
 
 def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]:
@@ -314,6 +209,10 @@ def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]
     return tuple(kept)
 
 
+AS_GOOD = 1.0
+"""Δχ² within which one of two positions does not fit better: one standard deviation."""
+
+
 def innermost_first(
     likelihood: Likelihood, modes: Sequence[Mode], single: FloatArray
 ) -> tuple[tuple[Mode, ...], tuple[Mode, ...]]:
@@ -322,7 +221,7 @@ def innermost_first(
     A mask on a regular lattice (NIRISS) repeats itself on the sky: far positions predict
     the same data as near ones but for the width of the band. Two modes are aliases where
     their predictions differ by less than 3σ over all data, and by less than half of the
-    signal itself, though they are more than λ/B_max apart.
+    signal itself, and neither fits notably better, though they are more than λ/B_max apart.
 
     Returns
     -------
@@ -336,6 +235,7 @@ def innermost_first(
     signal = data - likelihood.noise.whiten(none)
     apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
     alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
+    alike &= np.array([m.delta_chi2 for m in modes]) > modes[0].delta_chi2 - AS_GOOD
     places = thetas[:, likelihood.parameters.place()]
     distance = np.hypot(*(places - places[0]).T)
     alike &= distance > resolution_mas(likelihood)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.companion_search.optimise import refine
+from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.optimise import refine, starting_points
 from amibayes.companion_search.result import Companion, Mode, SearchResult, companions_of, mode_of
-from amibayes.companion_search.search import MODE_LIMIT, peaks, resolution_mas
+from amibayes.companion_search.seeds import MODE_LIMIT, peaks
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
@@ -96,8 +97,12 @@ def _beside(
     # What stands at the first companion's own place is its error, not another one.
     gain[np.hypot(grid.east_mas - place[0], grid.north_mas - place[1]) < 0.25 * fringe] = 0.0
     at = peaks(grid, gain, fringe)[:SEEDS]
-    second = np.column_stack([grid.east_mas[at], grid.north_mas[at], survey.bounded(at)])
     box = Box(grid.inner_mas, grid.outer_mas, fringe)
+    places = np.column_stack([grid.east_mas[at], grid.north_mas[at]])
+    points = starting_points(
+        result.likelihood, places, survey.bounded(at), first[parameters.nuisance], box
+    )
+    second = points[:, parameters.companion()]
     single = float(two.deviance(result.chi2_single))
     one, rest = first[parameters.companion()], first[parameters.nuisance]
     seeds = [np.concatenate([one, other, rest]) for other in second]

@@ -93,7 +93,9 @@ class TemplateBank:
         self._samples, self._smearing, self._moves = samples, model.smearing, model.moves
         self._bands = [samples.band[:, None] == b for b in range(model.n_contrasts)]
         self._years = samples.years(model.reference_mjd) if model.moves else np.zeros(len(samples))
-        self._even, self._odd, self._primary = linear_response(likelihood, nuisance)
+        response = linear_response(likelihood, nuisance)
+        self._even, self._odd, self._primary = response.even, response.odd, response.star
+        self._disc = None if (response.disc == 1.0).all() else response.disc[:, None]
         self._offset = np.asarray(self._even.matrix @ self._primary)
         both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
         self._even_shared, self._odd_shared = both[1:]
@@ -275,16 +277,19 @@ class TemplateBank:
             damping = np.sinc((0.5 / np.pi) * self._samples.relative_band[:, None] * angle)
             cosine *= damping
             sine *= damping
-        self._let_through(cosine, sine, east_mas, north_mas)
+        self._seen(cosine, sine, east_mas, north_mas)
         return cosine, sine
 
-    def _let_through(
+    def _seen(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
     ) -> None:
-        """Apply the extraction's response to light off the axis, in place.
+        """Apply the companion's disc, and the extraction's response off the axis, in place.
 
-        dV/dc = ρE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
+        dV/dc = ρDE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
         """
+        if self._disc is not None:
+            cosine *= self._disc
+            sine *= self._disc
         if self._samples.off_axis is None:
             return
         fringe, flux = self._samples.off_axis.at((east_mas, north_mas))
@@ -312,7 +317,7 @@ class TemplateBank:
             east, north = self.grid.east_mas[index], self.grid.north_mas[index]
             if drift is not None:
                 east, north = east + drift[0][:, None], north + drift[1][:, None]
-            self._let_through(cosine, sine, east, north)
+            self._seen(cosine, sine, east, north)
             yield index, cosine, sine
 
     def _mirrored(self, cosine: FloatArray, sine: FloatArray) -> MirroredTemplates:

@@ -63,7 +63,8 @@ def search_with_noise(
         noise = _best_noise(likelihood, result, per_file=per_file, prior=prior)
         converged = _same(before, noise)
         if not converged:
-            result = search(with_noise(likelihood, noise), separation_mas)
+            known = np.array([mode.theta for mode in result.modes])
+            result = search(with_noise(likelihood, noise), separation_mas, known=known)
             tried.append((_score(result), result, noise))
     if converged:
         return tried[-1][1], tried[-1][2]

@@ -362,8 +362,7 @@ def _treatment(
     if stated_errors:
         return KnownErrors()
     groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.common_rows)
-    least = 1.0 if likelihood.noise.floor else 0.0
-    return FreeScale.measured(groups, bank, observed, least)
+    return FreeScale.measured(groups, bank, observed)
 
 
 def _ratio(likelihood: Likelihood, bank: TemplateBank, *, known: bool) -> Ratio:

@@ -13,7 +13,10 @@ from amibayes.models.bands import band_numbers
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import UVPoints, uv_points_of
-from amibayes.units import ComplexArray, FloatArray
+from amibayes.units import MAS, ComplexArray, FloatArray
+
+SMALL_DISC = 0.05
+"""Diameter, in units of λ/B_max, below which all discs move the data in the same direction."""
 
 NEVER_ZERO = 1e-30
 """Keeps the phase derivative finite at an exact null of the visibility."""
@@ -22,7 +25,12 @@ NEVER_ZERO = 1e-30
 def _samples(observables: Observables, model: BinaryModel) -> UVPoints:
     """Points of the data, kept apart by what the model tells apart."""
     bands = band_numbers(observables, model.bands) if model.bands else None
-    return uv_points_of(observables, bands, dated=model.moves)
+    return uv_points_of(observables, bands, dated=model.moves, coloured=model.coloured)
+
+
+def _told_apart(model: BinaryModel) -> tuple[object, ...]:
+    """What of a model decides which points it tells apart."""
+    return model.bands, model.moves, model.coloured
 
 
 class Likelihood:
@@ -70,7 +78,7 @@ class Likelihood:
 
     def with_model(self, model: BinaryModel) -> Likelihood:
         """Make the likelihood of another model with the same data and noise."""
-        alike = (model.bands, model.moves) == (self.model.bands, self.model.moves)
+        alike = _told_apart(model) == _told_apart(self.model)
         return Likelihood(self.observables, model, self.noise, self.samples if alike else None)
 
     def with_noise(self, noise: NoiseModel) -> Likelihood:
@@ -108,6 +116,11 @@ class Likelihood:
         """χ² of parameter sets (n, n_dim), (n,)."""
         return np.asarray((self.residuals(theta) ** 2).sum(axis=0))
 
+    def chi2_of(self, visibility: ComplexArray) -> FloatArray:
+        """χ² of complex visibilities (n_samples, n) of any model, (n,)."""
+        white = self.noise.whiten(self._difference(self._observe(visibility)))
+        return np.asarray((white**2).sum(axis=0))
+
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
         return self.noise.log_prob(self.difference(theta))
@@ -142,7 +155,7 @@ class Likelihood:
         With an estimated covariance that of the t distribution which parameters of a linear
         model have: (ν − 2 + χ²)/(ν + n − n_dim − 2) times as large.
         """
-        jacobian = self.jacobian(theta)
+        jacobian = self.jacobian(self._sized(np.atleast_1d(theta)))
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0
         fisher = (jacobian / scale).T @ (jacobian / scale)
@@ -151,6 +164,26 @@ class Likelihood:
             return np.asarray(inverse)
         rest = self.degrees - 2.0 + self.n_independent - len(scale)
         return np.asarray(inverse * (self.degrees - 2.0 + self.chi2(theta)[0]) / rest)
+
+    def _sized(self, theta: ArrayLike) -> FloatArray:
+        """The parameter set (n_dim,) with discs too small to be seen as large as their error.
+
+        Data move with the square of a small disc, whose derivative vanishes with it: its
+        error σ is where that square is 1σ from 0.
+        """
+        sized = np.array(theta, dtype=float).ravel()
+        discs = self.parameters.discs
+        small = SMALL_DISC / float(self.samples.frequency.max(initial=1e-300)) / MAS
+        unseen = discs[sized[discs] < small]
+        if not len(unseen):
+            return sized
+        trial = sized.copy()
+        trial[unseen] = small
+        length = np.linalg.norm(self.jacobian(trial)[:, unseen], axis=0)
+        seen = np.sqrt(2.0 * small / np.maximum(length, 1e-300))
+        upper = np.array(self.parameters.bounds(unseen))[:, 1]
+        sized[unseen] = np.maximum(sized[unseen], np.minimum(seen, upper))
+        return sized
 
     def _sets(self, theta: ArrayLike) -> FloatArray:
         sets = np.atleast_2d(np.asarray(theta, dtype=float))

@@ -7,11 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from amibayes.likelihood.likelihood import Likelihood
-from amibayes.units import FloatArray, IntArray
+from amibayes.likelihood.likelihood import SMALL_DISC, Likelihood
+from amibayes.units import MAS, FloatArray, IntArray
 
 DENSE_ENOUGH = 0.15
 """Share of non-zeros above which a dense product is the faster one."""
+
+NEAR_NULL = 0.01
+"""Visibility of the star below which a closure phase is not linear in the contrasts that matter
+(some percent): its derivative, 1/V, is taken to vanish there instead of growing without end."""
+
+UNSEEN = 0.1
+"""Change of the data, in σ over all of them, that is as good as none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,25 +38,57 @@ def _part(matrix: csr_array) -> Part:
     return Part(kept.toarray() if dense else kept, rows)
 
 
-def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> tuple[Part, Part, FloatArray]:
-    """Matrices A, B and V₀ with template = A·(Re(E) − V₀) + B·Im(−E).
+@dataclass(frozen=True, eq=False)
+class WhitenedResponse:
+    """Matrices A, B with template = A·(D·Re(E) − V₀) + B·Im(−D·E).
 
-    With V₀ = D/(1 + f) real, dV/dc = (E − V₀)/(1 + f), hence dV² = 2V₀ Re dV and
+    With V₀ real and s = 1/(flux), dV/dc = s·(D·E − V₀), hence dV² = 2V₀ Re dV and
     dφ = Im dV / V₀.
+
+    Parameters
+    ----------
+    even, odd : Part
+        A and B.
+    star : (n_samples,) float array
+        V₀.
+    disc : (n_samples,) float array
+        D, the visibility of the companion's disc.
     """
+
+    even: Part
+    odd: Part
+    star: FloatArray
+    disc: FloatArray
+
+
+def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> WhitenedResponse:
+    """Make the response of the whitened data to a faint companion."""
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
-    primary, scale = response.star, response.scale
+    star, scale = response.star, response.scale
     whitening = likelihood.noise.covariance.whitening
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
-    even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * primary))
-    odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale / primary))
-    return even, odd, np.asarray(primary)
+    inverse = star / np.maximum(star**2, NEAR_NULL**2)
+    even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * star))
+    odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale * inverse))
+    return WhitenedResponse(even, odd, star, response.disc)
 
 
 def nuisance_directions(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:
-    """Orthonormal directions (n_data, k) in which the nuisance parameters move the data."""
-    single = replace(likelihood.model, companions=0)
-    if not len(single.parameters):
+    """Orthonormal directions (n_data, k) in which the nuisance parameters move the data.
+
+    A disc of no size moves the data with its square: the direction is that of a small one.
+    What cannot move them by `UNSEEN` within its range is left out.
+    """
+    single = likelihood.with_model(replace(likelihood.model, companions=0))
+    parameters = single.parameters
+    if not len(parameters):
         return np.empty((likelihood.n_independent, 0))
-    return np.asarray(np.linalg.qr(likelihood.with_model(single).jacobian(nuisance))[0])
+    at = np.array(nuisance, dtype=float)
+    discs = parameters.discs
+    at[discs] = np.maximum(at[discs], SMALL_DISC / likelihood.samples.frequency.max() / MAS)
+    columns = single.jacobian(at)
+    low, high = np.array(parameters.bounds(parameters.columns())).T
+    length = np.linalg.norm(columns, axis=0)
+    seen = length * (high - low) > UNSEEN
+    return np.asarray(np.linalg.qr(columns[:, seen] / length[seen])[0])

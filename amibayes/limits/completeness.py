@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolution_mas
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.statistic import Statistic
 from amibayes.errors import UsageError

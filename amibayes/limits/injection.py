@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from amibayes.companion_search.search import resolution_mas
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.statistic import Hits, Statistic
 from amibayes.limits.aliases import ambiguous, nearer_alias

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.support.options import LIMITS_SEPARATIONS
 from amibayes.units import FloatArray, offset

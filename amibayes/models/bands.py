@@ -94,6 +94,13 @@ def band_numbers(observables: Observables, names: tuple[str, ...]) -> IntArray:
     return numbers
 
 
+def reference_wavelength(observables: Observables) -> float:
+    """Geometric mean wavelength of the unflagged data, metres."""
+    data = observables.unflagged()
+    wavelengths = np.concatenate([data.vis2.wavelength_m, data.closure_phase.wavelength_m])
+    return float(np.exp(np.sort(np.log(wavelengths)).mean()))
+
+
 def dates(observables: Observables) -> tuple[float, float, float]:
     """First, last and mean date (MJD) of the data.
 

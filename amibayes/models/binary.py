@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from amibayes.models.background import Background
-from amibayes.models.companion import PointCompanion
+from amibayes.models.companion import Companion
 from amibayes.models.off_axis import Place
 from amibayes.models.parameters import Parameters
 from amibayes.models.source import CENTRED, Component, Slope, Source
@@ -28,20 +28,25 @@ from amibayes.units import ComplexArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class LinearResponse:
-    """How a faint companion moves the visibility: dV/dc = scale·(ρE − ρ_F·star).
+    """How a faint companion moves the visibility: dV/dc = scale·(ρDE − ρ_F·star).
 
     E are the fringes of a point, ρ and ρ_F the response of the extraction to its visibility
-    and flux (1 where there is none).
+    and flux (1 where there is none). A free disc or colour of the companion is left at its
+    value here, that of a point as bright in all channels: without light it has no effect.
 
     Parameters
     ----------
     star : (n_samples,) float array
         Visibility without a companion; real, since the star stands at the origin.
-    scale : float
+    scale : (n_samples,) float array
+        1/(flux without a companion), times the companion's colour.
+    disc : (n_samples,) float array
+        D, the visibility of the companion's disc.
     """
 
     star: FloatArray
-    scale: float
+    scale: FloatArray
+    disc: FloatArray
 
 
 @takes_quantities
@@ -68,6 +73,14 @@ class BinaryModel:
         Date at which a moving companion is at its east and north.
     surroundings : tuple of Component
         What else is on the sky, such as a disc; its parameters are nuisances, component 0.
+    limb_darkening : float or "free"
+        Exponent α of the primary's brightness μ^α; 0 for a uniform disc.
+    companion_diameter_mas : float or "free"
+        Uniform-disc diameter of companions.
+    contrast_slope : float or "free"
+        Exponent P of the flux ratio with wavelength, c·(λ/λ₀)^P.
+    reference_wavelength_m : float
+        λ₀; 0 for the geometric mean over the points of the data.
     """
 
     companions: int = 1
@@ -78,11 +91,20 @@ class BinaryModel:
     fastest_mas_yr: float = 0.0
     reference_mjd: float = 0.0
     surroundings: tuple[Component, ...] = ()
+    limb_darkening: float | Literal["free"] = 0.0
+    companion_diameter_mas: float | Literal["free"] = 0.0
+    contrast_slope: float | Literal["free"] = 0.0
+    reference_wavelength_m: float = 0.0
 
     @property
     def n_contrasts(self) -> int:
         """Number of contrasts of each companion."""
         return max(len(self.bands), 1)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the flux ratio goes with wavelength."""
+        return self.contrast_slope != 0.0
 
     @property
     def moves(self) -> bool:
@@ -92,17 +114,20 @@ class BinaryModel:
     @cached_property
     def components(self) -> tuple[Component, ...]:
         """Companions, star and background, in the order of a parameter vector."""
-        companions = [
-            PointCompanion(
-                k + 1, self.smearing, self.bands, self.fastest_mas_yr, self.reference_mjd
-            )
-            for k in range(self.companions)
-        ]
-        return (
-            *companions,
-            Star(self.diameter_mas),
-            Background(self.background),
-            *self.surroundings,
+        companions = [self._companion(k + 1) for k in range(self.companions)]
+        star = Star(self.diameter_mas, self.limb_darkening)
+        return (*companions, star, Background(self.background), *self.surroundings)
+
+    def _companion(self, k: int) -> Companion:
+        return Companion(
+            k,
+            self.smearing,
+            self.bands,
+            self.fastest_mas_yr,
+            self.reference_mjd,
+            self.companion_diameter_mas,
+            self.contrast_slope,
+            self.reference_wavelength_m,
         )
 
     @cached_property
@@ -111,7 +136,10 @@ class BinaryModel:
         return Parameters(tuple(p for c in self.components for p in c.parameters))
 
     def at_rest(self, three: FloatArray) -> FloatArray:
-        """Companions (n, width) that stand, alike in every band, from east, north, contrast."""
+        """Companions (n, width) that stand, alike in every band, from east, north, contrast.
+
+        Free shapes are those of a point without colour.
+        """
         one = replace(self, companions=1).parameters
         out = np.zeros((len(three), len(one.companion())))
         out[:, one.place()] = three[:, :2]
@@ -143,7 +171,15 @@ class BinaryModel:
         sources = alone._sources(samples, np.atleast_2d(nuisance), slopes=False)
         light, total = _mixed(samples, sources, CENTRED)
         scale = 1.0 / float(np.ravel(total)[0])
-        return LinearResponse(np.asarray(light[:, 0].real * scale), scale)
+        point = self._companion(1)
+        rest = np.zeros((len(point.shapes), 1))
+        colour, disc = point.colour(samples, rest)[0], point.disc(samples, rest)[0]
+        one = np.ones(len(samples))
+        return LinearResponse(
+            np.asarray(light[:, 0].real * scale),
+            scale * (one if colour is None else np.broadcast_to(colour, (len(one), 1))[:, 0]),
+            one if disc is None else np.broadcast_to(disc, (len(one), 1))[:, 0],
+        )
 
     def _sources(self, samples: UVPoints, theta: FloatArray, *, slopes: bool) -> list[Source]:
         """Every component at parameter sets (n, n_dim)."""

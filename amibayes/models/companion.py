@@ -1,27 +1,35 @@
-"""A companion: a point with contrasts, which may move, seen through a channel of some width.
+"""A companion: a disc with contrasts and a colour, which may move, seen through a channel.
 
-E = sinc · exp(−2πi(uα + vδ)/λ), whose sinc is the average over the channel. Of data in several
-bands each may have a contrast of its own, and of data of several dates the place may move
-linearly.
+c·(λ/λ₀)^P·D·E with D the visibility of a uniform disc, P the slope of the flux ratio with
+wavelength, and E = sinc · exp(−2πi(uα + vδ)/λ), whose sinc is the average over the channel. Of
+data in several bands each may have a contrast of its own, and of data of several dates the
+place may move linearly.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from amibayes.models.parameters import MAX_CONTRAST, Parameter
 from amibayes.models.source import Slope, Source
 from amibayes.models.uv_points import UVPoints
+from amibayes.scene.disc import uniform_disc
 from amibayes.units import MAS, ComplexArray, FloatArray
+
+MAX_SLOPE = 10.0
+"""Largest exponent of a flux ratio with wavelength: a 1000 K body beside a hot star at 1 µm."""
 
 
 def companion_parameters(
-    k: int = 1, bands: tuple[str, ...] = (), fastest_mas_yr: float = 0.0
+    k: int = 1,
+    bands: tuple[str, ...] = (),
+    fastest_mas_yr: float = 0.0,
+    shapes: tuple[str, ...] = (),
 ) -> tuple[Parameter, ...]:
-    """Parameters of companion ``k``: place, contrasts, rates.
+    """Parameters of companion ``k``: place, contrasts, rates, shapes.
 
     Parameters
     ----------
@@ -31,6 +39,8 @@ def companion_parameters(
         That have a contrast of their own; empty where all share one.
     fastest_mas_yr : float
         0 where it stands still.
+    shapes : tuple of {"companion_diameter_mas", "contrast_slope"}
+        What is free of them.
     """
     suffix = "" if k == 1 else f"_{k}"
     found = [Parameter(f"{axis}_mas{suffix}", "mas", "position", k) for axis in ("east", "north")]
@@ -45,6 +55,10 @@ def companion_parameters(
             Parameter(f"{axis}_rate_mas_yr{suffix}", "mas/yr", "rate", k, *limits)
             for axis in ("east", "north")
         ]
+    if "companion_diameter_mas" in shapes:
+        found.append(Parameter(f"companion_diameter_mas{suffix}", "mas", "shape", k, lower=0.0))
+    if "contrast_slope" in shapes:
+        found.append(Parameter(f"contrast_slope{suffix}", "", "shape", k, -MAX_SLOPE, MAX_SLOPE))
     return tuple(found)
 
 
@@ -53,8 +67,8 @@ ALONG = ((1.0, 0.0), (0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class PointCompanion:
-    """A point.
+class Companion:
+    """A companion.
 
     Parameters
     ----------
@@ -68,6 +82,11 @@ class PointCompanion:
         0: it stands still.
     reference_mjd : float
         Date at which a moving companion is at its east and north.
+    diameter_mas : float or "free"
+    slope : float or "free"
+        Exponent P of the flux ratio, (λ/λ₀)^P.
+    reference_wavelength_m : float
+        λ₀; 0 for the geometric mean of the data's.
     """
 
     number: int = 1
@@ -75,11 +94,20 @@ class PointCompanion:
     bands: tuple[str, ...] = ()
     fastest_mas_yr: float = 0.0
     reference_mjd: float = 0.0
+    diameter_mas: float | Literal["free"] = 0.0
+    slope: float | Literal["free"] = 0.0
+    reference_wavelength_m: float = 0.0
+
+    @property
+    def shapes(self) -> tuple[str, ...]:
+        """What is free of disc and colour."""
+        pairs = (("companion_diameter_mas", self.diameter_mas), ("contrast_slope", self.slope))
+        return tuple(name for name, value in pairs if value == "free")
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Place, contrasts, rates."""
-        return companion_parameters(self.number, self.bands, self.fastest_mas_yr)
+        """Place, contrasts, rates, shapes."""
+        return companion_parameters(self.number, self.bands, self.fastest_mas_yr, self.shapes)
 
     @property
     def n_contrasts(self) -> int:
@@ -88,28 +116,57 @@ class PointCompanion:
 
     def source(self, samples: UVPoints, values: FloatArray, *, slopes: bool = False) -> Source:
         """Make the companion of ``values`` (n_parameters, n)."""
-        place, rest = values[:2], values[2:]
-        bright, rates = rest[: self.n_contrasts], rest[self.n_contrasts :]
+        place, bright, rates, shapes = self._split(values)
         flux = bright[0] if self.n_contrasts == 1 else bright[samples.band]
+        colour, by_slope = self.colour(samples, shapes)
+        flux = flux if colour is None else flux * colour
         years = samples.years(self.reference_mjd)[:, None] if len(rates) else np.zeros(1)
         east, north = place[:, None] + years * rates[:, None] if len(rates) else place
+        disc, by_diameter = self.disc(samples, shapes)
         if not slopes:
             wave = point_visibility(samples, east, north, self.smearing)
-            return Source(flux, wave, (east, north))
+            return Source(flux, wave if disc is None else disc * wave, (east, north))
         wave, by_angle = point_slope(samples, east, north, self.smearing)
+        point = wave
+        if disc is not None:
+            wave, by_angle = disc * wave, disc * by_angle
         by_turn = by_angle * (2.0 * np.pi * MAS)
         by_place = by_turn * samples.u[:, None], by_turn * samples.v[:, None]
         found = [Slope(wave=w, place=p) for w, p in zip(by_place, ALONG, strict=True)]
-        found += [Slope(flux=f) for f in self._by_contrast(samples)]
+        found += [Slope(flux=f) for f in self._by_contrast(samples, colour)]
         if len(rates):
             found += [s.times(years) for s in found[: len(ALONG)]]
+        found += [] if self.diameter_mas != "free" else [Slope(wave=by_diameter * point)]
+        found += [] if self.slope != "free" else [Slope(flux=flux * by_slope)]
         return Source(flux, wave, (east, north), found)
 
-    def _by_contrast(self, samples: UVPoints) -> list[Any]:
+    def _split(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Place, contrasts, rates and shapes."""
+        first = 2 + self.n_contrasts
+        last = len(values) - len(self.shapes)
+        return values[:2], values[2:first], values[first:last], values[last:]
+
+    def colour(self, samples: UVPoints, shapes: FloatArray) -> tuple[Any, Any]:
+        """(λ/λ₀)^P, (n_samples, n), and its logarithmic derivative by P; None where P is 0."""
+        if self.slope == 0.0:
+            return None, None
+        log = samples.log_colour(self.reference_wavelength_m)[:, None]
+        slope = shapes[-1] if self.slope == "free" else np.full(1, float(self.slope))
+        return np.exp(log * slope), log
+
+    def disc(self, samples: UVPoints, shapes: FloatArray) -> tuple[Any, Any]:
+        """Visibility of the disc, (n_samples, n), and its derivative; None for a point."""
+        if self.diameter_mas == 0.0:
+            return None, None
+        diameter = shapes[0] if self.diameter_mas == "free" else np.full(1, self.diameter_mas)
+        return uniform_disc(samples.frequency[:, None], diameter)
+
+    def _by_contrast(self, samples: UVPoints, colour: FloatArray | None) -> list[Any]:
         """Derivatives of the flux by each contrast."""
+        each = 1.0 if colour is None else colour
         if self.n_contrasts == 1:
-            return [1.0]
-        return [1.0 * (samples.band[:, None] == b) for b in range(self.n_contrasts)]
+            return [each]
+        return [each * (samples.band[:, None] == b) for b in range(self.n_contrasts)]
 
 
 def point_visibility(

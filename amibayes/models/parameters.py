@@ -113,6 +113,11 @@ class Parameters:
         return self.columns(component=0)
 
     @property
+    def discs(self) -> IntArray:
+        """Columns of diameters."""
+        return np.array([k for k, p in enumerate(self.items) if _is_size(p)], dtype=np.intp)
+
+    @property
     def swapped(self) -> IntArray:
         """Columns with the first two companions exchanged."""
         order = np.arange(len(self))
@@ -145,10 +150,14 @@ class Parameters:
         largest = 1.0 / lowest_frequency / MAS if lowest_frequency > 0.0 else np.inf
 
         def bounded(p: Parameter) -> Parameter:
-            size = p.unit == "mas" and p.role != "position"
-            return replace(p, upper=min(p.upper, largest)) if size else p
+            return replace(p, upper=min(p.upper, largest)) if _is_size(p) else p
 
         return Parameters(tuple(bounded(p) for p in self.items))
+
+
+def _is_size(p: Parameter) -> bool:
+    """Whether a parameter is a diameter: an angle that is no position."""
+    return p.unit == "mas" and p.role != "position"
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class UVPoints:
         Number of each point's band, where bands are told apart.
     mjd : (n,) float array, optional
         Date of each point, where dates are told apart.
+    wavelength_m : (n,) float array, optional
+        Wavelength of each point, where wavelengths are told apart.
     """
 
     u: FloatArray
@@ -51,6 +53,7 @@ class UVPoints:
     off_axis: OffAxis | None = None
     bands: IntArray | None = None
     mjd: FloatArray | None = None
+    wavelength_m: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.u)
@@ -81,9 +84,21 @@ class UVPoints:
             raise ValueError("these samples do not know their dates")
         return np.asarray((self.mjd - reference_mjd) / YEAR_DAYS)
 
+    def log_colour(self, reference_wavelength_m: float) -> FloatArray:
+        """ln(λ/λ₀) of each point, (n,); λ₀ the geometric mean of the points unless given."""
+        if self.wavelength_m is None:
+            raise ValueError("these samples do not know their wavelengths")
+        log = np.log(self.wavelength_m)
+        zero = np.log(reference_wavelength_m) if reference_wavelength_m else log.mean()
+        return np.asarray(log - zero)
+
 
 def uv_points_of(
-    observables: Observables, band_of_setup: IntArray | None = None, *, dated: bool = False
+    observables: Observables,
+    band_of_setup: IntArray | None = None,
+    *,
+    dated: bool = False,
+    coloured: bool = False,
 ) -> UVPoints:
     """Collect the points of unflagged observables; opposite points are conjugate, hence one.
 
@@ -94,6 +109,8 @@ def uv_points_of(
         Keeps equal points of different bands apart.
     dated : bool
         Keep equal points of different dates apart.
+    coloured : bool
+        Keep equal points of different wavelengths apart.
     """
     data = observables.unflagged()
     v2, cp = data.vis2, data.closure_phase
@@ -107,6 +124,7 @@ def uv_points_of(
     mjd = np.concatenate([v2.mjd, np.repeat(cp.mjd, 3)])
     bands = None if band_of_setup is None else band_of_setup[setup]
     labels = ([] if bands is None else [bands]) + ([mjd] if dated else [])
+    labels += [wavelength] if coloured else []
     extracted = np.array([s.response is not None for s in data.setups])[setup]
     if extracted.any():
         labels += [setup, mjd]  # each exposure has a response, and a centre, of its own
@@ -125,6 +143,7 @@ def uv_points_of(
         off_axis_of(data, first, orientation, uv, np.column_stack([setup, mjd])[first]),
         None if bands is None else bands[first],
         mjd[first] if dated else None,
+        wavelength[first] if coloured else None,
     )
 
 

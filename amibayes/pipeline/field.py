@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amibayes.companion_search.field import (
+    SURELY_NOT_NOISE,
+    choose_field,
+    look_inside,
+    resolution_mas,
+)
+from amibayes.companion_search.optimise import refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
-from amibayes.companion_search.search import (
-    SURELY_NOT_NOISE,
-    look_inside,
-    look_outside,
-    resolves_stars,
-    search,
-)
+from amibayes.companion_search.search import search
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
-from amibayes.data.systematics import systematics_of
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.bands import reference_wavelength
 from amibayes.models.binary import BinaryModel
+from amibayes.models.parameters import Box
 from amibayes.pipeline.options import SearchOptions
 
-MAX_FIELDS = 3
-"""How often the default field is searched, widened each time: a companion further out than
-that is outside of what the data sample well."""
+DISC_CONTRAST = 0.03
+"""Contrast below which a disc is not tried unasked: as large as the star's it would have a surface
+brightness of 3 % of it, and what looks resolved is rather light lost in the channel's width."""
+
+SURELY_A_DISC = 25.0
+"""2Δln L that one more parameter does not gain by chance, even where channels err together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,25 +56,48 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     """Search the field; the default one is widened where something around it fits better."""
     likelihood = Likelihood(observables.only(options.observables))
     likelihood = joint_likelihood(
-        likelihood.with_model(_model(likelihood, options)),
+        likelihood.with_model(model_of(likelihood, options)),
         contrast=options.contrast,
         motion=options.motion,
         fastest_mas_yr=options.fastest_mas_yr,
     )
     field, warnings = options.separation_mas, list[str]()
-    for _ in range(MAX_FIELDS):
-        result, noise = _searched(likelihood, field, options)
-        place = None if options.separation_mas else look_outside(result)
-        if place is None:
-            break
-        field = (result.grid.inner_mas, 1.5 * place)
-        warnings = [
-            f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
-            "default one, a companion fits better than anywhere inside"
-        ]
+    if field is None:
+        field, place = choose_field(likelihood)
+        if place is not None:
+            warnings = [
+                f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
+                "default one, a companion fits better than anywhere inside"
+            ]
+    result, noise = _searched(likelihood, field, options)
+    if options.companion_diameter is None and shows_disc(likelihood, result):
+        free = replace(likelihood.model, companion_diameter_mas="free")
+        result, noise = _searched(likelihood.with_model(free), field, options)
     if options.separation_mas:
         warnings = _beyond(result)
     return FieldSearch(result, noise, tuple(warnings))
+
+
+def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
+    """Whether V² shows that the companion is a disc, by a fit with the stated errors.
+
+    With their scale free as well, so that errors that are too small make no disc.
+    """
+    data = likelihood.observables
+    sure = result.delta_chi2 > SURELY_NOT_NOISE and result.companion.contrast > DISC_CONTRAST
+    if not data.n_vis2 or not sure or likelihood.model.companion_diameter_mas != 0.0:
+        return False
+    disc = likelihood.with_model(replace(likelihood.model, companion_diameter_mas="free"))
+    grid = result.grid
+    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    point = refine(likelihood, result.theta, box, 0.0)
+    theta = with_disc(disc, np.array(point.theta), box)
+    chi2 = [
+        float(model.chi2(np.array(fit.theta))[0])
+        for model, fit in ((likelihood, point), (disc, refine(disc, theta, box, 0.0)))
+    ]
+    scaled = likelihood.n_independent * np.log(chi2[0] / chi2[1])
+    return bool(min(chi2[0] - chi2[1], scaled) > SURELY_A_DISC)
 
 
 def _searched(
@@ -79,17 +107,16 @@ def _searched(
     apart = options.file_noise is not False
     if options.robust:
         return search_robust(likelihood, field, free_scale=options.extra_noise, per_file=apart)
-    prior = noise_prior(likelihood.observables, options)
-    if options.extra_noise or options.channel_noise or prior.floors:
+    if options.extra_noise or options.channel_noise:
+        prior = noise_prior(options)
         return search_with_noise(likelihood, field, per_file=apart, prior=prior)
     return search(likelihood, field), ExtraNoise()
 
 
-def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
+def noise_prior(options: SearchOptions) -> NoisePrior:
     """Prior of extra noise; of width 0 where the stated errors count as right."""
     vis2, degrees = options.noise_prior if options.extra_noise else (0.0, 0.0)
-    floors = systematics_of(observables, options.systematics)
-    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise, floors)
+    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise)
 
 
 def _beyond(result: SearchResult) -> list[str]:
@@ -111,8 +138,19 @@ def _beyond(result: SearchResult) -> list[str]:
     return found
 
 
-def _model(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
-    diameter = options.diameter
+def model_of(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
+    """Make the model of one companion that the options ask for."""
+    diameter, disc = options.diameter, options.companion_diameter
+    coloured = options.contrast_slope != 0.0
     if diameter is None:
-        diameter = "free" if resolves_stars(likelihood) else 0.0
-    return BinaryModel(1, diameter, options.background, options.smearing)
+        diameter = "free" if likelihood.observables.n_vis2 else 0.0
+    return BinaryModel(
+        1,
+        diameter,
+        options.background,
+        options.smearing,
+        limb_darkening=options.limb_darkening,
+        companion_diameter_mas=0.0 if disc is None else disc,
+        contrast_slope=options.contrast_slope,
+        reference_wavelength_m=reference_wavelength(likelihood.observables) if coloured else 0.0,
+    )

@@ -218,7 +218,11 @@ def _alike(search: SearchOptions, main: SearchResult) -> SearchOptions:
     if "vis2" in search.observables:
         return search
     return replace(
-        search, diameter=main.nuisance("diameter_mas"), background=main.nuisance("background")
+        search,
+        diameter=main.nuisance("diameter_mas"),
+        limb_darkening=main.nuisance("limb_darkening"),
+        background=main.nuisance("background"),
+        companion_diameter=main.nuisance("companion_diameter_mas"),
     )
 
 

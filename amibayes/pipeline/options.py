@@ -34,8 +34,14 @@ class SearchOptions:
         By default λ/2B_max to λ/B_min of the data.
     observables : tuple of {"vis2", "cp"}
     diameter : float, "free" or None
-        Uniform-disc diameter of the primary, mas. None: free where the longest baseline
-        would notice a disc of 0.3 mas and V² is used, else 0.
+        Diameter of the primary, mas. None: free where V² is used, else 0.
+    limb_darkening : float or "free"
+        Exponent α of the brightness μ^α of the primary's disc.
+    companion_diameter : float, "free" or None
+        Uniform-disc diameter of companions, mas. None: 0, or free where V² shows the disc of
+        the companion that is found.
+    contrast_slope : float or "free"
+        Exponent of the flux ratio with wavelength.
     background : float or "free"
         Over-resolved flux in units of the primary's.
     smearing : bool
@@ -77,9 +83,6 @@ class SearchOptions:
     noise_prior : (float, float)
         Widths of the half-normal prior of extra noise: of V², relative to it, and of closure
         phases, degrees. It is at most three times as large.
-    systematics : "table", "none" or (float, float)
-        Floor of calibration errors that channels of an exposure share: of a table by
-        instrument, for files of few exposures, or share of V² and degrees of closure phase.
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
     file_noise : bool, optional
@@ -102,6 +105,9 @@ class SearchOptions:
     separation_mas: tuple[float, float] | None = None
     observables: tuple[str, ...] = OBSERVABLES
     diameter: float | Literal["free"] | None = None
+    limb_darkening: float | Literal["free"] = 0.0
+    companion_diameter: float | Literal["free"] | None = None
+    contrast_slope: float | Literal["free"] = 0.0
     background: float | Literal["free"] = 0.0
     smearing: bool = True
     closure_covariance: ClosureCovariance = "assumed"
@@ -123,7 +129,6 @@ class SearchOptions:
     extra_noise: bool = True
     channel_noise: bool = True
     noise_prior: tuple[float, float] = NOISE_PRIOR
-    systematics: Literal["table", "none"] | tuple[float, float] = "table"
     robust: bool = False
     file_noise: bool | None = None
     posterior: bool = True

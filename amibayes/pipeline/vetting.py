@@ -19,9 +19,10 @@ from scipy.sparse.csgraph import connected_components
 
 from amibayes.calibration import calibrate
 from amibayes.calibration.matching import keys_of, match, sharing
+from amibayes.companion_search.field import resolves_stars
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolves_stars, search
+from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, significance
 from amibayes.detection.statistic import statistic_of

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import resolution_mas
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import (

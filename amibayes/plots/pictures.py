@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.residuals_by_file import file_residuals
-from amibayes.companion_search.search import resolution_mas
 from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport
 from amibayes.pipeline.options import SearchOptions

@@ -25,7 +25,7 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
-from amibayes.posterior.priors import Prior
+from amibayes.posterior.priors import Prior, Range
 from amibayes.posterior.sampler import draw_posterior
 from amibayes.support.options import SAMPLERS
 from amibayes.units import FloatArray
@@ -184,9 +184,11 @@ def log_evidence_halo(likelihood: Likelihood, prior: Prior) -> float:
         return float("nan")
     halo = likelihood.with_model(replace(likelihood.model, background="free"))
     names = [single_likelihood(one).parameters.names for one in (likelihood, halo)]
-    ranges = dict(zip(names[0], prior.nuisance, strict=True))
-    ranges["background"] = (0.0, HALO_BACKGROUND)
-    return log_evidence_none(halo, replace(prior, nuisance=tuple(ranges[n] for n in names[1])))
+    found = dict(zip(names[0], prior.ranges, strict=True))
+    found["background"] = Range(0.0, HALO_BACKGROUND)
+    ranges = [found[n] for n in names[1]]
+    limits, scales = tuple((r.low, r.high) for r in ranges), tuple(r.scale for r in ranges)
+    return log_evidence_none(halo, replace(prior, nuisance=limits, half_cauchy=scales))
 
 
 def log_evidence_importance(
@@ -309,7 +311,7 @@ class _Gaussians:
     def _ordered(self, x: FloatArray) -> FloatArray:
         log = np.zeros(len(x))
         if self.n_free:
-            bare = replace(self.prior, nuisance=())
+            bare = replace(self.prior, nuisance=(), half_cauchy=())
             free = self.all.companion(2)
             log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
         parts = [t.log_density(x) for t in self.mixture]

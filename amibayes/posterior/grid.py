@@ -210,7 +210,8 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
 
 def integrable(likelihood: Likelihood) -> bool:
     """Whether the grid posterior has all of the model's dimensions."""
-    return refusal(combination_of(likelihood, method="grid posterior")) is None
+    shapes = likelihood.parameters.columns("shape")
+    return not len(shapes) and refusal(combination_of(likelihood, method="grid posterior")) is None
 
 
 def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:

@@ -143,7 +143,8 @@ def nuisance_nodes(prior: Prior, centres: FloatArray, errors: FloatArray) -> Nui
     """
     value, low, high = (np.empty((1, 0)) for _ in range(3))
     log_weight = np.zeros(1)
-    for k, bounds in enumerate(prior.nuisance):
+    for k, one in enumerate(prior.ranges):
+        bounds = one.low, one.high
         turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
         sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
         if not 0.0 < sigma < bounds[1] - bounds[0]:
@@ -155,21 +156,21 @@ def nuisance_nodes(prior: Prior, centres: FloatArray, errors: FloatArray) -> Nui
             np.hstack([np.repeat(old, n, axis=0), new.reshape(-1, 1)])
             for old, new in ((value, x), (low, a), (high, b))
         )
-        log_weight = np.repeat(log_weight, n) + np.log(w).ravel()
+        log_weight = np.repeat(log_weight, n) + (np.log(w) + one.log_density(x)).ravel()
     return Nuisance(value, log_weight, low, high)
 
 
 def _axis(
     middle: FloatArray, sigma: float, bounds: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Nodes, weights and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
+    """Nodes, widths and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
     centres = np.clip(middle, *bounds)
     begin = np.maximum(centres.min(axis=1) - NUISANCE_REACH * sigma, bounds[0])[:, None]
     length = np.minimum(centres.max(axis=1) + NUISANCE_REACH * sigma, bounds[1])[:, None] - begin
     wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
     x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, MIN_NODES, MAX_NODES)))
     edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
-    weight = 0.5 * w * length / (bounds[1] - bounds[0])
+    weight = 0.5 * w * length
     return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
 
 

@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from amibayes.companion_search.result import Mode
-from amibayes.likelihood.chi2 import LOG_TWO_PI
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import LOG_TWO_PI
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.priors import Prior
 from amibayes.units import FloatArray, IntArray
@@ -46,10 +46,11 @@ def _log_mass(likelihood: Likelihood, theta: FloatArray, prior: Prior) -> float:
 
 
 def _bounded(likelihood: Likelihood, prior: Prior) -> tuple[IntArray, FloatArray]:
-    """Columns of rates and nuisance parameters, and their ranges (n, 2)."""
+    """Columns of rates, shapes and nuisance parameters, and their ranges (n, 2)."""
     parameters, rate = likelihood.parameters, prior.fastest_mas_yr
-    columns = np.concatenate([parameters.rates, parameters.nuisance])
-    ranges = [(-rate, rate)] * len(parameters.rates) + list(prior.nuisance)
+    columns = np.concatenate([parameters.rates, parameters.columns("shape"), parameters.nuisance])
+    ranges = [(-rate, rate)] * len(parameters.rates)
+    ranges += list(prior.shapes) * parameters.companions + list(prior.nuisance)
     return columns, np.array(ranges).reshape(-1, 2)
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import Mode, SearchResult
-from amibayes.companion_search.search import resolution_mas
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import log_masses
 from amibayes.posterior.priors import Prior

@@ -7,7 +7,7 @@ the posterior is sampled, (east, north, ln contrast) of each companion and then 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
@@ -21,6 +21,9 @@ from amibayes.models.parameters import Parameter, Parameters
 from amibayes.support.options import ContrastForm, PositionForm, choices
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray, offset
+
+STAR_SCALE_MAS = 1.0
+"""Half of all stars that interferometers look at are smaller; giants of 20 mas stay possible."""
 
 SYNTAX = "contrast=[FORM:]LOW:HIGH, contrast=FORM, position=area|separation or NAME=LOW:HIGH"
 
@@ -37,8 +40,8 @@ class Prior:
     contrast_min, contrast_max : float
         Range of the contrast (flux ratio).
     nuisance : tuple of (low, high)
-        Uniform ranges of the free nuisance parameters, such as the diameter (mas) and the
-        background, in the order of a parameter vector.
+        Ranges of the free nuisance parameters, such as the diameter (mas) and the background, in
+        the order of a parameter vector.
     contrast_form : {"log-uniform", "uniform"}
         Distribution of the contrast over its range.
     position_form : {"area", "separation"}
@@ -47,6 +50,11 @@ class Prior:
         Contrasts of each companion, one per band: independent, each with that distribution.
     fastest_mas_yr : float
         Where companions move, their rates along east and north are uniform within so much of 0.
+    shapes : tuple of (low, high)
+        Ranges of what is free of each companion's disc and colour; uniform.
+    half_cauchy : tuple of float
+        Scale of the half-Cauchy distribution of each nuisance parameter over its range; 0 for a
+        uniform one, which all are by default.
     """
 
     inner_mas: float
@@ -58,6 +66,8 @@ class Prior:
     position_form: PositionForm = "area"
     n_contrasts: int = 1
     fastest_mas_yr: float = 0.0
+    shapes: tuple[tuple[float, float], ...] = ()
+    half_cauchy: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         _check("separation", self.inner_mas, self.outer_mas, least=0.0)
@@ -77,11 +87,25 @@ class Prior:
         words = f"{place[self.position_form]}, {contrast[self.contrast_form]}"
         if self.n_contrasts > 1:
             words += f" ({self.n_contrasts} bands, independently)"
-        return words + (", uniform in rate" if self.fastest_mas_yr > 0.0 else "")
+        words += ", uniform in rate" if self.fastest_mas_yr > 0.0 else ""
+        scales = [s for s in self.half_cauchy if s > 0.0]
+        return words + "".join(f", half-Cauchy of {s:g} mas in the star's diameter" for s in scales)
 
     def parameters(self, companions: int) -> Parameters:
         """Parameters of so many companions and the nuisance, in the order of a vector."""
-        return _parameters(companions, self.n_contrasts, self.fastest_mas_yr, len(self.nuisance))
+        return _parameters(
+            companions,
+            self.n_contrasts,
+            self.fastest_mas_yr,
+            len(self.shapes),
+            len(self.nuisance),
+        )
+
+    @property
+    def ranges(self) -> tuple[Range, ...]:
+        """Distributions of the nuisance parameters."""
+        scales = self.half_cauchy or (0.0,) * len(self.nuisance)
+        return tuple(Range(*r, s) for r, s in zip(self.nuisance, scales, strict=True))
 
     def _parameters_of(self, n_dim: int) -> Parameters:
         """Parameters of vectors of a length."""
@@ -118,10 +142,16 @@ class Prior:
             density = density + self._log_companion(x[:, [*parameters.place(k), first]])
             density = density + self._log_further(x[:, others])
             density = density + self._log_rates(x[:, parameters.columns("rate", component=k)])
-        for k, (low, high) in zip(parameters.nuisance, self.nuisance, strict=True):
-            inside = (x[:, k] >= low) & (x[:, k] <= high)
-            density = np.where(inside, density - np.log(high - low), -np.inf)
+        for k, one in self._bounded(parameters):
+            density = density + one.log_density(x[:, k])
         return density
+
+    def _bounded(self, parameters: Parameters) -> Iterator[tuple[int, Range]]:
+        """Columns of shapes and nuisance parameters, and their distributions."""
+        for k in range(1, parameters.companions + 1):
+            columns = parameters.columns("shape", component=k)
+            yield from zip(columns.tolist(), (Range(*s) for s in self.shapes), strict=True)
+        yield from zip(parameters.nuisance.tolist(), self.ranges, strict=True)
 
     def _log_companion(self, x: FloatArray) -> FloatArray:
         rho, ln_c = np.hypot(x[:, 0], x[:, 1]), x[:, 2]
@@ -170,8 +200,8 @@ class Prior:
         bright, rates = parameters.contrasts, parameters.rates
         theta[:, bright] = self._contrast_at(cube[:, bright])
         theta[:, rates] = self.fastest_mas_yr * (2.0 * cube[:, rates] - 1.0)
-        for k, (least, most) in zip(parameters.nuisance, self.nuisance, strict=True):
-            theta[:, k] = least + (most - least) * cube[:, k]
+        for k, one in self._bounded(parameters):
+            theta[:, k] = one.quantile(cube[:, k])
         return theta
 
     def _contrast_at(self, probability: FloatArray) -> FloatArray:
@@ -184,15 +214,51 @@ class Prior:
         return self.from_cube(rng.random((n, len(self.parameters(companions)))))
 
 
+@dataclass(frozen=True)
+class Range:
+    """Uniform between two limits, or the part of a half-Cauchy distribution between them.
+
+    Parameters
+    ----------
+    low, high : float
+    scale : float
+        Of the half-Cauchy distribution: half of it lies below; 0 for the uniform one.
+    """
+
+    low: float
+    high: float
+    scale: float = 0.0
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Log-density at any values."""
+        inside = (x >= self.low) & (x <= self.high)
+        if not self.scale:
+            return np.where(inside, -np.log(self.high - self.low), -np.inf)
+        shape = -np.log1p((x / self.scale) ** 2) - np.log(self.scale * np.diff(self._angles)[0])
+        return np.where(inside, shape, -np.inf)
+
+    def quantile(self, probability: FloatArray) -> FloatArray:
+        """Value below which a probability lies."""
+        if not self.scale:
+            return np.asarray(self.low + (self.high - self.low) * probability)
+        first, last = self._angles
+        return np.asarray(self.scale * np.tan(first + (last - first) * probability))
+
+    @property
+    def _angles(self) -> FloatArray:
+        return np.arctan(np.array([self.low, self.high]) / self.scale)
+
+
 @lru_cache
 def _parameters(
-    companions: int, n_contrasts: int, fastest_mas_yr: float, n_nuisance: int
+    companions: int, n_contrasts: int, fastest_mas_yr: float, n_shapes: int, n_nuisance: int
 ) -> Parameters:
     """Parameters by role; kept, since a chain asks at every step."""
     bands = tuple(str(b) for b in range(n_contrasts))
-    found = [
-        p for k in range(companions) for p in companion_parameters(k + 1, bands, fastest_mas_yr)
-    ]
+    found: list[Parameter] = []
+    for k in range(1, companions + 1):
+        found += companion_parameters(k, bands, fastest_mas_yr)
+        found += [Parameter(f"shape {j} of {k}", "", "shape", k) for j in range(n_shapes)]
     found += [Parameter(f"nuisance {k}", "", "nuisance", 0) for k in range(n_nuisance)]
     return Parameters(tuple(found))
 
@@ -209,12 +275,15 @@ class PriorSetting:
 def default_prior(likelihood: Likelihood, inner_mas: float, outer_mas: float) -> Prior:
     """The prior of the field that was searched."""
     parameters = likelihood.parameters
+    names = [parameters[k].name for k in parameters.nuisance]
     return Prior(
         inner_mas,
         outer_mas,
         nuisance=tuple(parameters.bounds(parameters.nuisance)),
         n_contrasts=likelihood.model.n_contrasts,
         fastest_mas_yr=likelihood.model.fastest_mas_yr,
+        shapes=tuple(parameters.bounds(parameters.columns("shape", component=1))),
+        half_cauchy=tuple(STAR_SCALE_MAS if n == "diameter_mas" else 0.0 for n in names),
     )
 
 
@@ -256,7 +325,10 @@ def edit_prior(prior: Prior, settings: Iterable[PriorSetting], nuisance: Iterabl
         elif wish.name == "position":
             prior = replace(prior, position_form=cast(PositionForm, wish.form))
         elif wish.name.removesuffix("_mas") in names and wish.bounds:
-            ranges[names.index(wish.name.removesuffix("_mas"))] = wish.bounds
+            k = names.index(wish.name.removesuffix("_mas"))
+            ranges[k] = wish.bounds
+            scales = [s if i != k else 0.0 for i, s in enumerate(prior.half_cauchy)]
+            prior = replace(prior, half_cauchy=tuple(scales))
         else:
             raise UsageError(
                 f"{wish.name!r} is not a free parameter",

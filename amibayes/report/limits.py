@@ -8,7 +8,7 @@ import numpy as np
 from astropy.table import Table
 
 from amibayes import __version__
-from amibayes.companion_search.search import resolution_mas
+from amibayes.companion_search.field import resolution_mas
 from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers

@@ -26,7 +26,6 @@ from amibayes.report.common import (
     inputs_json,
     noise_interval,
     number,
-    systematics_json,
 )
 from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
 from amibayes.report.limits import limits_json
@@ -54,10 +53,6 @@ def result_json(report: SearchReport, request: str = "") -> Json:
     result = report.result
     return {
         "amibayes": __version__,
-        "verdict": None if report.verdict is None else asdict(report.verdict),
-        "consistency": [
-            asdict(split) | {"parts": list(split.parts)} for split in report.consistency
-        ],
         "seed": report.options.seed,
         "request": request,
         "options": report.options.to_json(),
@@ -91,7 +86,6 @@ def _noise(report: SearchReport) -> Json:
         "extra_vis2": report.noise.vis2,
         "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
         "channel_correlation": channel_correlation_json(report.noise),
-        "systematics": systematics_json(report.noise),
         "posterior": posterior or None,
     }
 
@@ -115,6 +109,10 @@ def _fit(result: SearchResult) -> Json:
         **{name: number(getattr(c, name)) for name in QUANTITIES},
         "diameter_mas": result.nuisance("diameter_mas"),
         "background": result.nuisance("background"),
+        "limb_darkening": result.nuisance("limb_darkening"),
+        "companion_diameter_mas": result.nuisance("companion_diameter_mas"),
+        "contrast_slope": result.nuisance("contrast_slope"),
+        "reference_wavelength_um": 1e6 * result.likelihood.model.reference_wavelength_m or None,
         "chi2_single": result.chi2_single,
         "chi2_binary": result.chi2_binary,
         "chi2r_single": result.chi2_single / result.ndof,

@@ -8,7 +8,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import calibrate
-from amibayes.companion_search.search import resolution_mas
+from amibayes.companion_search.field import resolution_mas
 from amibayes.cube import Cube
 from amibayes.data.observables import Observables
 from amibayes.errors import AmibayesError, RunError

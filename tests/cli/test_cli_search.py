@@ -105,7 +105,7 @@ FAST = ("--null-draws", "0", "--no-posterior", "--no-limits")
         (("--separation", "100:100.0001"), "no position"),
         (("--prior", "contrast"), "is no prior"),
         (("--prior", "contrast=1:1e-5"), "is empty or impossible"),
-        (("--prior", "diameter=0:1"), "not a free parameter"),
+        (("--prior", "background=0:1"), "not a free parameter"),
         (("--companions", "3"), "not a list out of 0,1,2"),
     ],
 )

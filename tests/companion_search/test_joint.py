@@ -12,10 +12,11 @@ from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.residuals_by_file import file_residuals
-from amibayes.companion_search.search import resolution_mas, search
+from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.template_bank import TemplateBank, trial_rates
 from amibayes.companion_search.with_extra_noise import search_with_noise

@@ -7,7 +7,9 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.search import default_separation, peaks, resolves_stars, search
+from amibayes.companion_search.field import default_separation, resolves_stars
+from amibayes.companion_search.search import search
+from amibayes.companion_search.seeds import peaks
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood

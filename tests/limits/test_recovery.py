@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 
-from amibayes.companion_search.search import resolution_mas, search
+from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.search import search
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.aliases import ambiguous, nearer_alias

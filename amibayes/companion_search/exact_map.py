@@ -1,0 +1,115 @@
+"""χ² of bright companions, not linearised, over the whole field.
+
+Above a contrast of some percent, or where data are strong, the data are not linear in the
+contrast: V² is (D² + 2cD·Re E + c²|E|²)/(1 + c)², and the phase of a triangle turns by
+up to π. Here χ² is that of the model itself at a ladder of contrasts, at every position of a
+lattice that is coarser than the template bank's: a local fit from the best of them finds
+its top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from amibayes.companion_search.grid import Grid
+from amibayes.companion_search.phasors import WIDTH, LatticePhasors
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.units import FloatArray, IntArray
+
+LADDER = (0.05, 0.12, 0.25, 0.5, 0.8)
+"""Contrasts at which χ² is evaluated, in steps small enough for a local fit to close them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExactMap:
+    """Least χ² over the ladder at every position of a lattice.
+
+    Parameters
+    ----------
+    grid : Grid
+    chi2 : (n_contrasts, n_positions) float array
+    contrasts : (n_contrasts,) float array
+    """
+
+    grid: Grid
+    chi2: FloatArray
+    contrasts: FloatArray
+
+    @property
+    def best(self) -> FloatArray:
+        """Contrast of the least χ², (n_positions,)."""
+        return np.asarray(self.contrasts[self.chi2.argmin(axis=0)])
+
+    @property
+    def gain(self) -> FloatArray:
+        """By how much χ² is below the largest least one, (n_positions,)."""
+        least = self.chi2.min(axis=0)
+        return np.asarray(least.max() - least)
+
+
+def exact_map(
+    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...] = LADDER
+) -> ExactMap:
+    """Evaluate χ² of companions at rest, alike in every band, over a lattice.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Its free discs and colours of companions are those of a point.
+    grid : Grid
+    nuisance : (n_nuisance,) float array
+    contrasts : tuple of float
+    """
+    chi2 = np.empty((len(contrasts), len(grid)))
+    for index, values in _pieces(likelihood, grid, nuisance, contrasts):
+        chi2[:, index] = values
+    return ExactMap(grid, chi2, np.array(contrasts))
+
+
+def _pieces(
+    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...]
+) -> Iterator[tuple[IntArray, list[FloatArray]]]:
+    """Yield positions and their χ² at every contrast."""
+    if likelihood.samples.off_axis is not None:
+        yield from _by_model(likelihood, grid, nuisance, contrasts)
+        return
+    response = likelihood.model.linear_response(likelihood.samples, nuisance)
+    scale, star = response.scale[:, None], response.star[:, None]
+    wave = scale * response.disc[:, None]
+    for index, cosine, sine in lattice_waves(likelihood, grid):
+        for where, sign in ((index, -1.0), (index + len(grid) // 2, 1.0)):
+            fringes = np.empty(cosine.shape, dtype=complex)
+            fringes.real, fringes.imag = wave * cosine, sign * wave * sine
+            # Light and flux in units of the star's and the background's: V₀ + cD·E and 1 + c.
+            seen = ((star + c * fringes) / (1.0 + c * scale) for c in contrasts)
+            yield where, [likelihood.chi2_of(np.asarray(v)) for v in seen]
+
+
+def _by_model(
+    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...]
+) -> Iterator[tuple[IntArray, list[FloatArray]]]:
+    """Yield the same from the model itself, which knows the response off the axis."""
+    rest = np.broadcast_to(nuisance, (len(grid), len(nuisance)))
+    places = np.column_stack([grid.east_mas, grid.north_mas, np.ones(len(grid))])
+    for index in np.array_split(np.arange(len(grid)), 1 + len(grid) // WIDTH):
+        three = [places[index] * [1.0, 1.0, c] for c in contrasts]
+        sets = [np.hstack([likelihood.model.at_rest(x), rest[index]]) for x in three]
+        yield index, [likelihood.chi2(theta) for theta in sets]
+
+
+def lattice_waves(
+    likelihood: Likelihood, grid: Grid
+) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    """Yield positions (m,) of one half plane with cosine and sine of a point's fringes."""
+    half, n = len(grid) // 2, grid.half_width
+    axis = np.linspace(-n, n, 2 * n + 1) * grid.step_mas
+    waves = LatticePhasors(likelihood.samples, axis, likelihood.model.smearing)
+    columns, rows = grid.columns[:half] + n, grid.rows[:half] + n
+    breaks = (np.diff(rows) != 0) | (np.diff(columns) != 1) | (columns[1:] % WIDTH == 0)
+    for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
+        span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
+        cosine, sine = waves(span, int(rows[index[0]]))
+        yield index, cosine, sine

@@ -1,0 +1,144 @@
+"""The field of a search: what the data can see, and whether something stands outside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from amibayes.companion_search.grid import Grid, make_grid
+from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.seeds import MODE_LIMIT
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.units import MAS, FloatArray
+
+SURELY_NOT_NOISE = 30.0
+"""Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
+
+MAX_LOOKED_AT = 40_000
+"""Positions of the look around the field."""
+
+MAX_WORK = 60_000_000
+"""Positions times points of the (u, v) plane of the look outside: a few seconds."""
+
+COARSE_STEPS_PER_FRINGE = 4
+"""Positions per λ/B_max of the look outside: half of the search's, which costs 20 % of a peak."""
+
+MARGIN = 1.2
+"""A field is widened to so many times the separation of what stands outside it."""
+
+NOTABLY_BETTER = 0.1
+"""Part of χ²'s gain by which a coarse look outside must exceed that inside."""
+
+
+def default_separation(likelihood: Likelihood) -> tuple[float, float]:
+    """Range of separations the data can see: λ/2B_max to λ/B_min, mas."""
+    frequency = likelihood.samples.frequency
+    with np.errstate(divide="ignore"):
+        return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
+
+
+def resolution_mas(likelihood: Likelihood) -> float:
+    """λ/B of the longest baseline in wavelengths, mas."""
+    return float(1.0 / likelihood.samples.frequency.max() / MAS)
+
+
+def look_inside(result: SearchResult) -> float | None:
+    """Find where nearer the star than the field a companion would fit as well.
+
+    What was found may then be an alias of that. Only a gain that noise alone does not give
+    counts.
+
+    Returns
+    -------
+    float or None
+        Its separation in mas; None where nothing inside is as good.
+    """
+    nearest = default_separation(result.likelihood)[0]
+    if nearest >= result.grid.inner_mas:
+        return None
+    inner = result.grid.inner_mas
+    step = max(result.grid.step_mas, inner * float(np.sqrt(np.pi / MAX_LOOKED_AT)))
+    within = make_grid(nearest, inner, step)
+    if not len(within):
+        return None
+    gain, place = _best_on(within, result)
+    # A peak falls between the positions of either grid, which costs it up to 5 %.
+    as_good = 0.95 * float(result.bank_gain.max()) - MODE_LIMIT
+    return place if gain >= max(as_good, SURELY_NOT_NOISE) else None
+
+
+def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
+    """Largest gain in χ² at the positions of a grid, and the separation where it is, mas."""
+    likelihood = result.likelihood
+    # A moving companion is looked for at rest there: a first look has no time for more.
+    still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0))
+    bank = TemplateBank(still, grid, result.single_theta)
+    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
+    gain = bank.survey(residuals).gain
+    best = int(gain.argmax())
+    return float(gain[best]), float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
+
+
+def resolves_stars(likelihood: Likelihood) -> bool:
+    """Whether V² would notice a disc of 0.3 mas: by 1 % at the longest baseline, (πθB/λ)²/4."""
+    z = np.pi * 0.3 * MAS * likelihood.samples.frequency.max()
+    return likelihood.observables.n_vis2 > 0 and bool(z * z / 4.0 > 0.01)
+
+
+def outermost(likelihood: Likelihood) -> float:
+    """Separation, mas, at which the narrowest channel smears a companion out: R·λ/B_max."""
+    data = likelihood.observables
+    widths = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase) if len(m)]
+    return resolution_mas(likelihood) / max(float(np.concatenate(widths).min()), 1e-6)
+
+
+def choose_field(likelihood: Likelihood) -> tuple[tuple[float, float], float | None]:
+    """Choose the range of separations where none is asked for.
+
+    `default_separation`, unless a coarse look as far as the channels allow, within
+    `MAX_WORK`, shows something notably better outside: that is inside then. The look comes
+    before any noise is fitted to what a star alone leaves, which would hide a companion.
+
+    Returns
+    -------
+    (inner, outer) : tuple of float
+        mas.
+    place : float or None
+        Separation of what was found outside the default field.
+    """
+    inner, outer = default_separation(likelihood)
+    fringe = resolution_mas(likelihood)
+    if not np.isfinite([inner, outer]).all():
+        return (inner, outer), None
+    step = fringe / COARSE_STEPS_PER_FRINGE
+    affordable = step * float(np.sqrt(MAX_WORK / max(len(likelihood.samples), 1) / np.pi))
+    farthest = min(outermost(likelihood), affordable)
+    if farthest <= outer or likelihood.n_independent <= len(likelihood.parameters):
+        return (inner, outer), None
+    # A moving companion is looked for at rest, alike in all bands: a first look.
+    still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0, bands=()))
+    single = fit_single(still)[0]
+    within = _gains(still, make_grid(inner, outer, step), single)
+    grid = make_grid(outer, farthest, step)
+    beyond = _gains(still, grid, single)
+    if not len(beyond) or not len(within):
+        return (inner, outer), None
+    best = int(beyond.argmax())
+    left = single_likelihood(still).chi2(single[None])[0] - beyond[best]
+    # Errors that are too small make the gains of noise too large in proportion.
+    least = MODE_LIMIT * max(left / likelihood.n_independent, 1.0)
+    if beyond[best] < within.max() + max(least, NOTABLY_BETTER * within.max()):
+        return (inner, outer), None
+    place = float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
+    return (inner, MARGIN * place), place
+
+
+def _gains(likelihood: Likelihood, grid: Grid, single: FloatArray) -> FloatArray:
+    """Gain in χ² of a faint companion at every position of a grid, (n,)."""
+    if not len(grid):
+        return np.empty(0)
+    left = single_likelihood(likelihood).residuals(single)[:, 0]
+    return TemplateBank(likelihood, grid, single).survey(left).gain

@@ -1,0 +1,185 @@
+"""Where local fits begin: peaks of the linear map, and of the exact one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from amibayes.calibration.binning import bin_channels
+from amibayes.companion_search.exact_map import LADDER, exact_map
+from amibayes.companion_search.grid import Grid, make_grid
+from amibayes.companion_search.optimise import refine, starting_points, with_large_discs
+from amibayes.companion_search.result import Mode
+from amibayes.companion_search.scan import ScanResult
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.parameters import Box
+from amibayes.units import FloatArray, IntArray
+
+MIN_SEEDS, MAX_SEEDS = 5, 24
+"""How many peaks of the linear map are refined."""
+
+MODE_LIMIT = 25.0
+"""Δχ² within which modes are kept beside the best one: five standard deviations."""
+
+NOT_FAINT = 0.05
+"""Contrast above which the templates rank positions wrongly: c² is some of c·σ then."""
+
+STRONG = 100.0
+"""Δχ² above which c² counts even for faint companions, and a poor map may hide the best."""
+
+BRIGHT_STEPS_PER_FRINGE = 5
+"""Positions of the exact map per λ/B_max: from half of a step away a local fit arrives."""
+
+PEAKS_PER_CONTRAST, MAX_BRIGHT_SEEDS = 8, 12
+"""Peaks of the exact map that are fitted: at each contrast, and in all for each star."""
+
+TRIAL_DISCS = (0.0, 0.35, 0.7)
+"""Diameters of the star, in units of λ/B_max, at which the exact map is made where it is free;
+from halfway between them a local fit arrives."""
+
+MAX_COARSE_DATA = 2000
+"""Data above which local fits begin with channels averaged."""
+
+ROUGHNESS = 0.1
+"""Part of the best gain by which rough fits may stand in another order than complete ones."""
+
+
+def linear_seeds(
+    likelihood: Likelihood, grid: Grid, survey: ScanResult, single: FloatArray, box: Box
+) -> FloatArray:
+    """Peaks of the linear map as starting points, (n, n_dim)."""
+    at = peaks(grid, survey.gain, box.fringe_mas)
+    places = np.column_stack([grid.east_mas[at], grid.north_mas[at]])
+    return starting_points(likelihood, places, survey.bounded(at), single, box)
+
+
+def may_be_bright(survey: ScanResult, at: IntArray) -> bool:
+    """Whether what the linear map shows at its peaks may be a companion it cannot rank."""
+    bright = survey.contrasts[at].max(initial=0.0) > NOT_FAINT
+    return bool(bright or survey.gain.max(initial=0.0) > STRONG)
+
+
+def trial_stars(likelihood: Likelihood, single: FloatArray, box: Box) -> list[FloatArray]:
+    """Nuisance parameters at which the exact map is made: of the star alone, and other discs.
+
+    Where the companion is bright and the star's disc free, the star alone is of no use: its
+    disc takes the place of the companion.
+    """
+    found, names = [single], likelihood.parameters.names
+    if "diameter_mas" in names:
+        k = list(likelihood.parameters.nuisance).index(names.index("diameter_mas"))
+        for size in TRIAL_DISCS:
+            found.append(single.copy())
+            found[-1][k] = size * box.fringe_mas
+    return found
+
+
+def bright_seeds(likelihood: Likelihood, nuisance: FloatArray, box: Box) -> FloatArray:
+    """Peaks of the exact map at each of its contrasts, (n, n_dim), each place once."""
+    grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas / BRIGHT_STEPS_PER_FRINGE)
+    found = exact_map(likelihood, grid, nuisance)
+    tops: list[tuple[float, int, float]] = []
+    for chi2, contrast in zip(found.chi2, LADDER, strict=True):
+        gain = chi2.max(initial=0.0) - chi2
+        at = peaks(grid, gain, box.fringe_mas, PEAKS_PER_CONTRAST, PEAKS_PER_CONTRAST)
+        tops += [(float(chi2[i]), int(i), contrast) for i in at]
+    kept: list[tuple[int, float]] = []
+    for _, i, contrast in sorted(tops):
+        away = [
+            np.hypot(grid.columns[i] - grid.columns[j], grid.rows[i] - grid.rows[j])
+            for j, _ in kept
+        ]
+        if not away or min(away) * grid.step_mas > 0.25 * box.fringe_mas:
+            kept.append((i, contrast))
+    kept = kept[:MAX_BRIGHT_SEEDS]
+    index = np.array([i for i, _ in kept], dtype=np.intp)
+    bright = np.array([c for _, c in kept])
+    places = np.column_stack([grid.east_mas[index], grid.north_mas[index]])
+    three = np.column_stack([places, bright])
+    parameters, alike = likelihood.parameters, likelihood.model.at_rest(three)
+    tail = alike[:, np.concatenate([parameters.contrasts, parameters.rates])]
+    return starting_points(likelihood, places, tail, nuisance, box)
+
+
+def refine_all(
+    likelihood: Likelihood, seeds: FloatArray, box: Box, deviance_single: float
+) -> list[Mode]:
+    """Local fits from seeds (n, n_dim): all of them roughly, the best to the end.
+
+    Large data are fitted roughly with their channels averaged.
+    """
+    if not len(seeds):
+        return []
+    coarse = coarse_likelihood(likelihood, box)
+    base = float(coarse.deviance(coarse.chi2(_without(coarse, seeds[:1])))[0])
+    tried = [refine(coarse, seed, box, base, rough=True) for seed in seeds]
+    starts = np.array([m.theta for m in _best_distinct(tried, box.fringe_mas)])
+    large = with_large_discs(likelihood, starts[:MIN_SEEDS], box)
+    return [refine(likelihood, s, box, deviance_single) for s in np.vstack([starts, large])]
+
+
+def _without(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Parameter sets (n, n_dim) whose companions have no light."""
+    dark = theta.copy()
+    dark[:, likelihood.parameters.contrasts] = 0.0
+    return dark
+
+
+def _best_distinct(modes: Sequence[Mode], fringe_mas: float) -> list[Mode]:
+    """Modes that a complete fit may make the best, or one worth reporting, each place once."""
+    kept: list[Mode] = []
+    for mode in sorted(modes, key=lambda m: -m.delta_chi2):
+        best = max([mode, *kept[:1]], key=lambda m: m.delta_chi2).delta_chi2
+        far = mode.delta_chi2 < best - max(2.0 * MODE_LIMIT, ROUGHNESS * best)
+        if len(kept) >= MIN_SEEDS and (far or len(kept) == MAX_SEEDS):
+            break
+        near = [np.hypot(*np.subtract(mode.place, k.place)) < 0.1 * fringe_mas for k in kept]
+        if not any(near):
+            kept.append(mode)
+    return kept
+
+
+def coarse_likelihood(likelihood: Likelihood, box: Box) -> Likelihood:
+    """The likelihood with channels averaged, where data are many and a companion allows it.
+
+    Averages are narrow enough that a companion at the edge of the field is not smeared.
+    """
+    data = likelihood.observables
+    size = int(np.ceil(likelihood.n_independent / MAX_COARSE_DATA))
+    widths = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase) if len(m)]
+    widest = max(float(np.max(w)) for w in widths)
+    size = min(size, int(0.7 * box.fringe_mas / box.outer_mas / max(widest, 1e-9)))
+    if size < 2 or data.freedom is not None:
+        return likelihood
+    return Likelihood(bin_channels(data, size), likelihood.model)
+
+
+def peaks(
+    grid: Grid,
+    gain: FloatArray,
+    fringe_mas: float,
+    least: int = MIN_SEEDS,
+    most: int = MAX_SEEDS,
+) -> IntArray:
+    """Positions of the highest distinct local maxima of a map, best first.
+
+    At least ``least`` (if there are as many), further ones while within `MODE_LIMIT` of the
+    best, at most ``most``.
+    """
+    image = grid.image(gain)
+    lowest = np.where(np.isnan(image), -np.inf, image)
+    top = (lowest == maximum_filter(lowest, size=3, mode="constant", cval=-np.inf)) & (lowest > 0)
+    on_grid = top[grid.rows + grid.half_width, grid.columns + grid.half_width]
+    candidates = np.flatnonzero(on_grid)
+    candidates = candidates[np.argsort(-gain[candidates], kind="stable")]
+    chosen: list[int] = []
+    for i in candidates:
+        enough = len(chosen) >= least and gain[i] < gain[candidates[0]] - MODE_LIMIT
+        if enough or len(chosen) == most:
+            break
+        away = np.hypot(grid.columns[chosen] - grid.columns[i], grid.rows[chosen] - grid.rows[i])
+        if not (away * grid.step_mas < 0.5 * fringe_mas).any():
+            chosen.append(int(i))
+    return np.array(chosen, dtype=np.intp)
