@@ -241,6 +241,11 @@ def pair_of_numbers(text: str) -> tuple[float, float]:
     return first, second
 
 
+def systematics(text: str) -> str | tuple[float, float]:
+    """Parse ``table``, ``none`` or ``VIS2,DEG``."""
+    return text if text in ("table", "none") else pair_of_numbers(text)
+
+
 def configure_logging(arguments: argparse.Namespace) -> None:
     """Send the program's log and the libraries' warnings where they belong: standard error."""
     level = logging.DEBUG if arguments.verbose else logging.WARNING

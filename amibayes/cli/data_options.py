@@ -259,6 +259,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "extra_noise": arguments.extra_noise,
         "channel_noise": arguments.channel_noise,
         "noise_prior": arguments.noise_prior,
+        "systematics": arguments.systematics,
         "robust": arguments.robust,
         "file_noise": arguments.file_noise,
         "seed": arguments.seed,
@@ -307,6 +308,14 @@ def add_data(group: argparse._ActionsContainer) -> None:
         metavar="VIS2,DEG",
         help="widths of the prior of extra noise, of V² as a share of it and of closure phases; "
         "three times as much is the most (default: 0.05,3)",
+    )
+    group.add_argument(
+        "--systematics",
+        type=common.systematics,
+        default="table",
+        metavar="VIS2,DEG|table|none",
+        help="floor of calibration errors that channels of an exposure share: of a table by "
+        "instrument, for files of fewer than 10 exposures (default), or share of V² and degrees",
     )
     add_insname(group)
     group.add_argument(

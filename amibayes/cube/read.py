@@ -162,14 +162,28 @@ def _science(hdus: Any, source: str) -> Any:
         raise DataError("holds no image", source=source)
     hdu = images[0]
     if len(hdu.shape) > 3:
-        raise DataError(
-            f"holds {len(hdu.shape)}-dimensional data (ramps?), not images",
-            source=source,
-            remedy="give the slope images of each integration (calints)",
-        )
+        raise _ramps(hdus, hdu, source)
     if len(hdu.shape) < 2 or 0 in hdu.shape:
         raise DataError(f"its image has the shape {hdu.shape}", source=source)
     return hdu
+
+
+def _ramps(hdus: Any, hdu: Any, source: str) -> DataError:
+    """Describe a file of ramps: raw ones by the step that comes next."""
+    names = {h.name for h in hdus}
+    # The detector counts in whole numbers; every later step makes floating-point ones.
+    raw = len(hdu.shape) == 4 and hdu.header["BITPIX"] > 0 and "GROUPDQ" not in names
+    if raw:
+        return DataError(
+            "holds raw ramps (uncal): neither linear nor flagged",
+            source=source,
+            remedy="run jwst's calwebb_detector1 and calwebb_image2, and give its calints",
+        )
+    return DataError(
+        f"holds {len(hdu.shape)}-dimensional data (ramps), not images",
+        source=source,
+        remedy="run jwst's ramp_fit and calwebb_image2, and give the calints",
+    )
 
 
 def _companions(hdus: Any, science: Any, source: str) -> dict[str, Any]:

@@ -362,7 +362,8 @@ def _treatment(
     if stated_errors:
         return KnownErrors()
     groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.common_rows)
-    return FreeScale.measured(groups, bank, observed)
+    least = 1.0 if likelihood.noise.floor else 0.0
+    return FreeScale.measured(groups, bank, observed, least)
 
 
 def _ratio(likelihood: Likelihood, bank: TemplateBank, *, known: bool) -> Ratio:

@@ -8,7 +8,7 @@ data (kinds and files) scatter by its own amount; `StudentScores` bounds every r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
@@ -130,16 +130,30 @@ class FreeScale:
     groups : ScaleGroups
     scale : (n_data,) float array
         Standard deviation of the noise of null sets: as measured in the data.
+    least : float
+        Least variance, in units of the covariance's: 1 where that holds a floor of
+        systematic errors, which the scatter of few data need not show.
     """
 
     groups: ScaleGroups
     scale: FloatArray
+    least: float = 0.0
 
     @classmethod
-    def measured(cls, groups: ScaleGroups, bank: TemplateBank, residuals: FloatArray) -> Self:
+    def measured(
+        cls,
+        groups: ScaleGroups,
+        bank: TemplateBank,
+        residuals: FloatArray,
+        least: float = 0.0,
+    ) -> Self:
         """Measure the scatter of the groups in whitened residuals (n_data,)."""
-        left = bank.project(residuals)[:, None]
-        return cls(groups, np.sqrt(groups.variances(left)[:, 0])[groups.label])
+        variance = np.maximum(groups.variances(bank.project(residuals)[:, None])[:, 0], least)
+        return cls(groups, np.sqrt(variance)[groups.label], least)
+
+    def _total(self, bank: TemplateBank, chi2: FloatArray) -> FloatArray:
+        """χ² of data sets, not below what the least variance makes of their number."""
+        return np.maximum(chi2, self.least * (bank.n_data - bank.n_nuisance))
 
     @property
     def null_rests_on_residuals(self) -> bool:
@@ -152,31 +166,33 @@ class FreeScale:
         The gain is that share of χ² which the weighted data lose.
         """
         if not self.groups.several:
-            return KnownErrors().search(bank, white)
+            found = KnownErrors().search(bank, white)
+            return replace(found, chi2=self._total(bank, found.chi2))
         data = bank.project(white)
         chi2 = (data**2).sum(axis=0)
         rows, weight, total = self._weighted(bank, data)
         own = GroupWeights(self.groups, weight.astype(np.float32))
         gain, position = bank.largest_gain(rows.astype(np.float32), own)
-        return Searched(gain * chi2 / total, position, chi2)
+        return Searched(gain * chi2 / self._total(bank, total), position, chi2)
 
     def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere in weighted χ² of one data set (n_data,), and its weighted χ²."""
         if not self.groups.several:
-            return KnownErrors().field(bank, white)
+            gain, chi2 = KnownErrors().field(bank, white)
+            return gain, float(self._total(bank, np.array(chi2)))
         rows, weight, total = self._weighted(bank, bank.project(white)[:, None])
         gain = np.zeros(len(bank))
         for index, units in bank.by_band():
             match = [rows.T @ unit for unit in units]
             found = weighted_gain(GroupWeights(self.groups, weight), units, match)[0]
             gain[index] = np.maximum(gain[index], found)
-        return gain, float(total[0])
+        return gain, float(self._total(bank, total)[0])
 
     def _weighted(
         self, bank: TemplateBank, data: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Weigh data (n_data, n) by the scatter of their groups: (n_data, n), (n_groups, n), χ²."""
-        weight = 1.0 / self.groups.variances(data)
+        weight = 1.0 / np.maximum(self.groups.variances(data), self.least)
         rows = weight[self.groups.label] * data
         return bank.project(rows), weight, (rows * data).sum(axis=0)
 
@@ -193,7 +209,7 @@ class FreeScale:
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
         """Measure the scatter in other residuals."""
-        return self.measured(self.groups, bank, residuals)
+        return self.measured(self.groups, bank, residuals, self.least)
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places with the groups' own scatter; see `ErrorTreatment`."""

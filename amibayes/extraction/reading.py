@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
+from amibayes.cube.header import orientation_of
 from amibayes.data.joining import SEPARATOR
-from amibayes.data.observables import Observables
-from amibayes.errors import DataError
+from amibayes.data.observables import Observables, Setup
+from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.errors import DataError, UsageError
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.response import pipeline_response
 from amibayes.extraction.visits import visit_maps
+from amibayes.instrument import load_instrument
 from amibayes.oifits import OIFits, observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
@@ -153,7 +157,30 @@ def _is_product(contents: Contents) -> bool:
 def _products(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    return read_products(open_products(paths), **options)
+    return [_with_response(found) for found in read_products(open_products(paths), **options)]
+
+
+def _with_response(found: Observables) -> Observables:
+    """Give what the pipeline's fit lets through of light off the axis, where it can be told."""
+    setups = tuple(replace(s, response=_pipeline_response(s)) for s in found.setups)
+    if all(s.response is None for s in setups):
+        return found
+    note = "light off the axis taken as let through by the pipeline's fit of the fringes"
+    return replace(found, setups=setups, notes=(*found.notes, note))
+
+
+def _pipeline_response(setup: Setup) -> OffAxisResponse | None:
+    header = contents_of(setup.source.split(SEPARATOR)[0]).header
+    if setup.station_xyz_m is None:
+        return None
+    try:
+        instrument = load_instrument(str(header.get("INSTRUME")), str(header.get("FILTER")))
+        orientation = orientation_of(header, setup.source)
+    except (UsageError, DataError):
+        return None
+    side = header.get("SUBSIZE1")
+    size = min(side if isinstance(side, int) else instrument.n_pixels, instrument.n_pixels)
+    return pipeline_response(instrument, size, orientation, setup.station_xyz_m[:, :2])
 
 
 def _is_fitted_image(contents: Contents) -> bool:

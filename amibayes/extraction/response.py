@@ -8,15 +8,19 @@ baseline.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import spline_filter1d
 
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.fourier.sampling import Sampling
+from amibayes.extraction.image_plane import FringeModel, fringe_sampling, weighted_fit
 from amibayes.extraction.view import View
+from amibayes.instrument import Instrument
 from amibayes.scene.orientation import Orientation
-from amibayes.units import ComplexArray, FloatArray
+from amibayes.units import ComplexArray, FloatArray, IntArray
 
 NODES_PER_FRINGE = 2.8
 """Places per fringe of the longest baseline, at least."""
@@ -132,3 +136,54 @@ def _monomials(place: FloatArray) -> FloatArray:
     """Products (n, 15) of powers of x and y, up to degree 4."""
     x, y = place.T
     return np.stack([x ** (d - k) * y**k for d in range(5) for k in range(d + 1)], axis=1)
+
+
+SAME_HOLE = 0.05
+"""Holes of a file and of the instrument are the same within this share of the closest pair."""
+
+
+def pipeline_response(
+    instrument: Instrument, n_pixels: int, orientation: Orientation, stations_m: FloatArray
+) -> OffAxisResponse | None:
+    """Response of a fringe fit with even weights to the pixels of a square, as ami_analyze's.
+
+    The jwst package fits the same model as ``fringes`` does, and its products do not say what
+    that lets through of a companion's light: it is worked out here for a star in the middle.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        With the mask as built.
+    n_pixels : int
+        Side of the images.
+    orientation : Orientation
+    stations_m : (n, 2) array
+        Places of the file's stations on the sky, east and north.
+
+    Returns
+    -------
+    OffAxisResponse or None
+        In the order of the stations; None where these are not the holes of the mask.
+    """
+    holes = orientation.baselines_to_sky(instrument.mask.holes_m)
+    near = SAME_HOLE * instrument.mask.shortest_m
+    # jwst counts a baseline the other way round, which is the mask turned by half a turn.
+    found = [(s, o) for s in (1, -1) if (o := _same_holes(stations_m, s * holes, near)) is not None]
+    if not found:
+        return None
+    (sign, order), size = found[0], slice(0, n_pixels)
+    view = View(instrument, instrument.bandpass.channels(), size, size)
+    basis = view.basis()
+    fit = weighted_fit(FringeModel.of(basis), np.ones(n_pixels**2))
+    sampling = fringe_sampling(view, basis, fit)
+    ours = off_axis_response(star_image(view), sampling, orientation, np.zeros(2), "fringes")
+    coefficients = ours.coefficients[np.ix_(order, order)]
+    return replace(ours, coefficients=coefficients if sign > 0 else coefficients.swapaxes(0, 1))
+
+
+def _same_holes(stations_m: FloatArray, holes_m: FloatArray, near_m: float) -> IntArray | None:
+    """Hole of every station; None where they are others."""
+    apart = np.linalg.norm(stations_m[:, None] - holes_m, axis=2)
+    order = apart.argmin(axis=1)
+    once = len(set(order.tolist())) == len(holes_m) == len(stations_m)
+    return order if once and apart.min(axis=1).max() <= near_m else None

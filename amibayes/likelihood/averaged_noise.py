@@ -202,7 +202,12 @@ def _term(
     blocks = as_blocks(part.covariance)
     noisy = as_blocks(add_noise(part, _amount(typical)).covariance)
     pairs = [(a.index, b.matrix - a.matrix) for a, b in zip(blocks, noisy, strict=True)]
-    extra, covariance = _sparse(pairs, part.covariance.size), noise_with_channels(part, channels)
+    extra, covariance = (
+        _sparse(pairs, part.covariance.size),
+        noise_with_channels(
+            part, channels, [f for f in prior.floors if f.source in {s.source for s in part.setups}]
+        ),
+    )
     whitening, share = _together(covariance.covariance, extra)
     columns = np.flatnonzero(which)
     place = csr_array(

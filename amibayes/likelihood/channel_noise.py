@@ -34,6 +34,7 @@ from amibayes.data.covariance import (
     dense_covariance,
 )
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
 from amibayes.likelihood.noise import GaussianNoise, NoiseModel, noise_of
 from amibayes.units import FloatArray, IntArray
@@ -158,9 +159,12 @@ def _colouring(covariance: Covariance) -> Any:
 
 
 def channel_covariance(
-    base: Covariance, layout: ChannelLayout, shares: Sequence[ChannelShare]
+    base: Covariance,
+    layout: ChannelLayout,
+    shares: Sequence[ChannelShare],
+    floors: Sequence[Systematics] = (),
 ) -> ChannelCovariance:
-    """Correlate the channels of a covariance as the shares of their files say."""
+    """Correlate the channels of a covariance as the shares and floors of their files say."""
     by_file = {s.source: s for s in shares}
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
     for k, name in enumerate(layout.names):
@@ -168,25 +172,40 @@ def channel_covariance(
         for kind, found in ((layout.vis2, share.vis2), (~layout.vis2, share.closure_phase)):
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour
-    return ChannelCovariance(base, layout.turned(common, neighbour))
+    floor = floor_of_rows(layout, floors)
+    return ChannelCovariance(base, layout.turned(common, neighbour, floor))
 
 
-def noise_with_channels(data: Observables, shares: Sequence[ChannelShare]) -> NoiseModel:
+def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:
+    """Floor of every row, (rank,), sorted as the layout."""
+    out = np.zeros(len(layout.order))
+    for floor in floors:
+        here = layout.source == layout.names.index(floor.source)
+        out[here] = np.where(layout.vis2[here], floor.vis2, floor.closure_phase_rad)
+    return out
+
+
+def noise_with_channels(
+    data: Observables, shares: Sequence[ChannelShare], floors: Sequence[Systematics] = ()
+) -> NoiseModel:
     """The noise of unflagged data whose channels share some of it.
 
     A covariance that was estimated from scatter holds what channels share already.
     """
-    if not shares or data.freedom is not None:
+    if not (shares or floors) or data.freedom is not None:
         return noise_of(data)
     layout = channel_layout(data)
-    if not layout.any:
+    if not (layout.any or floors):
         return noise_of(data)
-    covariance = channel_covariance(data.covariance, layout, shares)
-    return GaussianNoise(covariance, rows=covariance.rows)
+    covariance = channel_covariance(data.covariance, layout, shares, floors)
+    return GaussianNoise(covariance, rows=covariance.rows, floor=bool(floors))
 
 
 def correlation_of(
-    layout: ChannelLayout, residual: FloatArray, jacobian: FloatArray
+    layout: ChannelLayout,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    floors: Sequence[Systematics] = (),
 ) -> Correlation:
     """Find ρ and φ by restricted likelihood under a uniform prior: their posterior means.
 
@@ -198,6 +217,8 @@ def correlation_of(
         Of a fit, whitened by independent channels.
     jacobian : (rank, n_dim) float array
         Of its parameters, likewise: they take their share of what is common.
+    floors : sequence of Systematics
+        What is common for certain.
 
     Notes
     -----
@@ -208,7 +229,8 @@ def correlation_of(
     if not layout.any:
         return Correlation()
     both = np.column_stack([residual, jacobian])[layout.order]
-    loss = np.array([_losses(layout, both, phi) for phi in NEIGHBOUR])
+    further = (floor_of_rows(layout, floors) * layout.unit) ** 2
+    loss = np.array([_losses(layout, both, further, phi) for phi in NEIGHBOUR])
     mass = np.exp(-0.5 * (loss - loss.min())) * _widths(NEIGHBOUR)[:, None]
     mass /= mass.sum()
     value = COMMON + (1.0 - COMMON) * NEIGHBOUR[:, None]
@@ -224,7 +246,7 @@ def _widths(nodes: FloatArray) -> FloatArray:
     return np.diff(edges)
 
 
-def _losses(layout: ChannelLayout, both: FloatArray, phi: float) -> FloatArray:
+def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: float) -> FloatArray:
     """−2 ln of the restricted likelihood at every node of ρ, the scale of errors at its best.
 
     ``both`` (rank, 1 + n_dim) has residual and slopes, sorted as the layout.
@@ -235,7 +257,10 @@ def _losses(layout: ChannelLayout, both: FloatArray, phi: float) -> FloatArray:
     length = layout.sums(weight**2)
     along = layout.sums(steps * weight[:, None]) / np.sqrt(length)[:, None]
     several = layout.count > 1
-    alone = steps[~several[layout.group]]
+    single_row = ~several[layout.group]
+    alone = steps[single_row] / np.sqrt(1.0 + further[single_row])[:, None]
+    # Half of the floor is a slope; the fit of ρ and φ leaves that out.
+    sure = 0.5 * further[layout.starts][several]
     along, length = along[several], length[several]
     whole = steps[several[layout.group]]
     rest, single = whole.T @ whole - along.T @ along, alone.T @ alone
@@ -244,7 +269,7 @@ def _losses(layout: ChannelLayout, both: FloatArray, phi: float) -> FloatArray:
     log_step = float(np.log1p(-(back**2)).sum())
     found = []
     for rho in COMMON:
-        variance = 1.0 - rho + rho * length
+        variance = 1.0 - rho + (rho + sure) * length
         product = rest / (1.0 - rho) + single + (along / variance[:, None]).T @ along
         chi2, n_fitted, information = _fitted(product)
         count = len(both) - n_fitted

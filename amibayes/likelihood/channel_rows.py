@@ -32,6 +32,8 @@ class ChannelLayout:
         Channels since the one before in its group; infinite for the first one.
     weight : (rank,) float array
         Shape of the common error in units of the errors, of unit mean square in each group.
+    unit : (rank,) float array
+        Root mean square of that shape in its group, before: V² (or a radian) in errors.
     vis2 : (rank,) bool array
         Rows of V².
     source : (rank,) int array
@@ -43,6 +45,7 @@ class ChannelLayout:
     group: IntArray
     gap: FloatArray
     weight: FloatArray
+    unit: FloatArray
     vis2: BoolArray
     source: IntArray
     names: tuple[str, ...]
@@ -84,15 +87,19 @@ class ChannelLayout:
                 self.starts, 0.0, np.power(neighbour, np.where(self.starts, 1, self.gap))
             )
 
-    def turned(self, common: FloatArray, neighbour: FloatArray) -> ChannelRows:
-        """Rows for shares ρ and correlations φ (rank,), sorted as all else here."""
+    def turned(self, common: FloatArray, neighbour: FloatArray, floor: FloatArray) -> ChannelRows:
+        """Rows for shares ρ, correlations φ and further common errors (rank,), sorted likewise.
+
+        The last are relative for V², in radians for closure phases.
+        """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
-        variance = np.ones(n)
+        variance, further = np.ones(n), (floor * self.unit) ** 2
         parts: list[tuple[IntArray, IntArray, FloatArray]] = []
         for first, last in pairwise(cuts):
             if last == first + 1:
                 parts.append((np.array([first]), np.array([first]), np.ones(1)))
+                variance[first] += further[first]
                 continue
             row, column, value = haar(self.weight[first:last])
             parts.append((row + first, column + first, value))
@@ -100,8 +107,12 @@ class ChannelLayout:
             # Differences of neighbours are never trusted more than independent channels are:
             # what makes neighbours alike (overlap on the detector) blurs the signal there too.
             rest = np.maximum(variance_of(row, value, phi), 1.0)
-            variance[first:last] = (1.0 - rho) * rest
+            rest = (1.0 - rho) * rest
+            # A floor says that exposures are too few to tell: no errors then shrink by a fit.
+            variance[first:last] = np.maximum(rest, 1.0) if floor[first] > 0.0 else rest
             variance[first] += rho * (last - first)
+            smooth = smooth_in(row, column, value, self.weight[first:last])
+            variance[first:last] += further[first] * smooth
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
         sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
@@ -150,6 +161,19 @@ def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
         before[step:] += np.where(same, power * before[:-step], 0.0)
         step, power = 2 * step, power**2
     return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
+
+
+def smooth_in(row: IntArray, column: IntArray, value: FloatArray, weight: FloatArray) -> FloatArray:
+    """Variance in each row of an error that is smooth over the channels, of unit mean square.
+
+    Half of it is common to all channels, half a slope across them: calibrations err in either
+    way. Rows are taken as independent, which counts a slope's share in each.
+    """
+    across = np.linspace(-1.0, 1.0, len(weight))
+    across /= np.sqrt(np.mean(across**2))
+    offset = np.bincount(row, value * weight[column])
+    slope = np.bincount(row, value * (weight * across)[column])
+    return np.asarray(0.5 * (offset**2 + slope**2))
 
 
 def haar(weight: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
@@ -212,6 +236,7 @@ def channel_layout(data: Observables) -> ChannelLayout:
         group,
         gap,
         weight / np.sqrt(mean[group]),
+        np.sqrt(mean[group]),
         (first < data.n_vis2)[order],
         of_setup[setup][order],
         names,

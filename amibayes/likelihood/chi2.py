@@ -9,6 +9,8 @@ from scipy.special import gammaincc, gammaln, ndtri_exp
 
 from amibayes.units import FloatArray
 
+LOG_TWO_PI = float(np.log(2.0 * np.pi))
+
 CONTINUED_FRACTION_TERMS = 500
 
 
@@ -61,3 +63,24 @@ def candid_n_sigma(chi2_single: ArrayLike, chi2_binary: ArrayLike, dof: float) -
     ratio = dof * np.asarray(chi2_single) / np.maximum(chi2_binary, 1e-300)
     log_p = log_chi2_survival(ratio, dof)
     return np.asarray(np.maximum(0.0, -ndtri_exp(log_p - np.log(2.0))))
+
+
+def log_peak(n: int, degrees: float) -> float:
+    """Logarithm of the density of n data of unit covariance where they have no residuals."""
+    gaussian = -0.5 * n * LOG_TWO_PI
+    if not np.isfinite(degrees):
+        return gaussian
+    half = 0.5 * degrees
+    ratio = gammaln(half + 0.5 * n) - gammaln(half) - 0.5 * n * np.log(half - 1.0)
+    return float(gaussian + ratio)
+
+
+def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
+    """−2 ln L of χ² (any shape) of n data, 0 without residuals.
+
+    χ² where the data are Gaussian, (ν + n) ln[1 + χ²/(ν − 2)] where they follow a t
+    distribution of ν ``degrees`` of freedom.
+    """
+    if not np.isfinite(degrees):
+        return chi2
+    return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))

@@ -24,6 +24,7 @@ from amibayes.data.covariance import (
 )
 from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_noise import ChannelShare, noise_with_channels
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
@@ -61,18 +62,31 @@ class NoisePrior:
         Likewise of closure phases.
     channels : bool
         Whether channels of an exposure may share some of their noise.
+    floors : tuple of Systematics
+        Calibration errors of files, which no fit of the noise goes below.
     """
 
     vis2: float = VIS2_PRIOR
     closure_phase_rad: float = CLOSURE_PRIOR_RAD
     channels: bool = True
+    floors: tuple[Systematics, ...] = ()
 
     def width(self, data: Observables, kind: str) -> float:
-        """Width of the prior of one kind, in the unit of the data."""
-        if kind == "closure_phase_rad":
-            return self.closure_phase_rad
+        """Width of the prior of one kind, in the unit of the data.
+
+        Not below the typical stated error: near a null of V² errors are no share of it, and
+        as much again is plausible of any.
+        """
+        if self.vis2 == 0.0 == self.closure_phase_rad:
+            return 0.0
+        n = data.n_vis2
+        vis2 = kind == "vis2"
+        variance = data.covariance.variance[:n] if vis2 else data.covariance.variance[n:]
+        typical = float(np.sqrt(np.median(variance))) if len(variance) else 0.0
+        if not vis2:
+            return max(self.closure_phase_rad, typical)
         value = data.vis2.value[~data.vis2.flag]
-        return self.vis2 * float(np.sqrt(np.mean(value**2))) if len(value) else self.vis2
+        return max(self.vis2 * float(np.sqrt(np.mean(value**2))) if len(value) else 0.0, typical)
 
 
 @dataclass(frozen=True)
@@ -100,12 +114,15 @@ class ExtraNoise:
     channels : tuple of ChannelShare
         What the channels of an exposure share of the whole variance, for every file where
         files are told apart; empty where channels are independent.
+    floors : tuple of Systematics
+        Calibration errors that were taken for certain.
     """
 
     vis2: float = 0.0
     closure_phase_rad: float = 0.0
     files: tuple[FileNoise, ...] = ()
     channels: tuple[ChannelShare, ...] = ()
+    floors: tuple[Systematics, ...] = ()
 
     @property
     def any(self) -> bool:
@@ -153,7 +170,9 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
 def with_noise(likelihood: Likelihood, extra: ExtraNoise) -> Likelihood:
     """Add extra noise, and what channels share, to a likelihood with the stated errors."""
     data = add_noise(likelihood.observables, extra)
-    return Likelihood(data, likelihood.model, noise_with_channels(data, extra.channels))
+    return Likelihood(
+        data, likelihood.model, noise_with_channels(data, extra.channels, extra.floors)
+    )
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:

@@ -15,15 +15,13 @@ from typing import Any, Protocol
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.special import gammaln
 
 from amibayes.data.covariance import Covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelRows
+from amibayes.likelihood.chi2 import deviance, log_peak
 from amibayes.units import BoolArray, FloatArray
-
-LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 MAX_EXPONENT = 50.0
 """Gains in ln L are cut where their Δχ² would overflow; nothing is decided so far out."""
@@ -60,6 +58,11 @@ class NoiseModel(Protocol):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the unknown amounts that `log_prob` averages over."""
+        ...
+
+    @property
+    def floor(self) -> bool:
+        """Whether the errors hold a floor: they are not smaller, whatever residuals are."""
         ...
 
     @property
@@ -121,27 +124,6 @@ class NoiseModel(Protocol):
         ...
 
 
-def log_peak(n: int, degrees: float) -> float:
-    """Logarithm of the density of n data of unit covariance where they have no residuals."""
-    gaussian = -0.5 * n * LOG_TWO_PI
-    if not np.isfinite(degrees):
-        return gaussian
-    half = 0.5 * degrees
-    ratio = gammaln(half + 0.5 * n) - gammaln(half) - 0.5 * n * np.log(half - 1.0)
-    return float(gaussian + ratio)
-
-
-def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
-    """−2 ln L of χ² (any shape) of n data, 0 without residuals.
-
-    χ² where the data are Gaussian, (ν + n) ln[1 + χ²/(ν − 2)] where they follow a t
-    distribution of ν ``degrees`` of freedom.
-    """
-    if not np.isfinite(degrees):
-        return chi2
-    return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))
-
-
 @dataclass(frozen=True, eq=False)
 class GaussianNoise:
     """Gaussian noise of known covariance.
@@ -153,12 +135,15 @@ class GaussianNoise:
         None: they belong to an `EstimatedNoise`.
     rows : ChannelRows, optional
         How whitened data are turned where channels of an exposure share some noise.
+    floor : bool
+        The errors hold a floor that residuals of few data need not show: they are not smaller.
     """
 
     covariance: Covariance
     freedom: Freedom | None = None
     scatter: csr_array | None = None
     rows: ChannelRows | None = None
+    floor: bool = False
 
     @property
     def common_rows(self) -> BoolArray | None:
@@ -305,6 +290,11 @@ class FittedNoise:
     def scatter(self) -> csr_array | None:
         """That of the fit."""
         return self.fit.scatter
+
+    @property
+    def floor(self) -> bool:
+        """That of the fit."""
+        return self.fit.floor
 
     @property
     def common_rows(self) -> BoolArray | None:

@@ -10,6 +10,7 @@ from scipy import optimize
 
 from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_noise import (
     COMMON,
     ChannelShare,
@@ -74,7 +75,7 @@ def fit_noise(
     else:
         extra = mean_of_files(data, found)
     told = any(np.isfinite([s.vis2.error, s.closure_phase.error]).any() for s in shares)
-    return replace(extra, channels=tuple(shares)) if told else extra
+    return replace(extra, channels=tuple(shares) if told else (), floors=prior.floors)
 
 
 class _Fit:
@@ -93,7 +94,8 @@ class _Fit:
             return amount, shared
         n = self.data.n_vis2
         part = self.data.select(which[:n], which[n:])
-        one = _Kind(part, self.difference[which], self.jacobian[which], self.share, kind)
+        floors = self.prior.floors
+        one = _Kind(part, self.difference[which], self.jacobian[which], self.share, kind, floors)
         for _ in range(ROUNDS):
             before = amount
             if self.prior.channels and self.data.freedom is None:
@@ -113,16 +115,28 @@ class _Kind:
     jacobian: FloatArray
     share: float
     kind: str
+    floors: tuple[Systematics, ...]
 
     def covariance(self, amount: float, shared: Correlation) -> Covariance:
         """With an amount of extra noise, and channels that share some of the noise."""
+        data = self._with(amount)
+        if shared.value == 0.0 and not self.floors:
+            return data.covariance
+        shares = [ChannelShare(shared, shared)]
+        return channel_covariance(data.covariance, self._layout, shares, self._own_floors)
+
+    def _with(self, amount: float) -> Observables:
+        """The data with an amount of extra noise, channels independent."""
+        if amount <= 0.0:
+            return self.data
         extra = (
             ExtraNoise(vis2=amount) if self.kind == "vis2" else ExtraNoise(closure_phase_rad=amount)
         )
-        data = _with_noise(self.data, extra) if amount > 0.0 else self.data
-        if shared.value == 0.0:
-            return data.covariance
-        return channel_covariance(data.covariance, self._layout, [ChannelShare(shared, shared)])
+        return _with_noise(self.data, extra)
+
+    @property
+    def _own_floors(self) -> list[Systematics]:
+        return [f for f in self.floors if f.source in self._layout.names]
 
     @cached_property
     def _layout(self) -> ChannelLayout:
@@ -167,8 +181,9 @@ class _Kind:
 
     def correlation(self, amount: float) -> Correlation:
         """What channels share, given an amount of extra noise."""
-        base = self.covariance(amount, Correlation())
-        return correlation_of(self._layout, base.whiten(self.residual), base.whiten(self.jacobian))
+        base = self._with(amount).covariance
+        white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
+        return correlation_of(self._layout, white, slopes, self._own_floors)
 
 
 def _chi2(covariance: Covariance, residual: FloatArray) -> float:

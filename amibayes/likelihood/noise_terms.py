@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 
 from amibayes.data.covariance import DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
+from amibayes.likelihood.chi2 import deviance, log_peak
 from amibayes.likelihood.extra_noise import BOUND
-from amibayes.likelihood.noise import deviance, log_peak
 from amibayes.units import BoolArray, FloatArray
 
 MAX_INFLATION = 100.0

@@ -10,8 +10,9 @@ from scipy.sparse import csr_array, diags_array
 
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import AveragedNoise, differences_of
+from amibayes.likelihood.chi2 import LOG_TWO_PI
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.noise import LOG_TWO_PI, NoiseModel
+from amibayes.likelihood.noise import NoiseModel
 from amibayes.likelihood.noise_terms import NoiseTerm, kinds_of, with_nodes
 from amibayes.likelihood.residuals import groups_of
 from amibayes.likelihood.student import DEGREES, normal_moments, symmetric_whitening

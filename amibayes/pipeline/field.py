@@ -18,6 +18,7 @@ from amibayes.companion_search.robust import search_robust
 from amibayes.companion_search.search import search
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import systematics_of
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood
@@ -107,16 +108,17 @@ def _searched(
     apart = options.file_noise is not False
     if options.robust:
         return search_robust(likelihood, field, free_scale=options.extra_noise, per_file=apart)
-    if options.extra_noise or options.channel_noise:
-        prior = noise_prior(options)
+    prior = noise_prior(likelihood.observables, options)
+    if options.extra_noise or options.channel_noise or prior.floors:
         return search_with_noise(likelihood, field, per_file=apart, prior=prior)
     return search(likelihood, field), ExtraNoise()
 
 
-def noise_prior(options: SearchOptions) -> NoisePrior:
+def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
     """Prior of extra noise; of width 0 where the stated errors count as right."""
     vis2, degrees = options.noise_prior if options.extra_noise else (0.0, 0.0)
-    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise)
+    floors = systematics_of(observables, options.systematics)
+    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise, floors)
 
 
 def _beyond(result: SearchResult) -> list[str]:

@@ -83,6 +83,9 @@ class SearchOptions:
     noise_prior : (float, float)
         Widths of the half-normal prior of extra noise: of V², relative to it, and of closure
         phases, degrees. It is at most three times as large.
+    systematics : "table", "none" or (float, float)
+        Floor of calibration errors that channels of an exposure share: of a table by
+        instrument, for files of few exposures, or share of V² and degrees of closure phase.
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
     file_noise : bool, optional
@@ -129,6 +132,7 @@ class SearchOptions:
     extra_noise: bool = True
     channel_noise: bool = True
     noise_prior: tuple[float, float] = NOISE_PRIOR
+    systematics: Literal["table", "none"] | tuple[float, float] = "table"
     robust: bool = False
     file_noise: bool | None = None
     posterior: bool = True

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
+from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.limit import DetectionLimit
@@ -39,6 +41,8 @@ class SearchReport:
     evidence: Evidence | None = None
     noise_posterior: dict[str, NoisePosterior] | None = None
     second_significance: Significance | None = None
+    verdict: Verdict | None = None
+    consistency: tuple[Consistency, ...] = ()
     timing_s: dict[str, float] = field(default_factory=dict)
 
 

@@ -12,13 +12,15 @@ from threadpoolctl import threadpool_limits
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
 from amibayes.companion_search.with_extra_noise import noise_averaged
+from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
-from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm
+from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
@@ -84,7 +86,7 @@ def search_companion(
     with threadpool_limits(1):
         ready = prepare(targets, calibrators, options, rng["calibration"], run)
         found = _searched(ready, options, run)
-        tests = _tested(found, options, rng, run)
+        tests = _tested(ready, found, options, rng, run)
         limits = _limits(found, tests, options, rng["limits"], run)
         posterior = _inferred(ready, found, options, rng, run, (chain, resume))
     return replace(
@@ -97,7 +99,7 @@ def search_companion(
 
 def _streams(seed: int) -> Streams:
     """Independent random numbers for every stage that draws some."""
-    stages = ("significance", "posterior", "limits", "calibration", "evidence", "second")
+    stages = ("significance", "posterior", "limits", "calibration", "evidence", "second", "verdict")
     seeds = np.random.SeedSequence(seed).spawn(len(stages))
     return {s: np.random.default_rng(k) for s, k in zip(stages, seeds, strict=True)}
 
@@ -125,9 +127,11 @@ class Tests:
 
     first: Significance | None = None
     second: Significance | None = None
+    verdict: Verdict | None = None
+    splits: tuple[Consistency, ...] = ()
 
 
-def _tested(found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
+def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
     if not options.null_draws:
         return Tests()
     with run.stage("significance"):
@@ -135,13 +139,19 @@ def _tested(found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tes
             found.result, options, rng["significance"], run.executor, run.progress,
             journal=run.journal("null"),
         )  # fmt: skip
-    if found.two is None:
-        return Tests(first)
-    with run.stage("significance of the second"):
-        second = second_false_alarm(
-            found.result, options, rng["second"], run.executor, run.progress
+    second = None
+    if found.two is not None:
+        with run.stage("significance of the second"):
+            second = second_false_alarm(
+                found.result, options, rng["second"], run.executor, run.progress
+            )
+    if first.detected is None:
+        return Tests(first, second)
+    with run.stage("verdict"):
+        statement, splits = verdict_of(
+            found.result, first, ready.observables, options, rng["verdict"], run.executor
         )
-    return Tests(first, second)
+    return Tests(first, second, statement, splits)
 
 
 def _limits(
@@ -187,7 +197,7 @@ def _inferred(
         extra_noise=options.extra_noise,
         per_file=options.file_noise is not False,
         channels=found.noise.channels,
-        prior=noise_prior(options),
+        prior=noise_prior(ready.observables.only(options.observables), options),
     )
     prior, counts = _prior(result, options), _counts(options)
     grid = samples = evidence = None
@@ -241,6 +251,8 @@ def _report(
         noise=found.noise,
         significance=tests.first,
         second_significance=tests.second,
+        verdict=tests.verdict,
+        consistency=tests.splits,
         limits=limits,
         posterior=posterior.samples,
         grid=posterior.grid,

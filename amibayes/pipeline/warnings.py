@@ -111,6 +111,22 @@ def _of_bright(result: SearchResult) -> list[str]:
     ]
 
 
+def _floor_warning(noise: ExtraNoise) -> str:
+    """Name the floors that were taken, once for files alike."""
+    kinds = {(f.vis2, f.closure_phase_rad, f.instrument): f for f in noise.floors}
+    each = [
+        f"{100.0 * f.vis2:.2g} % of V2 and {np.degrees(f.closure_phase_rad):.2g} deg"
+        + (f" ({f.instrument})" if f.instrument else "")
+        for f in kinds.values()
+    ]
+    tabulated = any(f.instrument for f in noise.floors)
+    why = " (too few exposures to tell their own)" if tabulated else ""
+    return (
+        f"calibration errors of {', '.join(each)}, common to the channels of an exposure, are in "
+        f"the covariance{why}: --systematics none leaves them out"
+    )
+
+
 def _noise_warning(noise: ExtraNoise) -> str:
     each = [f for f in noise.files if f.vis2 > 0.0 or f.closure_phase_rad > 0.0]
     if each:
@@ -184,6 +200,8 @@ def search_warnings(
     """Warn of what makes the numbers of a search less than they seem."""
     found = [*result.warnings, *observables.notes, *_joint_warnings(result)]
     found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
+    if noise.floors:
+        found.append(_floor_warning(noise))
     if noise.any:
         found.append(_noise_warning(noise))
     elif result.chi2_binary / result.ndof > 2.0:

@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from amibayes.companion_search.result import Mode
+from amibayes.likelihood.chi2 import LOG_TWO_PI
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.noise import LOG_TWO_PI
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.priors import Prior
 from amibayes.units import FloatArray, IntArray

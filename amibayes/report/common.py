@@ -75,6 +75,20 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
     return found
 
 
+def systematics_json(noise: ExtraNoise) -> list[Json]:
+    """Floors of calibration errors that were taken for certain, file by file."""
+    return [
+        {
+            "path": f.source,
+            "vis2_relative": f.vis2,
+            "closure_phase_deg": float(np.degrees(f.closure_phase_rad)),
+            "instrument": f.instrument or None,
+            "reference": f.reference or None,
+        }
+        for f in noise.floors
+    ]
+
+
 def noise_interval(found: NoisePosterior, unit: float) -> Json:
     """Intervals of the extra noise of one kind of observable."""
     median, lower, upper = (unit * x for x in found.interval(0.68))

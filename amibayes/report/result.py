@@ -26,6 +26,7 @@ from amibayes.report.common import (
     inputs_json,
     noise_interval,
     number,
+    systematics_json,
 )
 from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
 from amibayes.report.limits import limits_json
@@ -53,6 +54,10 @@ def result_json(report: SearchReport, request: str = "") -> Json:
     result = report.result
     return {
         "amibayes": __version__,
+        "verdict": None if report.verdict is None else asdict(report.verdict),
+        "consistency": [
+            asdict(split) | {"parts": list(split.parts)} for split in report.consistency
+        ],
         "seed": report.options.seed,
         "request": request,
         "options": report.options.to_json(),
@@ -86,6 +91,7 @@ def _noise(report: SearchReport) -> Json:
         "extra_vis2": report.noise.vis2,
         "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
         "channel_correlation": channel_correlation_json(report.noise),
+        "systematics": systematics_json(report.noise),
         "posterior": posterior or None,
     }
 

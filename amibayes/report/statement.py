@@ -10,6 +10,20 @@ from amibayes.units import offset
 
 Json = dict[str, Any]
 
+REFUSED = {
+    "model rejected": (
+        "Model rejected",
+        "Neither a star nor a star with a companion explains these data: the numbers of the best "
+        "fit below are those of a wrong model. Images need no model (amibayes export).",
+    ),
+    "inconsistent data": (
+        "Inconsistent data",
+        "Parts of the data contradict each other: analyse them apart before any number of the "
+        "best fit is used.",
+    ),
+}
+"""Label and advice for each verdict that states no best fit."""
+
 LABELS = {True: "Companion detected", False: "No companion detected", None: "No claim is made"}
 
 
@@ -21,11 +35,24 @@ def statement_of(content: Json) -> Statement:
     content : dict
         As `amibayes.report.result_json` gives it.
     """
+    refused = _refused(content)
+    if refused is not None:
+        return refused
     detected = content["significance"]["detected"]
     kind = {True: "found", False: "none", None: "open"}[detected]
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
     sentences = [_chance(content), _others(content), _limits(content), _upper_limit(content)]
     return Statement(kind, LABELS[detected], headline, tuple(s for s in sentences if s))  # type: ignore[arg-type]
+
+
+def _refused(content: Json) -> Statement | None:
+    """The statement where neither a star nor a star with a companion explains the data."""
+    verdict = content.get("verdict")
+    if verdict is None or verdict["statement"] not in REFUSED:
+        return None
+    label, advice = REFUSED[verdict["statement"]]
+    because = f"{verdict['because'][0].upper()}{verdict['because'][1:]}."
+    return Statement("open", label, because, (advice, _chance(content)))
 
 
 def place(content: Json) -> str:

@@ -23,21 +23,16 @@ EVEN = 0.5
 
 def summary(report: SearchReport, folder: Path) -> list[str]:
     """Write the result in at most 20 lines."""
-    result, c = report.result, report.result.companion
+    result = report.result
     used = result.likelihood.observables
     lines = [
         f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
         f"{len(result.grid)} positions",
+        *_statement(report),
         _verdict(report),
-        "best fit    no companion improves the fit"
-        if c.contrast <= 0.0
-        else f"best fit    {c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
-        f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
-        f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)",
-        f"contrast    {c.contrast:.5f} +/- {c.contrast_error:.5f} "
-        f"(delta mag {c.delta_mag:.2f} +/- {c.delta_mag_error:.2f})",
+        *_best_fit(report),
         f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
         f"({result.ndof} dof: reduced {result.chi2_single / result.ndof:.3f} -> "
         f"{result.chi2_binary / result.ndof:.3f})",
@@ -55,6 +50,32 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")
+
+
+def _statement(report: SearchReport) -> list[str]:
+    """The verdict, with its reason."""
+    found = report.verdict
+    return [] if found is None else [row("verdict", f"{found.statement.upper()}: {found.because}")]
+
+
+def _best_fit(report: SearchReport) -> list[str]:
+    """Place and contrast; not those of a model that was rejected."""
+    c, found = report.result.companion, report.verdict
+    if found is not None and found.statement == "model rejected":
+        return [row("best fit", "not stated: the model is rejected (amibayes export, for images)")]
+    contrast = row(
+        "contrast",
+        f"{c.contrast:.5f} +/- {c.contrast_error:.5f} "
+        f"(delta mag {c.delta_mag:.2f} +/- {c.delta_mag_error:.2f})",
+    )
+    if c.contrast <= 0.0:
+        return [row("best fit", "no companion improves the fit"), contrast]
+    place = (
+        f"{c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
+        f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
+        f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)"
+    )
+    return [row("best fit", place), contrast]
 
 
 def _verdict(report: SearchReport) -> str:

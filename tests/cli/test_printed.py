@@ -139,8 +139,20 @@ def test_a_misfit_is_warned_of_where_no_noise_was_added(report: SearchReport) ->
     assert not any(text.startswith("reduced chi2") for text in noisy)
 
 
+def test_a_star_with_two_companions_rejects_the_model_of_one(report: SearchReport) -> None:
+    assert report.verdict is not None
+    assert report.verdict.statement == "model rejected"
+    assert line(report, "verdict").startswith(
+        "verdict     MODEL REJECTED: what the best fit leaves"
+    )
+    assert "not stated" in line(report, "best fit")
+    found = statement_of(json.loads(json.dumps(result_json(report))))
+    assert (found.kind, found.label) == ("open", "Model rejected")
+    assert "amibayes export" in found.sentences[0]
+
+
 def test_other_positions_and_lost_limits_stand_in_the_statement(report: SearchReport) -> None:
-    content = json.loads(json.dumps(result_json(report)))
+    content = json.loads(json.dumps(result_json(replace(report, verdict=None))))
     mode = content["modes"][0]
     content["modes"] = [mode, *({**mode, "probability": 0.1} for _ in range(5))]
     content["limits"] = {"separation_mas": [100.0], "delta_mag": [None]}
@@ -246,7 +258,7 @@ def test_numbers_that_are_none(alone: Path, tmp_path: Path, capsys) -> None:
                 "--separation",
                 "50:99999",
             ),
-            "the baselines tell",
+            "the baselines distinguish",
         ),
     ]:
         assert run(*words, "--out", tmp_path / "out") == 2

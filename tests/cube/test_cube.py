@@ -374,3 +374,8 @@ def test_orientation_is_that_of_the_wcs_and_contradictions_are_named(tmp_path: P
     assert "from ROLL_REF" in other.notes[0]
     assert "VPARITY" in other.notes[1]
     assert other.orientation == same.orientation
+
+
+def test_raw_ramps_are_refused_with_the_step_that_comes_next(data: Path) -> None:
+    with pytest.raises(DataError, match=r"uncal.*calwebb_detector1"):
+        read_cube(data / "cubes" / "niriss_f480m_uncal.fits")

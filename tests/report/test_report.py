@@ -127,8 +127,8 @@ def test_the_answer_stands_in_words(page: Reader, content) -> None:
     said = page.said.replace("\u00a0", " ")
     place = f"A companion at {fit['separation_mas']:.1f} ± {fit['errors']['separation_mas']:.1f}"
     assert place in said
-    assert "Not one of 2\u202f000 data sets simulated without a companion has anything as" in said
-    assert "the chance of this by noise is estimated as 0.0005, and below 0.0018, with 95" in said
+    assert "Not one of 3\u202f000 data sets simulated without a companion has anything as" in said
+    assert "the chance of this by noise is below 0.0012, with 95" in said
     for entry in content["inputs"]:
         assert entry["sha256"] in said
         assert entry["path"] in said

@@ -1,0 +1,230 @@
+"""Whether parts of the data agree on the companion: V² and closure phases, files, epochs.
+
+At the best fit of all data together each part asks for a change of the companion's parameters,
+its own star and background free. What the parts gain in χ² by going their own ways, over going
+one way, is the test; its probability is the share of data sets drawn from the model and its
+noise whose parts go as far apart. To first order in the changes: the same for the data and for
+the draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.with_extra_noise import search_with_noise
+from amibayes.data.observables import Observables
+from amibayes.likelihood.extra_noise import NoisePrior
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.residuals import files_of
+from amibayes.models.binary import BinaryModel
+from amibayes.units import BoolArray, FloatArray
+
+Split = Literal["observables", "files", "epochs", "calibrators"]
+
+EPOCH_GAP_DAYS = 0.5
+"""Data further apart in time are of two nights."""
+
+SIMULATIONS = 4000
+"""Draws: a probability of 0.0013 is then known to 45 %."""
+
+MAX_PARTS = 12
+"""Parts of a split that are compared: each is searched by itself."""
+
+SINGULAR = 1e-10
+"""Directions that a part measures so much worse than its best one it does not measure."""
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """How far the parts of a split go apart.
+
+    Parameters
+    ----------
+    split : {"observables", "files", "epochs", "calibrators"}
+    parts : tuple of str
+    delta_chi2 : float
+        Gain in χ² of the parts apart over the parts together.
+    p : float
+        Share of simulated data sets that go as far apart.
+    """
+
+    split: Split
+    parts: tuple[str, ...]
+    delta_chi2: float
+    p: float
+
+
+def consistency(
+    result: SearchResult,
+    rng: np.random.Generator,
+    *,
+    stated: Observables | None = None,
+    prior: NoisePrior | None = None,
+) -> tuple[Consistency, ...]:
+    """Compare all the parts that the data of a search have.
+
+    Parameters
+    ----------
+    result : SearchResult
+        Its best fit has a companion.
+    rng : numpy.random.Generator
+    stated : Observables, optional
+        The data with their stated errors: each file and each night then has the noise that its
+        own best fit leaves. The noise of a joint fit would hide that they disagree.
+    prior : NoisePrior, optional
+        Of that noise.
+    """
+    whole, theta = result.likelihood, result.theta
+    data = whole.observables
+    files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
+    found = []
+    kinds, nights = _kinds(data), _epochs(data)
+    if len(kinds) > 1:
+        found.append(compare(whole, theta, "observables", kinds, rng))
+    splits: list[tuple[Split, dict[str, BoolArray]]] = [("files", files), ("epochs", nights)]
+    for name, parts in splits:
+        if not 1 < len(parts) <= MAX_PARTS:
+            continue
+        own = [_own_noise(result, mask, stated, prior) for mask in parts.values()]
+        found.append(compare(whole, theta, name, parts, rng, own=own))
+    return tuple(found)
+
+
+def _own_noise(
+    result: SearchResult, mask: BoolArray, stated: Observables | None, prior: NoisePrior | None
+) -> Likelihood:
+    """Likelihood of a part with the noise of its own best fit, if it has data enough for one."""
+    whole = result.likelihood
+    if stated is None:
+        return _selected(whole.observables, whole.model, mask)
+    part = _selected(stated.unflagged(), whole.model, mask)
+    field = result.grid.inner_mas, result.grid.outer_mas
+    if part.n_independent <= len(part.parameters):
+        return part
+    return search_with_noise(part, field, prior=prior)[0].likelihood
+
+
+def _selected(data: Observables, model: BinaryModel, mask: BoolArray) -> Likelihood:
+    return Likelihood(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), model)
+
+
+def _kinds(data: Observables) -> dict[str, BoolArray]:
+    vis2 = np.arange(len(data.data)) < data.n_vis2
+    return {name: mask for name, mask in (("vis2", vis2), ("cp", ~vis2)) if mask.any()}
+
+
+def _epochs(data: Observables) -> dict[str, BoolArray]:
+    """Nights, by their mean date."""
+    mjd = np.concatenate([data.vis2.mjd, data.closure_phase.mjd])
+    if not np.isfinite(mjd).all():
+        return {}
+    order = np.argsort(mjd, kind="stable")
+    night = np.empty(len(mjd), dtype=np.intp)
+    night[order] = np.cumsum(np.diff(mjd[order], prepend=mjd[order[:1]]) > EPOCH_GAP_DAYS)
+    masks = [night == k for k in np.unique(night)]
+    return {f"MJD {mjd[mask].mean():.3f}": mask for mask in masks}
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What one part says of the companion's parameters.
+
+    Parameters
+    ----------
+    mask : (n_data,) bool array
+    rows : (n_independent, n_companion) float array
+        Whitened derivatives by these, what star and background can do taken out.
+    basis : (n_independent, n_nuisance) float array
+        What these can do.
+    likelihood : Likelihood
+    """
+
+    mask: BoolArray
+    rows: FloatArray
+    basis: FloatArray
+    likelihood: Likelihood
+
+    @classmethod
+    def of(cls, part: Likelihood, theta: FloatArray, mask: BoolArray) -> _Part:
+        jacobian, star = part.jacobian(theta), part.parameters.nuisance
+        left, singular, _ = np.linalg.svd(_scaled(jacobian[:, star]), full_matrices=False)
+        basis = left[:, singular > np.sqrt(SINGULAR)] if len(star) else np.empty((len(jacobian), 0))
+        rows = np.delete(jacobian, star, axis=1)
+        return cls(mask, rows - basis @ (basis.T @ rows), basis, part)
+
+    def project(self, residual: FloatArray) -> FloatArray:
+        """Whitened residuals (n_independent, n) of data (n_data, n), star and background out."""
+        white = self.likelihood.noise.whiten(residual[self.mask])
+        return np.asarray(white - self.basis @ (self.basis.T @ white))
+
+
+def _scaled(columns: FloatArray) -> FloatArray:
+    length = np.linalg.norm(columns, axis=0)
+    return np.asarray(columns / np.where(length > 0.0, length, 1.0))
+
+
+def compare(
+    likelihood: Likelihood,
+    theta: FloatArray,
+    split: Split,
+    parts: dict[str, BoolArray],
+    rng: np.random.Generator,
+    simulations: int = SIMULATIONS,
+    own: Sequence[Likelihood] | None = None,
+) -> Consistency:
+    """Compare some parts of the data.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of all data.
+    theta : (n_dim,) float array
+        Its best fit.
+    split : str
+    parts : dict of str to (n_data,) bool array
+    rng : numpy.random.Generator
+    simulations : int
+    own : sequence of Likelihood, optional
+        Of the parts, with noise of their own.
+    """
+    data, model, masks = likelihood.observables, likelihood.model, list(parts.values())
+    each = own or [_selected(data, model, mask) for mask in masks]
+    made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
+    ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
+    noise = likelihood.noise.draw(simulations, rng)
+    for one, mask in zip(own or (), masks, strict=False):
+        noise[mask] = one.noise.draw(simulations, rng)
+    drawn, by_noise = _apart(made, noise)
+    # What a part cannot explain by itself is no excuse for going apart, once its noise is known.
+    above = (by_noise >= gain[0]) if own else (drawn >= ratio[0])
+    p = (1 + int(above.sum())) / (1 + simulations)
+    return Consistency(split, tuple(parts), float(gain[0]), p)
+
+
+def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gain of the parts apart over the rest of χ², and the gain itself, (n,) each.
+
+    The ratio does not depend on the scale of the noise.
+    """
+    white = [part.project(residual) for part in parts]
+    fisher = [part.rows.T @ part.rows for part in parts]
+    slope = [part.rows.T @ w for part, w in zip(parts, white, strict=True)]
+    scale = np.sqrt(np.diag(np.sum(fisher, axis=0)))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    each = [_gain(f, s, scale) for f, s in zip(fisher, slope, strict=True)]
+    together = _gain(np.sum(fisher, axis=0), np.sum(slope, axis=0), scale)
+    gain = np.maximum(np.sum(each, axis=0) - together, 0.0)
+    chi2 = np.sum([(w**2).sum(axis=0) for w in white], axis=0)
+    return np.asarray(gain / np.maximum(chi2 - gain, 1e-300)), np.asarray(gain)
+
+
+def _gain(fisher: FloatArray, slope: FloatArray, scale: FloatArray) -> FloatArray:
+    """Gain in χ² of the best change of the parameters, (n,)."""
+    inverse = np.linalg.pinv(fisher / np.outer(scale, scale), rcond=SINGULAR, hermitian=True)
+    unit = slope / scale[:, None]
+    return np.asarray((unit * (inverse @ unit)).sum(axis=0))

@@ -1,0 +1,116 @@
+"""The verdict of a search: companion, no companion, model rejected, or inconsistent data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from amibayes.companion_search.result import SearchResult
+from amibayes.detection.consistency import Consistency
+from amibayes.detection.false_alarm import Significance
+from amibayes.likelihood.chi2 import chi2_survival
+
+Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
+
+NAMES = {"vis2": "V²", "cp": "closure phases"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the data say of a star with at most one companion.
+
+    Parameters
+    ----------
+    statement : {"companion", "no companion", "model rejected", "inconsistent data"}
+    because : str
+        The reason, one sentence.
+    p_model : float
+        Probability of data that fit as badly, were the best model of the family and its noise
+        the true one: the smaller one of χ² and of structure in the residuals, times two.
+    """
+
+    statement: Statement
+    because: str
+    p_model: float
+
+
+def verdict(
+    result: SearchResult,
+    tested: Significance,
+    structure: Significance,
+    splits: Sequence[Consistency],
+) -> Verdict:
+    """Give the verdict of a search whose null draws can tell a detection.
+
+    Parameters
+    ----------
+    result : SearchResult
+        With noise that is bounded by its prior.
+    tested : Significance
+        Of the companion.
+    structure : Significance
+        Of one more component, in what the best fit leaves.
+    splits : sequence of Consistency
+        Empty where no companion is detected.
+
+    Notes
+    -----
+    Parts that each see a companion of their own come first: the model may be right for each of
+    them. Then the model as a whole; then V² against closure phases, which an incomplete model
+    sets against each other as well as a bad calibration does.
+    """
+    alpha = tested.alpha
+    fit = chi2_survival(result.chi2_binary, result.ndof, result.likelihood.degrees)
+    p_model = min(1.0, 2.0 * min(fit, structure.probability))
+    apart = [s for s in splits if s.p * len(splits) < alpha]
+    for split in apart:
+        if split.split != "observables":
+            return Verdict("inconsistent data", _apart(split), p_model)
+    if p_model < alpha:
+        return Verdict("model rejected", _rejected(result, fit, structure), p_model)
+    for split in apart:
+        return Verdict("inconsistent data", _apart(split), p_model)
+    if tested.detected:
+        return Verdict("companion", _found(tested), p_model)
+    return Verdict("no companion", _nothing(tested), p_model)
+
+
+def _apart(split: Consistency) -> str:
+    parts = " and ".join(NAMES.get(part, part) for part in split.parts[:3])
+    more = f" and {len(split.parts) - 3} more" if len(split.parts) > 3 else ""
+    motion = "; a motion (--motion) may explain it" if split.split == "epochs" else ""
+    return (
+        f"{parts}{more} disagree on the companion by Δχ² {split.delta_chi2:.3g}, which "
+        f"{_share(split.p)} of consistent data exceed{motion}"
+    )
+
+
+def _rejected(result: SearchResult, fit: float, structure: Significance) -> str:
+    if fit <= structure.probability:
+        return (
+            f"χ² is {result.chi2_binary:.4g} for {result.ndof} degrees of freedom with the best "
+            "companion and as much noise as its prior allows"
+        )
+    return (
+        "what the best fit leaves still holds structure: one more component would gain more than "
+        f"in all but {_share(structure.probability)} of data without it"
+    )
+
+
+def _found(tested: Significance) -> str:
+    return (
+        "noise alone gives something as good in the field with a probability below "
+        f"{tested.interval[1]:.2g} (95 % confidence)"
+    )
+
+
+def _nothing(tested: Significance) -> str:
+    return (
+        "noise alone gives something as good in the field with a probability of "
+        f"{tested.probability:.2g}"
+    )
+
+
+def _share(p: float) -> str:
+    return f"{100.0 * p:.2g} %"

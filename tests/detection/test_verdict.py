@@ -1,0 +1,154 @@
+"""The verdict of simulated stars, binaries, discs, rings and triple stars."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss
+from scipy.special import j0, j1
+
+from amibayes.data.observables import Measurements, Observables, join
+from amibayes.detection.consistency import Consistency
+from amibayes.detection.verdict import Verdict
+from amibayes.pipeline.false_alarm import false_alarm, verdict_of
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions
+from amibayes.units import MAS, offset
+
+Visibility = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Complex visibility at spatial frequencies along east and north, cycles per mas."""
+
+OPTIONS = SearchOptions(separation_mas=(60.0, 300.0), alpha=0.01, null_draws=500)
+
+
+def star(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return np.ones_like(u, dtype=complex)
+
+
+def points(*companions: tuple[float, float, float]) -> Visibility:
+    """A star with companions: east and north (mas), flux ratio."""
+
+    def visibility(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        light = star(u, v)
+        for east, north, c in companions:
+            light = light + c * np.exp(-2j * np.pi * (u * east + v * north))
+        return light / (1.0 + sum(c for *_, c in companions))
+
+    return visibility
+
+
+def ring(radius: float, flux: float, east: float = 0.0) -> Visibility:
+    """A thin ring about the star, its middle off by ``east`` (mas), inclined by 45 degrees."""
+
+    def visibility(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        x = 2.0 * np.pi * radius * np.hypot(u, v * np.sqrt(0.5))
+        return (1.0 + flux * j0(x) * np.exp(-2j * np.pi * u * east)) / (1.0 + flux)
+
+    return visibility
+
+
+def disc(diameter: float, spot: float = 0.0) -> Visibility:
+    """A uniform disc, with a spot of some flux at a third of its radius."""
+
+    def visibility(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        x = np.maximum(np.pi * diameter * np.hypot(u, v), 1e-9)
+        bright = spot * np.exp(-2j * np.pi * u * diameter / 6.0)
+        return (2.0 * j1(x) / x + bright) / (1.0 + spot)
+
+    return visibility
+
+
+def observed(sheet: Observables, source: Visibility, rng: np.random.Generator) -> Observables:
+    """The sheet's observables of a source, with noise."""
+    data = np.concatenate([_vis2(sheet.vis2, source), _closure(sheet.closure_phase, source)])
+    vis2, closure = np.split(data + sheet.covariance.draw(rng, 1)[:, 0], [sheet.n_vis2])
+    return replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=vis2),
+        closure_phase=replace(sheet.closure_phase, value=closure),
+    )
+
+
+def _vis2(table: Measurements, source: Visibility) -> np.ndarray:
+    u, v = (MAS * x[:, 0] / table.wavelength_m for x in (table.u_m, table.v_m))
+    return np.abs(source(u, v)) ** 2
+
+
+def _closure(table: Measurements, source: Visibility) -> np.ndarray:
+    u, v = (MAS * x.T / table.wavelength_m for x in (table.u_m, table.v_m))
+    bispectrum = source(u[0], v[0]) * source(u[1], v[1])
+    return np.angle(bispectrum * source(u[0] + u[1], v[0] + v[1]).conj())
+
+
+def told(data: Observables, rng: np.random.Generator) -> tuple[Verdict, tuple[Consistency, ...]]:
+    """The verdict as the main job gives it."""
+    result = search_field(data, OPTIONS).result
+    tested = false_alarm(result, OPTIONS, rng)
+    return verdict_of(result, tested, data, OPTIONS, rng)
+
+
+def anywhere(rng: np.random.Generator, near: float = 80.0, far: float = 280.0) -> list[float]:
+    return [float(x) for x in offset(rng.uniform(near, far), rng.uniform(0.0, 360.0))]
+
+
+KINDS: dict[str, Callable[[np.random.Generator], Visibility]] = {
+    "star": lambda rng: star,
+    "binary": lambda rng: points((*anywhere(rng), 10.0 ** rng.uniform(-2.0, -0.7))),
+    "triple": lambda rng: points((*anywhere(rng), 0.1), (*anywhere(rng), 0.07)),
+    "ring": lambda rng: ring(rng.uniform(120.0, 250.0), rng.uniform(0.3, 0.8), 30.0),
+    "disc": lambda rng: disc(rng.uniform(150.0, 260.0)),
+    "spotted disc": lambda rng: disc(rng.uniform(150.0, 260.0), 0.2),
+}
+
+EXPECTED = {
+    "star": {"no companion"},
+    "binary": {"companion"},
+    "triple": {"model rejected"},
+    "ring": {"model rejected"},
+    "spotted disc": {"model rejected"},
+}
+"""A disc by itself is a star with a diameter, where that is free."""
+
+
+@pytest.mark.parametrize("kind", EXPECTED)
+def test_one_of_each_kind_is_told_for_what_it_is(kind: str) -> None:
+    rng = np.random.default_rng([1, list(KINDS).index(kind)])
+    data = observed(niriss(), KINDS[kind](rng), rng)
+    found, _ = told(data, rng)
+    assert found.statement in EXPECTED[kind], found
+    assert 0.0 <= found.p_model <= 1.0
+    assert found.because
+
+
+def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:
+    """At PA 0 in one file, at PA 90 in the other: no companion of both."""
+    rng, parts = np.random.default_rng(2), []
+    for name, companion in (("a", (0.0, 150.0, 0.03)), ("b", (150.0, 0.0, 0.03))):
+        data = observed(niriss(), points(companion), rng)
+        parts.append(replace(data, setups=(replace(data.setups[0], source=name),)))
+    found, splits = told(join(parts), rng)
+    assert found.statement == "inconsistent data", found
+    assert {"files"} <= {s.split for s in splits}
+
+
+@pytest.mark.slow
+def test_confusion_of_forty_of_each_kind() -> None:
+    """Shares with bounds of 4.5 binomial σ about what was measured over 200 of each."""
+    table: dict[str, dict[str, int]] = {}
+    for number, (kind, make) in enumerate(KINDS.items()):
+        for k in range(40):
+            rng = np.random.default_rng([3, number, k])
+            statement = told(observed(niriss(), make(rng), rng), rng)[0].statement
+            counts = table.setdefault(kind, {})
+            counts[statement] = counts.get(statement, 0) + 1
+        logging.getLogger("verdict").info("%s: %s", kind, table[kind])
+    assert table["star"].get("companion", 0) <= 4
+    assert table["star"]["no companion"] >= 34
+    assert table["binary"]["companion"] >= 33
+    for kind in ("triple", "ring", "spotted disc"):
+        assert table[kind].get("companion", 0) <= 4
+        assert table[kind].get("no companion", 0) <= 4
