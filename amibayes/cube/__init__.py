@@ -3,7 +3,7 @@
 from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube
 from amibayes.cube.read import CubeFile, open_cube, read_cube
 from amibayes.cube.stream import EmptyImage, FitsStream
-from amibayes.cube.write import CubeStream, cube_stream, header_of, write_cube
+from amibayes.cube.write import CubeStream, cube_stream, header_of, headers_of, write_cube
 
 __all__ = [
     "DO_NOT_USE",
@@ -16,6 +16,7 @@ __all__ = [
     "FitsStream",
     "cube_stream",
     "header_of",
+    "headers_of",
     "open_cube",
     "read_cube",
     "write_cube",

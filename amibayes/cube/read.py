@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
 from amibayes.cube.container import Cube
+from amibayes.cube.ramps import RampFile
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
 from amibayes.support.fits_errors import reporting_damage
@@ -93,7 +94,7 @@ def open_cube(
     filter: str | None = None,
     pixel_scale_rad: float | None = None,
     position_angle_deg: float | None = None,
-) -> Iterator[CubeFile]:
+) -> Iterator[CubeFile | RampFile]:
     """Open a JWST-like ``calints`` file, or any FITS file with an image or a cube.
 
     Parameters
@@ -130,8 +131,10 @@ def open_cube(
         yield file
 
 
-def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile:
+def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile | RampFile:
     science = _science(hdus, source)
+    if len(science.shape) == 4:
+        return _ramp_file(hdus, science, given, source)
     chosen = {"SCI": science} | _companions(hdus, science, source)
     _check_complete(hdus, source)
     header = _merged(hdus, science)
@@ -139,6 +142,34 @@ def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile:
     template = _template(header, science, given, source, _comments(hdus, science))
     n = science.shape[0] if len(science.shape) == 3 else 1
     return CubeFile(template, n, chosen, _mid_times(hdus, n, header, source))
+
+
+def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> RampFile:
+    """Ramps that are read as slopes.
+
+    Raises
+    ------
+    DataError
+        Where they are raw, have fewer than two groups, or do not say the time between groups.
+    """
+    _check_complete(hdus, source)
+    n, groups, *shape = science.shape
+    header = _merged(hdus, science)
+    keys.check_mask(header, source)
+    step = keys.number(header, "TGROUP", source) or keys.number(header, "TFRAME", source)
+    if groups < 2 or step is None or not step > 0.0:
+        fault = f"has {groups} group in a ramp" if groups < 2 else "does not say TGROUP"
+        raise DataError(f"{fault}: no slopes", source=source, remedy="give slope images (calints)")
+    parts = {"SCI": science}
+    for name, wanted in (("GROUPDQ", science.shape), ("PIXELDQ", tuple(shape))):
+        there = [h for h in hdus if h.name == name and h.is_image]
+        if there and there[0].shape != wanted:
+            raise DataError(f"{name} has the shape {there[0].shape}, not {wanted}", source=source)
+        parts |= {name: there[0]} if there else {}
+    template = _template(header, science, given, source, _comments(hdus, science))
+    unit = "electron/s" if "electron" in template.unit.lower() else "DN/s"
+    template = replace(template, unit=unit)
+    return RampFile(template, n, parts, _mid_times(hdus, n, header, source), step)
 
 
 @contextmanager
@@ -162,28 +193,30 @@ def _science(hdus: Any, source: str) -> Any:
         raise DataError("holds no image", source=source)
     hdu = images[0]
     if len(hdu.shape) > 3:
-        raise _ramps(hdus, hdu, source)
+        _refuse_ramps(hdus, hdu, source)
     if len(hdu.shape) < 2 or 0 in hdu.shape:
         raise DataError(f"its image has the shape {hdu.shape}", source=source)
     return hdu
 
 
-def _ramps(hdus: Any, hdu: Any, source: str) -> DataError:
-    """Describe a file of ramps: raw ones by the step that comes next."""
+def _refuse_ramps(hdus: Any, hdu: Any, source: str) -> None:
+    """Refuse ramps that are raw, by the step that comes next, and what is no ramp at all."""
     names = {h.name for h in hdus}
     # The detector counts in whole numbers; every later step makes floating-point ones.
     raw = len(hdu.shape) == 4 and hdu.header["BITPIX"] > 0 and "GROUPDQ" not in names
     if raw:
-        return DataError(
+        raise DataError(
             "holds raw ramps (uncal): neither linear nor flagged",
             source=source,
-            remedy="run jwst's calwebb_detector1 and calwebb_image2, and give its calints",
+            remedy="run jwst's calwebb_detector1 and give its _ramp file, or calwebb_image2 too, "
+            "and give its _calints",
         )
-    return DataError(
-        f"holds {len(hdu.shape)}-dimensional data (ramps), not images",
-        source=source,
-        remedy="run jwst's ramp_fit and calwebb_image2, and give the calints",
-    )
+    if len(hdu.shape) != 4 or 0 in hdu.shape:
+        raise DataError(
+            f"holds {len(hdu.shape)}-dimensional data, neither images nor ramps",
+            source=source,
+            remedy="give the slope images of each integration (calints)",
+        )
 
 
 def _companions(hdus: Any, science: Any, source: str) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def cube_stream(
     RunError
         Where the file cannot be written.
     """
-    primary, science = _headers(template, n_integrations)
+    primary, science = headers_of(template, n_integrations)
     for line in history:
         primary.add_history(line)
     shape = (n_integrations, *template.images.shape[1:])
@@ -143,7 +143,7 @@ def write_cube(path: str | Path, cube: Cube) -> None:
         stream.write(0, cube.images, cube.error, cube.dq)
 
 
-def _headers(cube: Cube, n: int) -> tuple[Any, Any]:
+def headers_of(cube: Cube, n: int) -> tuple[Any, Any]:
     """Split the keywords between the primary header and that of SCI, as JWST files do."""
     both = _kept(cube.header) | _essential(cube, n)
     science = {key: both.pop(key) for key in _IN_SCIENCE if key in both}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, header_of
+from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, headers_of
 from amibayes.errors import DataError
 from amibayes.instrument import Instrument, instrument_names, load_instrument
 from amibayes.optics import Wavefront, scene_image
@@ -323,8 +323,10 @@ def ramp_path(path: Path) -> Path:
 def _ramp_hdus(shutter: PreparedExposure) -> list[Any]:
     observation = shutter.observation
     exposure = observation.exposure
-    header = exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s)
-    primary, science = header_of(header), header_of({"BUNIT": "electron"})
+    # What a reader of slopes asks of a header, a reader of ramps asks too.
+    primary, science = headers_of(
+        replace(blank_cube(shutter), unit="electron"), exposure.n_integrations
+    )
     reads = observation.detector.n_reads(exposure.n_groups)
     shape = (exposure.n_integrations, reads, exposure.n_pixels, exposure.n_pixels)
     return [fits.PrimaryHDU(header=primary), EmptyImage("SCI", shape, "float32", science)]

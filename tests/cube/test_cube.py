@@ -273,7 +273,7 @@ IMAGES = np.random.default_rng(3).normal(size=(3, 8, 8))
     ("arrays", "message"),
     [
         ({"SCI": np.ones((2, 3, 4, 8, 8))}, "5-dimensional data"),
-        ({"SCI": np.ones((2, 4, 8, 8))}, "4-dimensional data"),
+        ({"SCI": np.ones((2, 4, 8, 8))}, "does not say TGROUP"),
         ({"SCI": np.ones(8)}, r"has the shape \(8,\)"),
         ({"SCI": IMAGES, "DQ": np.zeros((8, 8), np.int32)}, "DQ has the shape"),
         ({"SCI": IMAGES, "ERR": np.ones((3, 8, 9))}, "ERR has the shape"),

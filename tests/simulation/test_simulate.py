@@ -417,3 +417,17 @@ def test_memory_does_not_grow_with_the_exposure(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_memory_of_ten_thousand_integrations(tmp_path: Path) -> None:
     assert peak_memory_mb(tmp_path, 10000) < 300.0
+
+
+def test_simulated_ramps_are_read_as_the_simulated_slopes(tmp_path: Path) -> None:
+    text = SMALL.replace("roll_deg = [0.0, 60.0]\ndithers = 2", "ramps = true")
+    assert main(["simulate", write(tmp_path, text), "--out", str(tmp_path), "--quiet"]) == 0
+    slopes, ramps = (read_cube(tmp_path / f"AB_Dor_{kind}.fits") for kind in ("calints", "ramp"))
+    assert ramps.unit == slopes.unit == "electron/s"
+    assert ramps.orientation == slopes.orientation
+    assert ramps.pixel_scale_rad == pytest.approx(slopes.pixel_scale_rad)
+    both = ~(slopes.bad | ramps.bad)
+    assert slopes.error is not None
+    off = ((ramps.images - slopes.images) / slopes.error)[both]
+    # Dark, background and flat field are taken off the slopes only; weights differ a little.
+    assert np.median(np.abs(off)) < 0.5

@@ -1,0 +1,97 @@
+"""Ramps as slopes: the truth is that of photons and reads drawn here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from amibayes.cube import DO_NOT_USE, JUMP, SATURATED, read_cube
+from amibayes.errors import DataError
+
+GAIN, READ_DN, TIME_S = 1.61, 9.0, 0.07544
+SHAPE = (40, 8, 16, 16)
+
+
+def rate_dn_s() -> np.ndarray:
+    y, x = np.indices(SHAPE[2:]) - 7.5
+    return np.asarray(30_000.0 * np.exp(-(x**2 + y**2) / 8.0) + 20.0)
+
+
+def ramp_file(path: Path, rng: np.random.Generator, **change: Any) -> Path:
+    per_group = rate_dn_s() * TIME_S * GAIN
+    charge = np.cumsum(rng.poisson(per_group, SHAPE), axis=1) / GAIN
+    ramps = charge + rng.normal(0.0, READ_DN, SHAPE) + 500.0
+    flags = np.zeros(SHAPE, np.uint8)
+    hdus = {"SCI": ramps.astype(np.float32), "GROUPDQ": flags}
+    hdus["PIXELDQ"] = np.zeros(SHAPE[2:], np.uint32)
+    hdus |= change.pop("hdus", lambda found: {})(hdus)
+    primary = fits.PrimaryHDU()
+    keywords = {"INSTRUME": "NIRISS", "FILTER": "F480M", "TGROUP": TIME_S, "PIXELSCL": 0.0656}
+    primary.header.update(keywords | change)
+    images = [fits.ImageHDU(array, name=name) for name, array in hdus.items()]
+    fits.HDUList([primary, *images]).writeto(path)
+    return path
+
+
+def test_slopes_and_errors_are_true(tmp_path: Path, rng: np.random.Generator) -> None:
+    cube = read_cube(ramp_file(tmp_path / "a_ramp.fits", rng))
+    assert cube.images.shape == (SHAPE[0], *SHAPE[2:])
+    assert cube.unit == "DN/s"
+    assert cube.error is not None
+    pull = (cube.images - rate_dn_s()) / cube.error
+    # 10 240 numbers: mean to 0.01, standard deviation to 0.007.
+    assert abs(pull.mean()) < 0.05
+    assert pull.std() == pytest.approx(1.0, abs=0.04)
+    assert not cube.bad.any()
+
+
+def test_jumps_and_saturation_are_left_out(tmp_path: Path, rng: np.random.Generator) -> None:
+    def spoilt(found: dict[str, Any]) -> dict[str, Any]:
+        found["SCI"][3, 4:, 5, 6] += 5e4
+        found["GROUPDQ"][3, 4, 5, 6] = JUMP
+        found["SCI"][4, 5:, 7, 7] = np.nan
+        found["GROUPDQ"][5, 6:, 8, 8] = SATURATED
+        found["SCI"][5, 6:, 8, 8] = 6e4
+        found["GROUPDQ"][6, :, 2, 2] = DO_NOT_USE
+        found["PIXELDQ"][1, 1] = DO_NOT_USE
+        return {}
+
+    cube = read_cube(ramp_file(tmp_path / "a_ramp.fits", rng, hdus=spoilt))
+    assert cube.error is not None
+    assert cube.dq is not None
+    for at in ((3, 5, 6), (4, 7, 7), (5, 8, 8)):
+        assert abs(cube.images[at] - rate_dn_s()[at[1:]]) < 5.0 * cube.error[at]
+        assert cube.error[at] > 1.03 * np.median(cube.error[:, at[1], at[2]])
+    assert cube.bad[6, 2, 2]
+    assert cube.bad[:, 1, 1].all()
+    assert cube.bad.sum() == 1 + SHAPE[0]
+
+
+def test_a_few_integrations_are_those_of_the_whole(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    from amibayes.cube import open_cube
+
+    path = ramp_file(tmp_path / "a_ramp.fits", rng)
+    with open_cube(path) as file:
+        part = file.read(5, 9)
+    np.testing.assert_array_equal(part.images, read_cube(path).images[5:9])
+
+
+def test_ramps_without_slopes_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    short = ramp_file(
+        tmp_path / "a.fits",
+        rng,
+        hdus=lambda found: {k: v[:, :1] for k, v in found.items() if v.ndim == 4},
+    )
+    with pytest.raises(DataError, match="1 group"):
+        read_cube(short)
+    with pytest.raises(DataError, match="TGROUP"):
+        read_cube(ramp_file(tmp_path / "b.fits", rng, TGROUP=None))
+    wrong = ramp_file(tmp_path / "c.fits", rng, hdus=lambda found: {"PIXELDQ": np.zeros((3, 3))})
+    with pytest.raises(DataError, match="PIXELDQ has the shape"):
+        read_cube(wrong)
