@@ -39,6 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     stages = parser.add_argument_group("stages")
     data_options.add_null_draws(stages, NULL_DRAWS)
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
+    stages.add_argument(
+        "--bootstrap",
+        type=common.non_negative_integer,
+        default=0,
+        metavar="N",
+        help="fit N times to exposures drawn anew, for intervals beside the posterior's",
+    )
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
     stages.add_argument(
         "--resume",
@@ -161,6 +168,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,
         companions=arguments.companions,
+        bootstrap=arguments.bootstrap,
         evidence_method=arguments.evidence_method,
         prior=tuple(arguments.prior),
     )

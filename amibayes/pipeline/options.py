@@ -83,6 +83,8 @@ class SearchOptions:
     noise_prior : (float, float)
         Widths of the half-normal prior of extra noise: of V², relative to it, and of closure
         phases, degrees. It is at most three times as large.
+    bootstrap : int
+        Fits to exposures drawn anew, for intervals beside the posterior's; 0: none.
     systematics : "table", "none" or (float, float)
         Floor of calibration errors that channels of an exposure share: of a table by
         instrument, for files of few exposures, or share of V² and degrees of closure phase.
@@ -132,6 +134,7 @@ class SearchOptions:
     extra_noise: bool = True
     channel_noise: bool = True
     noise_prior: tuple[float, float] = NOISE_PRIOR
+    bootstrap: int = 0
     systematics: Literal["table", "none"] | tuple[float, float] = "table"
     robust: bool = False
     file_noise: bool | None = None

@@ -15,6 +15,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.limit import DetectionLimit
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.vetting import Vetting
+from amibayes.posterior.bootstrap import Bootstrap
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import Evidence
 from amibayes.posterior.grid import GridPosterior
@@ -43,6 +44,7 @@ class SearchReport:
     second_significance: Significance | None = None
     verdict: Verdict | None = None
     consistency: tuple[Consistency, ...] = ()
+    bootstrap: Bootstrap | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 

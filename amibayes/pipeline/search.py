@@ -27,6 +27,7 @@ from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Announce, Run, silent
 from amibayes.pipeline.warnings import search_warnings
+from amibayes.posterior.bootstrap import Bootstrap, bootstrap
 from amibayes.posterior.ensemble import Posterior, sample
 from amibayes.posterior.evidence import Evidence, compare_models
 from amibayes.posterior.grid import GridPosterior, affordable, grid_posterior
@@ -99,7 +100,8 @@ def search_companion(
 
 def _streams(seed: int) -> Streams:
     """Independent random numbers for every stage that draws some."""
-    stages = ("significance", "posterior", "limits", "calibration", "evidence", "second", "verdict")
+    first = ("significance", "posterior", "limits", "calibration", "evidence", "second")
+    stages = (*first, "verdict", "bootstrap")  # new ones at the end: the others keep their numbers
     seeds = np.random.SeedSequence(seed).spawn(len(stages))
     return {s: np.random.default_rng(k) for s, k in zip(stages, seeds, strict=True)}
 
@@ -179,6 +181,7 @@ class Inference:
     grid: GridPosterior | None
     evidence: Evidence | None
     noise: dict[str, NoisePosterior] | None
+    resampled: Bootstrap | None = None
 
 
 def _inferred(
@@ -217,7 +220,14 @@ def _inferred(
                 result, prior, rng["evidence"],
                 companions=counts, grid=grid, two=two, method=options.evidence_method,
             )  # fmt: skip
-    return Inference(samples, grid, evidence, _noise_posterior(result, samples))
+    resampled = None
+    if options.bootstrap:
+        with run.stage("bootstrap"):
+            resampled = bootstrap(
+                found.result, found.noise, options.bootstrap, rng["bootstrap"],
+                progress=run.progress,
+            )  # fmt: skip
+    return Inference(samples, grid, evidence, _noise_posterior(result, samples), resampled)
 
 
 def _noise_posterior(
@@ -258,6 +268,7 @@ def _report(
         grid=posterior.grid,
         evidence=posterior.evidence,
         noise_posterior=posterior.noise,
+        bootstrap=posterior.resampled,
         warnings=_warnings(ready, found, tests, posterior),
     )
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.support.atomic_files import sha256
@@ -73,6 +74,18 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
         common = [s.common for s, ok in zip(shares, known, strict=True) if ok]
         found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
     return found
+
+
+def in_errors_json(noise: ExtraNoise, stated: Observables) -> Json:
+    """Extra noise in units of the typical stated error of its kind."""
+    n, variance = stated.n_vis2, stated.covariance.variance
+    out: Json = {}
+    for key, amount, part in (
+        ("extra_vis2_in_errors", noise.vis2, variance[:n]),
+        ("extra_closure_phase_in_errors", noise.closure_phase_rad, variance[n:]),
+    ):
+        out[key] = float(amount / np.sqrt(np.median(part))) if len(part) else 0.0
+    return out
 
 
 def systematics_json(noise: ExtraNoise) -> list[Json]:

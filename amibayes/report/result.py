@@ -14,6 +14,7 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
+from amibayes.posterior.bootstrap import Bootstrap
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import HALO_BACKGROUND, Evidence
 from amibayes.posterior.grid import GridPosterior, integrable
@@ -23,6 +24,7 @@ from amibayes.report.common import (
     Json,
     channel_correlation_json,
     data_json,
+    in_errors_json,
     inputs_json,
     noise_interval,
     number,
@@ -67,6 +69,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "significance": _significance(result, report.significance, report.options.alpha),
         "modes": _modes(report),
         "posterior": None if report.posterior is None else _posterior(report, report.posterior),
+        "bootstrap": _bootstrap(report),
         "calibration": _calibration(report),
         "limits": _limits(report),
         "noise": _noise(report) | noise_files_json(report),
@@ -92,6 +95,7 @@ def _noise(report: SearchReport) -> Json:
         "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
         "channel_correlation": channel_correlation_json(report.noise),
         "systematics": systematics_json(report.noise),
+        **in_errors_json(report.noise, report.observables.only(report.options.observables)),
         "posterior": posterior or None,
     }
 
@@ -236,7 +240,17 @@ def _posterior(report: SearchReport, posterior: Posterior) -> Json:
     }
 
 
-def _intervals(found: Posterior | GridPosterior, names: list[str]) -> Json:
+def _bootstrap(report: SearchReport) -> Json | None:
+    """Intervals of fits to exposures drawn anew; null where it was not asked for."""
+    found = report.bootstrap
+    if found is None:
+        return None
+    names = [*QUANTITIES, *(n for n in found.names if n not in QUANTITIES)]
+    count: Json = {"n_fits": len(found.samples), "n_exposures": found.n_exposures}
+    return _intervals(found, names) | count
+
+
+def _intervals(found: Posterior | GridPosterior | Bootstrap, names: list[str]) -> Json:
     """Median, 68 and 95 % intervals: of the chain, or by direct integration over the field."""
     out: Json = {}
     for name in names:
