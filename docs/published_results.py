@@ -235,6 +235,12 @@ def cubes(folder: Path) -> Numbers:
     return companion(calibrate(target, [calibrator]).observables, BinaryModel(), (50.0, 400.0))
 
 
+def jwst_product(folder: Path) -> Numbers:
+    images = SearchOptions().images
+    data = join(read_observations(folder / "jwst" / "sima_aminorm-oi.fits", images))
+    return companion(data.only(("cp",)), BinaryModel(), (50.0, 400.0))
+
+
 BINARY_DISCS = {"diameter_mas": "free", "companion_diameter_mas": "free"}
 LIMB = {"diameter_mas": "free", "limb_darkening": "free"}
 
@@ -399,6 +405,18 @@ DATA_SETS: tuple[DataSet, ...] = (
             "flux ratio (%)": (2.2, 0.0),
         },
         lambda d: companion(read_oifits(d / "oifits" / "uvonly_sam.oifits"), BinaryModel()),
+        {},
+    ),
+    DataSet(
+        "NIRISS F480M, jwst aminorm-oi",
+        "a fit of its closure phases",
+        "closure phases alone",
+        {
+            "separation (mas)": (198.8, 0.0),
+            "position angle (°)": (305.6, 0.0),
+            "flux ratio (%)": (0.97, 0.0),
+        },
+        jwst_product,
         {},
     ),
     DataSet(

@@ -1,4 +1,4 @@
-"""Calibration: what the instrument did to a target, learnt from calibrators and taken away."""
+"""Calibration: the instrument's response, measured on calibrators and divided out."""
 
 from amibayes.calibration.binning import average_polarisations, bin_channels, merge_epochs
 from amibayes.calibration.calibrate import Calibration, CalibratorUse, calibrate

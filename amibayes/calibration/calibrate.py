@@ -36,7 +36,7 @@ class CalibratorUse:
     reason : str
         Why it was not used, or what was left out of it; empty where nothing was.
     n_used, n_clipped : int
-        Values that went into the mean, and that stood off the other calibrators'.
+        Values that went into the mean, and that were outliers among the calibrators.
     """
 
     path: str
@@ -129,7 +129,7 @@ def calibrate(
         Inverse-variance means, with the scatter where it is larger than the errors; or random
         effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline.
     clip : float, optional
-        Leave out values that stand off the other calibrators' by more standard deviations.
+        Leave out values that differ from the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (diameter, error), optional
         Of each calibrator, as a uniform disc.
     window_days : float, optional
@@ -178,8 +178,7 @@ def _method(
     together = int(np.sum([t.seen for t in serving], axis=0).max())
     if method == "hierarchical" and together < 2:
         raise DataError(
-            "one calibrator says nothing of the scatter between calibrators, and no baseline has "
-            "more",
+            "one calibrator cannot tell the scatter between calibrators, and no baseline has more",
             source=target.source,
             remedy="give more of them, or use the weighted method",
         )
@@ -232,13 +231,13 @@ def _transfers(
     keys: Keys,
     diameters_mas: Sequence[float | Diameter] | None,
 ) -> list[Transfer]:
-    """What each calibrator, freed of its disc, says of the response."""
+    """The response by each calibrator, without its disc."""
     diameters = _diameters(diameters_mas, calibrators)
     return [transfer_of(c, keys, d) for c, d in zip(calibrators, diameters, strict=True)]
 
 
 def _consistent(serving: list[Transfer], keys: Keys, clip: float | None) -> list[Transfer]:
-    """Calibrators with closure phases on one branch, without what stands off the others'."""
+    """Calibrators with closure phases on one branch, without outliers."""
     kept = on_one_branch(serving, keys.n_vis2)
     return kept if clip is None else clipped(kept, keys, clip)
 
@@ -328,7 +327,7 @@ def _uses(
     for j, (calibrator, transfer) in enumerate(zip(calibrators, seen, strict=True)):
         n = int(transfer.seen.sum())
         used = int(kept[j].seen.sum()) if j in kept else 0
-        reason = "" if used == n else f"{n - used} of {n} values stand off the other calibrators'"
+        reason = "" if used == n else f"{n - used} of {n} values are outliers among the calibrators"
         if not n:
             reason = "no baseline at the same wavelength and time in common with the target"
         uses.append(CalibratorUse(calibrator.source, used > 0, reason, used, n - used))

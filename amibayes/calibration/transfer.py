@@ -21,7 +21,7 @@ Diameter = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
-    """What a calibrator says of the instrument's V² and closure phases.
+    """The instrument's response by one calibrator: V² and closure phases.
 
     Parameters
     ----------

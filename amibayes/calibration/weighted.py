@@ -43,11 +43,11 @@ class TransferFunction:
 
 
 def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:
-    """Leave out values that stand off those of the other calibrators.
+    """Leave out values that are outliers among the calibrators.
 
     A value is compared with the mean of the others, in units of its error, the scatter that
     all keys of its type show between calibrators, and the error of that mean. The worst value
-    of a key goes while it stands off by more than ``clip``, as long as two remain: between two
+    of a key goes while it departs by more than ``clip``, as long as two remain: between two
     that disagree there is no telling which is wrong.
     """
     value = np.array([t.value for t in transfers])
@@ -55,7 +55,7 @@ def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Tran
     seen = np.array([t.seen for t in transfers])
     while True:
         total = variance + _excess(value, variance, seen, keys.n_vis2)
-        off = np.where(seen & (seen.sum(axis=0) > 2), _standing_off(value, total, seen), 0.0)
+        off = np.where(seen & (seen.sum(axis=0) > 2), _departure(value, total, seen), 0.0)
         worst = np.argmax(off, axis=0)
         bad = np.flatnonzero(off.max(axis=0) > clip)
         if not len(bad):
@@ -69,7 +69,7 @@ def _inverse(variance: FloatArray, seen: BoolArray) -> FloatArray:
     return np.divide(1.0, variance, out=np.zeros_like(variance), where=seen)
 
 
-def _standing_off(value: FloatArray, variance: FloatArray, seen: BoolArray) -> FloatArray:
+def _departure(value: FloatArray, variance: FloatArray, seen: BoolArray) -> FloatArray:
     """|value − mean of the others| in standard deviations, (n_calibrators, n_keys)."""
     weight = _inverse(variance, seen)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Observables of an ideal point source on any array: the blank sheet of simulations."""
+"""Observables of an ideal point source on any array, which simulations start from."""
 
 from __future__ import annotations
 

@@ -218,7 +218,7 @@ def image_table(oifits: OIFits, name: str, insname: str) -> OITable | None:
     return next(iter(alike or unnamed), None)
 
 
-def trusted_pairs(
+def consistent_pairs(
     pairs: Pairs, variance: FloatArray, closure_phase: Measurements
 ) -> tuple[Pairs, str]:
     """Set the correlations between closure phases aside where they cannot be right.
@@ -226,7 +226,7 @@ def trusted_pairs(
     Two triangles of one exposure that share a baseline are correlated with the sign that
     the baseline has in both. Correlations that on average have the opposite sign, in one
     exposure at least, belong to another order of the triangles (fouriever's example of
-    AX Cir: half of its exposures); weighed with them, some combination would have no noise.
+    AX Cir: half of its exposures); with them, some combination would have no noise.
 
     Returns
     -------

@@ -17,8 +17,8 @@ from amibayes.oifits.scatter import SCATTER
 from amibayes.oifits.setups import (
     DATA_TABLES,
     Target,
-    doubts_of_bands,
     make_setup,
+    notes_of_bands,
     targets_of,
     wavelength_table,
 )
@@ -132,19 +132,19 @@ def _parts(
         rows_in_use, found = chosen[table.number], identified[table.number]
         wavelengths = wavelength_table(oifits, table, channel_count(oifits, table))
         own = table.header.get(f"{OWN_KEY} SETUP", 0)
-        doubts: tuple[str, ...] = ()
+        band_notes: tuple[str, ...] = ()
         key = (wavelengths.number, 0 if found.array is None else found.array.number, own)
         if key not in setups:
             target = targets[int(_target_ids(oifits, table)[rows_in_use[0]])]
             made = make_setup(oifits, wavelengths, found.array, found.stations, target)
             setups[key] = with_response(oifits, made, own)
-            doubts = doubts_of_bands(oifits, wavelengths)
+            band_notes = notes_of_bands(oifits, wavelengths)
         setup = setups[key]
         rows = read_rows(
             oifits, table, rows_in_use, found.position, (setup.wavelength_m, setup.band_m)
         )
         number, k = list(setups).index(key), 1 + (table.name == "OI_T3")
-        rows = replace(rows, notes=(*doubts, *found.notes, *rows.notes))
+        rows = replace(rows, notes=(*band_notes, *found.notes, *rows.notes))
         first = rows_so_far.get((number, k), 0)
         rows_so_far[number, k] = first + len(rows_in_use)
         parts.append(_Part(k, _numbered(rows, number, first, table)))

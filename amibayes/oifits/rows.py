@@ -21,7 +21,7 @@ DAY_S = 86400.0
 
 @dataclass(frozen=True)
 class Kind:
-    """Which columns hold one kind of data, and what is too absurd to be used.
+    """Which columns hold one kind of data, and what is impossible and not used.
 
     No calibration error makes a visibility of 100: a V² past ``largest_value`` is a fault. A
     phase past it stands for "no value" (1e20, 9.97e36, …), and any other has its turns.

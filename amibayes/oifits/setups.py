@@ -183,7 +183,7 @@ def _looks_swapped(values: NDArray[Any]) -> bool:
         return bool(((turned > 1e-7) & (turned < 1e-3)).all())
 
 
-def doubts_of_bands(oifits: OIFits, table: OITable) -> tuple[str, ...]:
+def notes_of_bands(oifits: OIFits, table: OITable) -> tuple[str, ...]:
     """Say what was made of widths of channels that are none."""
     if "EFF_BAND" not in table.columns:
         return (f"{table.label} has no EFF_BAND: channels are taken as narrow",)

@@ -1,4 +1,4 @@
-"""What a file says of the errors of its data: their covariance, of which kind, from how many."""
+"""The errors that a file states: their covariance, of which kind, from how many."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from amibayes.oifits.columns import same
 from amibayes.oifits.correlations import (
     REMEDY,
     Pairs,
+    consistent_pairs,
     given_covariance,
     image_pairs,
     image_table,
     joined,
     oi_corr_pairs,
-    trusted_pairs,
 )
 from amibayes.oifits.scatter import scatter_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
@@ -82,7 +82,7 @@ class FileCovariance:
 def stated_covariance(
     oifits: OIFits, content: Content, closure_covariance: ClosureCovariance
 ) -> FileCovariance:
-    """Covariance of what is not flagged, and what the file says of it."""
+    """Covariance of what is not flagged, and what the file states of it."""
     flag = np.concatenate([c.measurements.flag for c in content.both])
     variance = np.concatenate([c.variance for c in content.both])
     closure = content.closure.measurements
@@ -95,10 +95,10 @@ def stated_covariance(
             DiagonalCovariance(variance[~flag]), "diagonal", None, None, set_aside
         )
     pairs = _unflagged(joined([images, *_table_pairs(oifits, content, tables, variance)]), flag)
-    pairs, doubt = trusted_pairs(pairs, variance[~flag], closure)
-    notes += (doubt,) if doubt else ()
-    said = _said_kind(tables)
-    covered = _covered(content, tables if said else [])[~flag]
+    pairs, note = consistent_pairs(pairs, variance[~flag], closure)
+    notes += (note,) if note else ()
+    written = _written_kind(tables)
+    covered = _covered(content, tables if written else [])[~flag]
     independent = np.concatenate([c.of_parts(c.independent).astype(bool) for c in content.both])
     independent = independent[~flag]
     try:
@@ -113,7 +113,9 @@ def stated_covariance(
     freedom = _freedom(tables)
     index = np.concatenate([c.correlation_index for c in content.both])[~flag]
     scatter = None if freedom is None else scatter_of(oifits, tables, index, variance[~flag])
-    return FileCovariance(covariance, said or kind, _integrations(tables), freedom, notes, scatter)
+    return FileCovariance(
+        covariance, written or kind, _integrations(tables), freedom, notes, scatter
+    )
 
 
 def _tables_in_use(oifits: OIFits, content: Content) -> list[OITable]:
@@ -187,7 +189,7 @@ def _covered(content: Content, own: list[OITable]) -> BoolArray:
     return (index > 0) & bool(own)
 
 
-def _said_kind(tables: list[OITable]) -> CovarianceKind | None:
+def _written_kind(tables: list[OITable]) -> CovarianceKind | None:
     """The kind that amibayes wrote into OI_CORR."""
     kinds = [str(t.header.get(f"{OWN_KEY} COVARIANCE", "")) for t in tables]
     known: tuple[CovarianceKind, ...] = get_args(CovarianceKind)

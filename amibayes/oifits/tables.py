@@ -82,7 +82,7 @@ class OIFits:
     tables : tuple of OITable
         Every extension, in file order.
     trailing_bytes : int
-        Bytes after the last complete HDU (0 in a sound file).
+        Bytes after the last complete HDU (0 in a correct file).
     """
 
     path: str

@@ -337,8 +337,8 @@ def test_vis2_errors_divided_twice(n: int, rng: np.random.Generator, tmp_path: P
     assert {f.code for f in found.findings} == ({"vis2-error-divided-twice"} if n > 1 else set())
     if n > 1:
         repair(found.oifits, list(found.findings), tmp_path / "b.fits")
-        mended = observables_of(open_oifits(tmp_path / "b.fits"))
-        np.testing.assert_allclose(mended.errors[0], 0.01, rtol=1e-6)
+        fixed = observables_of(open_oifits(tmp_path / "b.fits"))
+        np.testing.assert_allclose(fixed.errors[0], 0.01, rtol=1e-6)
         assert audit(tmp_path / "b.fits").findings == ()
 
 
@@ -395,19 +395,19 @@ def test_repair_mends_what_is_certain_and_nothing_else(
     path = changed(rng, tmp_path / "a.fits", spoil)
     path.write_bytes(path.read_bytes() + b"\0" * 10)
     found = audit(path)
-    mended = repair(found.oifits, list(found.findings), tmp_path / "mended.fits")
-    assert {f.code for f in mended} == {
+    fixed = repair(found.oifits, list(found.findings), tmp_path / "fixed.fits")
+    assert {f.code for f in fixed} == {
         "trailing-bytes",
         "primary-keyword",
         "unit-spelling",
         "unit",
         "unusable-unflagged",
     }
-    assert audit(tmp_path / "mended.fits").findings == ()
-    before, after = read_oifits(path), read_oifits(tmp_path / "mended.fits")
+    assert audit(tmp_path / "fixed.fits").findings == ()
+    before, after = read_oifits(path), read_oifits(tmp_path / "fixed.fits")
     np.testing.assert_allclose(after.data, before.data, rtol=1e-13)
     np.testing.assert_array_equal(after.vis2.flag, before.vis2.flag)
-    header = fits.getheader(tmp_path / "mended.fits")
+    header = fits.getheader(tmp_path / "fixed.fits")
     assert (header["OBSERVER"], header["DATE-OBS"]) == ("UNKNOWN", "2023-02-25")
 
 

@@ -1,4 +1,4 @@
-"""``audit --fix``: what is certain is mended, and every other byte stays."""
+"""``audit --fix``: what is certain is fixed, and every other byte stays."""
 
 from __future__ import annotations
 

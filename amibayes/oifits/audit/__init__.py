@@ -107,7 +107,7 @@ def _line(group: list[Finding]) -> str:
 
 
 def _of_product(general: list[Finding], own: list[Finding]) -> list[Finding]:
-    """Findings of a product; a copy mends all or, where it cannot be written, nothing."""
+    """Findings of a product; a copy fixes all or, where it cannot be written, nothing."""
     fixable = any(f.certain for f in own)
     return own + [replace(f, certain=f.certain and fixable) for f in general]
 

@@ -37,7 +37,7 @@ Remedy = Callable[[Any, OIFits, list[OITable]], None]
 
 
 def repair(oifits: OIFits, findings: list[Finding], path: str | Path) -> list[Finding]:
-    """Write a copy of a file in which every finding whose remedy is certain is mended.
+    """Write a copy of a file in which every finding whose remedy is certain is fixed.
 
     Tables without such a finding are copied byte by byte; a copy called ``.gz`` is packed.
 
@@ -49,22 +49,22 @@ def repair(oifits: OIFits, findings: list[Finding], path: str | Path) -> list[Fi
     Returns
     -------
     list of Finding
-        Those that were mended.
+        Those that were fixed.
     """
-    mended = [f for f in findings if f.certain]
+    fixed = [f for f in findings if f.certain]
     product = product_of(oifits)
-    if product is not None and mended:
+    if product is not None and fixed:
         write_repaired(product, path)
-        return mended
+        return fixed
     raw = fits_bytes(Path(oifits.path))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with fits.open(io.BytesIO(raw), memmap=False) as hdus:
             spans = [(hdu.fileinfo()["hdrLoc"], hdu.fileinfo()) for hdu in hdus]
             whole = [raw[start : info["datLoc"] + info["datSpan"]] for start, info in spans]
-            touched = {0} if any(f.where == "primary header" for f in mended) else set()
-            for code in dict.fromkeys(f.code for f in mended):
-                where = {f.where for f in mended if f.code == code}
+            touched = {0} if any(f.where == "primary header" for f in fixed) else set()
+            for code in dict.fromkeys(f.code for f in fixed):
+                where = {f.where for f in fixed if f.code == code}
                 tables = [t for t in oifits.tables if t.label in where]
                 touched |= {t.number for t in tables}
                 REMEDIES[code](hdus, oifits, tables)
@@ -75,7 +75,7 @@ def repair(oifits: OIFits, findings: list[Finding], path: str | Path) -> list[Fi
         content = gzip.compress(content, mtime=0)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
-    return mended
+    return fixed
 
 
 def _bytes(hdu: Any) -> bytes:

@@ -142,7 +142,7 @@ def unusable_unflagged(oifits: OIFits) -> Findings:
                 "unusable-unflagged",
                 table.label,
                 f"{count(int(bad.sum()), 'value')} of {kind.value} not finite, or with an error "
-                "that is not finite, not positive or absurd, and not flagged",
+                "that is not finite, not positive or impossible, and not flagged",
                 "a fit stops, or gives them infinite weight",
                 "flag them",
                 certain=True,
@@ -203,7 +203,7 @@ def phase_range(oifits: OIFits) -> Findings:
 
 
 def phases_that_are_radians(oifits: OIFits) -> Findings:
-    """Numbers said to be degrees that look like radians.
+    """Numbers given as degrees that look like radians.
 
     Two signs: wrapped phases that fill ±π and end there; and errors that are 57 times too
     small for those of V² (independent baselines: σ(CP) = √3 σ(V²)/2V²) with phases inside ±π.
@@ -228,7 +228,7 @@ def phases_that_are_radians(oifits: OIFits) -> Findings:
                 "error" if fills else "warning",
                 "phase-in-radians",
                 table.label,
-                f"closure phases said to be degrees {sign}",
+                f"closure phases given as degrees {sign}",
                 "they look like radians: read as degrees they would be 57 times too small",
                 "convert T3PHI and T3PHIERR to degrees, or set their TUNIT to rad",
             )
