@@ -62,6 +62,13 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
         help="of the image's +y, east of north",
     )
     group.add_argument(
+        "--bad-flags",
+        type=lambda text: tuple(text.split(",")),
+        metavar="NAMES",
+        help="data quality flags of pixels that are not used, as in JWST files (default: "
+        "DO_NOT_USE,NON_SCIENCE,DEAD,REFERENCE_PIXEL)",
+    )
+    group.add_argument(
         "--temperature",
         type=positive_float,
         metavar="K",
@@ -88,9 +95,19 @@ def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
         "filter": arguments.filter,
         "pixel_scale_rad": arguments.pixel_scale * MAS if arguments.pixel_scale else None,
         "position_angle_deg": arguments.position_angle,
+        "bad_flags": _flags(arguments.bad_flags),
     }
     extraction = ExtractOptions(method=arguments.method, temperature_k=arguments.temperature)
     return ImageOptions(extraction, header)
+
+
+def _flags(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    """Check the names of data quality flags."""
+    from amibayes.cube.container import flag_bits
+
+    if names is not None:
+        flag_bits(names)
+    return names
 
 
 def finite_float(text: str) -> float:

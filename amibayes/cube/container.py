@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
@@ -10,18 +11,54 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.errors import DataError
+from amibayes.errors import DataError, UsageError
 from amibayes.scene.orientation import Orientation
 from amibayes.units import FloatArray
 
-DO_NOT_USE = 1
-"""Flag of a pixel that is not to be used (JWST data quality, bit 0)."""
+DQ_FLAGS = {
+    name: 1 << bit
+    for bit, name in enumerate(
+        (
+            "DO_NOT_USE", "SATURATED", "JUMP_DET", "DROPOUT", "OUTLIER", "PERSISTENCE",
+            "AD_FLOOR", "CHARGELOSS", "UNRELIABLE_ERROR", "NON_SCIENCE", "DEAD", "HOT", "WARM",
+            "LOW_QE", "RC", "TELEGRAPH", "NONLINEAR", "BAD_REF_PIXEL", "NO_FLAT_FIELD",
+            "NO_GAIN_VALUE", "NO_LIN_CORR", "NO_SAT_CHECK", "UNRELIABLE_BIAS", "UNRELIABLE_DARK",
+            "UNRELIABLE_SLOPE", "UNRELIABLE_FLAT", "OPEN", "ADJ_OPEN", "FLUX_ESTIMATED",
+            "MSA_FAILED_OPEN", "OTHER_BAD_PIXEL", "REFERENCE_PIXEL",
+        )
+    )
+}  # fmt: skip
+"""Data quality flags by the names of the jwst package (`stcal.dqflags`), bit 0 first."""
 
-SATURATED = 2
-"""Flag of a pixel that reached full well in some group (bit 1)."""
+DO_NOT_USE = DQ_FLAGS["DO_NOT_USE"]
+"""Flag of a pixel that is not to be used."""
 
-JUMP = 4
-"""Flag of a pixel whose ramp was cut at a cosmic ray (bit 2)."""
+SATURATED = DQ_FLAGS["SATURATED"]
+"""Flag of a pixel that reached full well in some group."""
+
+JUMP_DET = DQ_FLAGS["JUMP_DET"]
+"""Flag of a pixel whose ramp was cut at a cosmic ray."""
+
+NEVER_USED = ("DO_NOT_USE", "NON_SCIENCE", "DEAD", "REFERENCE_PIXEL")
+"""Flags of pixels that see no light; slopes that jumps or saturation only cut short are good."""
+
+
+def flag_bits(names: Collection[str]) -> int:
+    """Bits of flags by name.
+
+    Raises
+    ------
+    UsageError
+        Naming the first that is not known.
+    """
+    for name in names:
+        if name not in DQ_FLAGS:
+            near = difflib.get_close_matches(name, DQ_FLAGS, n=1)
+            raise UsageError(
+                f"'{name}' is no data quality flag",
+                remedy=f"did you mean {near[0]}?" if near else f"such as {', '.join(NEVER_USED)}",
+            )
+    return sum(DQ_FLAGS[name] for name in set(names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +93,8 @@ class Cube:
     pixels_known : bool
         Whether the pixel scale is known (a WCS, or the user) and not only usual: what the
         fringes say of their size is then the mask's.
+    bad_flags : tuple of str
+        Names of the data quality flags of pixels that are not used.
     notes : tuple of str
         What a reader of the result has to know of the headers.
 
@@ -79,6 +118,7 @@ class Cube:
     source: str = "cube"
     pixels_known: bool = False
     notes: tuple[str, ...] = ()
+    bad_flags: tuple[str, ...] = NEVER_USED
 
     def __post_init__(self) -> None:
         self._hold("images", _real(self.images))
@@ -120,7 +160,7 @@ class Cube:
         bad = ~np.isfinite(self.images)
         # One flag spread over all pixels, as where none are given, is looked at once.
         if (self.dq if any(self.dq.strides) else self.dq[:1, :1, :1]).any():
-            bad |= (self.dq & DO_NOT_USE) > 0
+            bad |= (self.dq & np.uint32(flag_bits(self.bad_flags))) > 0
         if self.error is not None:
             bad |= ~(np.isfinite(self.error) & (self.error > 0.0))
         return bad

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from amibayes.cube.container import DO_NOT_USE, JUMP, SATURATED, Cube
+from amibayes.cube.container import DO_NOT_USE, JUMP_DET, SATURATED, Cube
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import BoolArray, FloatArray
 
@@ -62,7 +62,7 @@ class RampFile:
         dq = np.zeros(slope.shape, dtype=np.uint32)
         dq |= self._pixel_flags
         dq[~good.any(axis=1)] |= DO_NOT_USE
-        dq[~good.all(axis=1)] |= JUMP
+        dq[~good.all(axis=1)] |= JUMP_DET
         time = self.group_time_s
         mjd = None if self.mjd is None else self.mjd[part]
         return replace(self.template, images=slope / time, error=error / time, dq=dq, mjd=mjd)
@@ -82,7 +82,7 @@ class RampFile:
         cut = np.zeros(groups.shape, dtype=bool)
         if dq is not None:
             good &= (dq & (DO_NOT_USE | SATURATED)) == 0
-            cut = (dq & JUMP) > 0
+            cut = (dq & JUMP_DET) > 0
         used = good[:, 1:] & good[:, :-1] & ~cut[:, 1:]
         return np.where(used, np.diff(np.nan_to_num(groups), axis=1), 0.0), used
 

@@ -15,7 +15,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
-from amibayes.cube.container import Cube
+from amibayes.cube.container import NEVER_USED, Cube
 from amibayes.cube.ramps import RampFile
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
@@ -94,6 +94,7 @@ def open_cube(
     filter: str | None = None,
     pixel_scale_rad: float | None = None,
     position_angle_deg: float | None = None,
+    bad_flags: tuple[str, ...] | None = None,
 ) -> Iterator[CubeFile | RampFile]:
     """Open a JWST-like ``calints`` file, or any FITS file with an image or a cube.
 
@@ -106,6 +107,9 @@ def open_cube(
         Used in place of what the header says.
     position_angle_deg : float, optional
         Position angle of the image's +y axis, in place of what the header says.
+    bad_flags : tuple of str, optional
+        Names of the data quality flags (`DQ_FLAGS`) of pixels that are not to be used; by
+        default DO_NOT_USE, NON_SCIENCE, DEAD and REFERENCE_PIXEL.
 
     Yields
     ------
@@ -124,6 +128,7 @@ def open_cube(
         "filter": filter,
         "pixel_scale_rad": pixel_scale_rad,
         "position_angle_deg": position_angle_deg,
+        "bad_flags": NEVER_USED if bad_flags is None else tuple(bad_flags),
     }
     with _opened(Path(path)) as hdus:
         with reporting_damage(path):
@@ -294,6 +299,7 @@ def _template(
         integration_time_s=keys.integration_time_of(header, source),
         header=MappingProxyType(header),
         source=source,
+        bad_flags=given["bad_flags"],
         notes=keys.orientation_notes(header, source, comments) if angle is None else (),
         pixels_known=given["pixel_scale_rad"] is not None or keys.knows_pixels(header, source),
     )

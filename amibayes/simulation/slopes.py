@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.cube import DO_NOT_USE, JUMP, SATURATED
+from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import Ramps, to_neighbours
 from amibayes.units import FloatArray
@@ -157,7 +157,7 @@ class SlopeFit:
         slopes.images[hit], slopes.variance[hit] = _without_highest(
             steps[:, hit], electrons, self._detector
         )
-        slopes.dq[hit] |= JUMP
+        slopes.dq[hit] |= JUMP_DET
 
     def _flattened(self, slopes: Slopes) -> Slopes:
         """Divide by the flat field and mark the bad pixels."""

@@ -13,13 +13,14 @@ from astropy.wcs import WCS
 
 from amibayes.cube import (
     DO_NOT_USE,
+    DQ_FLAGS,
     Cube,
     cube_stream,
     open_cube,
     read_cube,
     write_cube,
 )
-from amibayes.errors import DataError, RunError
+from amibayes.errors import DataError, RunError, UsageError
 from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS
 
@@ -379,3 +380,18 @@ def test_orientation_is_that_of_the_wcs_and_contradictions_are_named(tmp_path: P
 def test_raw_ramps_are_refused_with_the_step_that_comes_next(data: Path) -> None:
     with pytest.raises(DataError, match=r"uncal.*calwebb_detector1"):
         read_cube(data / "cubes" / "niriss_f480m_uncal.fits")
+
+
+def test_flags_have_the_names_and_bits_of_jwst(tmp_path: Path) -> None:
+    known = {"DO_NOT_USE": 0, "SATURATED": 1, "JUMP_DET": 2, "NON_SCIENCE": 9, "DEAD": 10,
+             "HOT": 11, "UNRELIABLE_SLOPE": 24, "REFERENCE_PIXEL": 31}  # fmt: skip
+    assert {name: DQ_FLAGS[name] for name in known} == {n: 1 << b for n, b in known.items()}
+    dq = np.zeros(IMAGES.shape, np.uint32)
+    for k, name in enumerate(("SATURATED", "JUMP_DET", "HOT", "DEAD", "REFERENCE_PIXEL")):
+        dq[0, 0, k] = DQ_FLAGS[name]
+    path = write_calints(tmp_path / "a.fits", SCI=IMAGES, DQ=dq)
+    assert read_cube(path).bad[0, 0, :5].tolist() == [False, False, False, True, True]
+    hot = read_cube(path, bad_flags=("HOT", "SATURATED")).bad[0, 0, :5]
+    assert hot.tolist() == [True, False, True, False, False]
+    with pytest.raises(UsageError, match="did you mean JUMP_DET"):
+        _ = read_cube(path, bad_flags=("JUMP_DETT",)).bad

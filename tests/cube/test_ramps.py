@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from amibayes.cube import DO_NOT_USE, JUMP, SATURATED, read_cube
+from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, read_cube
 from amibayes.errors import DataError
 
 GAIN, READ_DN, TIME_S = 1.61, 9.0, 0.07544
@@ -52,7 +52,7 @@ def test_slopes_and_errors_are_true(tmp_path: Path, rng: np.random.Generator) ->
 def test_jumps_and_saturation_are_left_out(tmp_path: Path, rng: np.random.Generator) -> None:
     def spoilt(found: dict[str, Any]) -> dict[str, Any]:
         found["SCI"][3, 4:, 5, 6] += 5e4
-        found["GROUPDQ"][3, 4, 5, 6] = JUMP
+        found["GROUPDQ"][3, 4, 5, 6] = JUMP_DET
         found["SCI"][4, 5:, 7, 7] = np.nan
         found["GROUPDQ"][5, 6:, 8, 8] = SATURATED
         found["SCI"][5, 6:, 8, 8] = 6e4

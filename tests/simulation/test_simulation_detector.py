@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from amibayes.cube import DO_NOT_USE, JUMP, SATURATED
+from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED
 from amibayes.errors import UsageError
 from amibayes.simulation.detector import PRESETS, Detector, detector_preset, draw_maps
 from amibayes.simulation.ramps import Ramps, linearised, measured_signal, read_ramps, to_neighbours
@@ -142,7 +142,7 @@ def test_cosmic_rays_are_found_and_left_out(rng: np.random.Generator) -> None:
     noisy = Detector(zero_read=False, flat_error=0.0, cosmic_rays_s=3e-3)
     ramps = read_ramps(np.tile(rate, (100, 1, 1)), noisy, 7, rng)
     slopes = fit_of(rate, noisy, 7)(ramps)
-    hit = (slopes.dq & JUMP) > 0
+    hit = (slopes.dq & JUMP_DET) > 0
     # exponential charges: 0.8 of each in its pixel, 0.05 in each neighbour, seen above 5 sigma
     sigma = np.sqrt((2000.0 * FRAME + 21.0**2) * 6 / 5)
     seen = np.exp(-5 * sigma / 0.8 / 3000) + 4 * np.exp(-5 * sigma / 0.05 / 3000)
@@ -154,7 +154,7 @@ def test_cosmic_rays_are_found_and_left_out(rng: np.random.Generator) -> None:
     assert (slopes.variance[hit] > slopes.variance[~hit].max()).all()
     clean = replace(noisy, cosmic_rays_s=1e-12)
     ramps = read_ramps(np.tile(rate, (100, 1, 1)), clean, 7, rng)
-    assert ((fit_of(rate, clean, 7)(ramps).dq & JUMP) > 0).mean() < 1e-4
+    assert ((fit_of(rate, clean, 7)(ramps).dq & JUMP_DET) > 0).mean() < 1e-4
 
 
 def test_ramp_with_a_jump_is_fitted_as_two_ramps() -> None:
@@ -170,7 +170,7 @@ def test_ramp_with_a_jump_is_fitted_as_two_ramps() -> None:
     covariance = dense_covariance(electrons, detector.single_read_noise_e, m)[np.ix_(keep, keep)]
     inverse = np.linalg.inv(covariance)
     expected = inverse.sum(axis=0) @ steps[keep] / inverse.sum() / FRAME
-    assert slopes.dq[0, 0, 0] == JUMP
+    assert slopes.dq[0, 0, 0] == JUMP_DET
     assert slopes.images[0, 0, 0] == pytest.approx(expected, rel=1e-6)
     assert slopes.variance[0, 0, 0] == pytest.approx(1 / inverse.sum() / FRAME**2, rel=1e-6)
 
