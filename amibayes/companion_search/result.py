@@ -131,7 +131,7 @@ class SearchResult:
     ndof : int
         Independent data minus free parameters of the binary fit.
     modes : tuple of Mode
-        Distinct solutions left standing, best first.
+        Distinct solutions within Δχ² 25, best first.
     grid : Grid
     bank_contrast, bank_sigma : (n_grid,) float array
         Best linear contrast and its error at every position, the same in every band.
@@ -214,7 +214,7 @@ class SearchResult:
         return float(getattr(self.likelihood.model, name))
 
     def to_table(self) -> QTable:
-        """Every solution left standing, best first, as an astropy table with units."""
+        """Every distinct solution, best first, as an astropy table with units."""
         names = ("separation_mas", "position_angle_deg", "contrast", "delta_mag")
         found = [mode.companion for mode in self.modes]
         columns = {name: [getattr(c, name) for c in found] for name in names}

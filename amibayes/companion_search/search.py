@@ -249,10 +249,10 @@ def innermost_first(
 def _doubts(
     modes: Sequence[Mode], aliases: Sequence[Mode], found: Sequence[Mode], check: Mode
 ) -> tuple[str, ...]:
-    doubts = []
+    warnings = []
     best_found = max((m.delta_chi2 for m in found), default=0.0)
     if check.delta_chi2 > best_found + 0.1:
-        doubts.append(
+        warnings.append(
             f"the global optimiser found a better solution than the grid "
             f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
         )
@@ -260,15 +260,15 @@ def _doubts(
         opposite = [m for m in aliases if np.hypot(*np.add(m.place, modes[0].place)) < 1e-2]
         far = [f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite]
         if opposite:
-            doubts.append("without closure phases a position cannot be told from its opposite")
+            warnings.append("without closure phases a position cannot be told from its opposite")
         if far:
             name = "alias" if len(far) == 1 else "aliases"
-            doubts.append(
+            warnings.append(
                 f"these baselines cannot tell the position from its {name} at {', '.join(far)} "
                 "mas: the innermost is reported"
             )
     rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
     if rivals:
         others = "position fits" if len(rivals) == 1 else "positions fit"
-        doubts.append(f"{len(rivals)} other {others} within Δχ² 9: it is not unique")
-    return tuple(doubts)
+        warnings.append(f"{len(rivals)} other {others} within Δχ² 9: it is not unique")
+    return tuple(warnings)

@@ -142,7 +142,7 @@ def averaged_noise(
     stated : Observables
         The same data with the stated errors.
     fits : sequence of (Likelihood, (n_dim,) float array)
-        Best fits of every model that will be weighed: nodes cover the noise each asks for.
+        Best fits of every model that will be compared: nodes cover the noise each asks for.
     per_file : bool
         The noise of every file is unknown by itself; files that share errors (through their
         calibrators) are unknown together.

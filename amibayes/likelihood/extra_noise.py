@@ -3,7 +3,7 @@
 Where the best model leaves residuals that the stated errors cannot explain, a variance is
 added to every V² and one to every closure phase (through the baselines that its triangles
 share) that makes the residuals as likely as can be. A reduced χ² of ten then means errors
-three times larger, and not a companion. Of a joint fit each file may be judged by itself:
+three times larger, and not a companion. Of a joint fit each file may have noise of its own:
 one with calibration errors of its own then does not spoil the others.
 """
 

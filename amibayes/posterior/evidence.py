@@ -117,7 +117,7 @@ def compare_models(
     companions : sequence of int
         Out of 0, 1, 2.
     grid : GridPosterior, optional
-        Of the same likelihood and prior; without it one companion is weighed by importance.
+        Of the same likelihood and prior; without it one companion is integrated by importance.
     two : TwoCompanions
         Needed for 2.
     method : {"direct", "laplace", "nested"}

@@ -188,8 +188,8 @@ def _refuse_without_errors(product: Product) -> None:
 
 def _integrations(group: list[Product], options: dict[str, Any]) -> Observables:
     pairs = [repaired(product) for product in group]
-    mended = [replace(p, oifits=oifits) for p, (oifits, _) in zip(group, pairs, strict=True)]
-    found = averaged(mended, **options)
+    corrected = [replace(p, oifits=oifits) for p, (oifits, _) in zip(group, pairs, strict=True)]
+    found = averaged(corrected, **options)
     what = (
         f"{found.n_integrations} integrations: values and joint covariance from them "
         "(errors of the file are 0)"
