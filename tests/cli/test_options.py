@@ -17,7 +17,11 @@ from amibayes.extraction import ExtractOptions
 from amibayes.extraction.reading import ImageOptions
 from amibayes.pipeline.limits import LimitsOptions
 from amibayes.pipeline.options import SearchOptions
-from amibayes.support.options import EXTRACTION_METHODS, entry
+from amibayes.support.options import EVIDENCE_METHODS, EXTRACTION_METHODS, entry
+
+
+TABLES = {"method": EXTRACTION_METHODS, "evidence_method": EVIDENCE_METHODS}
+"""Choices that are a table, to which a kind may be added."""
 
 
 def parsed(command: str, *words: str) -> argparse.Namespace:
@@ -47,7 +51,7 @@ def test_docstrings_list_the_choices(kind: type) -> None:
     listed = dict(re.findall(r"^    (\w+) : \{(.*?)\}", str(kind.__doc__), flags=re.MULTILINE))
     hints = get_type_hints(kind)
     for name in listed:
-        known = list(literals(hints[name])) or list(EXTRACTION_METHODS)
+        known = list(literals(hints[name])) or list(TABLES[name])
         assert re.findall(r'"(.*?)"', listed[name]) == known, name
 
 
