@@ -165,14 +165,20 @@ def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> Float
 
 
 def global_check(
-    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, deviance_single: float
+    likelihood: Likelihood,
+    coarse: Likelihood,
+    bank: TemplateBank,
+    box: Box,
+    single: FloatArray,
+    deviance_single: float,
 ) -> Mode:
     """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
 
     It shares neither the lattice nor the choice of peaks with the search. A field of very
-    many fringes is more than it can cover; what it finds is a lower bound then.
+    many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
+    ``coarse``, the same data or those with their channels averaged.
     """
-    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    residuals = single_likelihood(coarse).residuals(single)[:, 0]
     best_at = bank.matched_filter(residuals)
 
     def inside(position: FloatArray) -> bool:

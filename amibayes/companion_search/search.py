@@ -81,7 +81,7 @@ def search(
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
     found = _fits(likelihood, grid, survey, single, box, deviance_single, known)
-    check = global_check(likelihood, bank, box, single, deviance_single)
+    check = _checked(likelihood, bank, box, single, deviance_single)
     every = distinct_modes([*found, check], box.fringe_mas)
     modes, aliases = innermost_first(likelihood, every, single)
     theta = np.array(modes[0].theta)
@@ -153,6 +153,16 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
             source="--separation",
             remedy=f"narrow the range: at most {MAX_POSITIONS:.0e} are searched",
         )
+
+
+def _checked(
+    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, deviance_single: float
+) -> Mode:
+    """Global check by NLopt; of large data with their channels averaged."""
+    coarse = coarse_likelihood(likelihood, box)
+    if coarse is not likelihood:
+        bank = TemplateBank(coarse, make_grid(box.inner_mas, box.outer_mas, box.fringe_mas), single)
+    return global_check(likelihood, coarse, bank, box, single, deviance_single)
 
 
 def _fits(

@@ -42,8 +42,9 @@ from halfway between them a local fit arrives."""
 MAX_COARSE_DATA = 2000
 """Data above which local fits begin with channels averaged."""
 
-ROUGHNESS = 0.1
-"""Part of the best gain by which rough fits may stand in another order than complete ones."""
+ROUGHNESS, COARSENESS = 0.1, 0.02
+"""Part of the best gain by which fits may stand in another order than complete ones: fits that
+stop early, and fits with channels averaged."""
 
 
 def linear_seeds(
@@ -115,9 +116,14 @@ def refine_all(
     coarse = coarse_likelihood(likelihood, box)
     base = float(coarse.deviance(coarse.chi2(_without(coarse, seeds[:1])))[0])
     tried = [refine(coarse, seed, box, base, rough=True) for seed in seeds]
-    starts = np.array([m.theta for m in _best_distinct(tried, box.fringe_mas)])
-    large = with_large_discs(likelihood, starts[:MIN_SEEDS], box)
-    return [refine(likelihood, s, box, deviance_single) for s in np.vstack([starts, large])]
+    kept = _best_distinct(tried, box.fringe_mas, MIN_SEEDS, ROUGHNESS)
+    starts = np.array([m.theta for m in kept])
+    starts = np.vstack([starts, with_large_discs(likelihood, starts[:MIN_SEEDS], box)])
+    if coarse is not likelihood:
+        fitted = [refine(coarse, start, box, base) for start in starts]
+        kept = _best_distinct(fitted, box.fringe_mas, 1, COARSENESS)
+        starts = np.array([m.theta for m in kept])
+    return [refine(likelihood, start, box, deviance_single) for start in starts]
 
 
 def _without(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
@@ -127,13 +133,15 @@ def _without(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     return dark
 
 
-def _best_distinct(modes: Sequence[Mode], fringe_mas: float) -> list[Mode]:
+def _best_distinct(
+    modes: Sequence[Mode], fringe_mas: float, least: int, uncertain: float
+) -> list[Mode]:
     """Modes that a complete fit may make the best, or one worth reporting, each place once."""
     kept: list[Mode] = []
     for mode in sorted(modes, key=lambda m: -m.delta_chi2):
         best = max([mode, *kept[:1]], key=lambda m: m.delta_chi2).delta_chi2
-        far = mode.delta_chi2 < best - max(2.0 * MODE_LIMIT, ROUGHNESS * best)
-        if len(kept) >= MIN_SEEDS and (far or len(kept) == MAX_SEEDS):
+        far = mode.delta_chi2 < best - max(2.0 * MODE_LIMIT, uncertain * best)
+        if len(kept) >= least and (far or len(kept) == MAX_SEEDS):
             break
         near = [np.hypot(*np.subtract(mode.place, k.place)) < 0.1 * fringe_mas for k in kept]
         if not any(near):

@@ -31,6 +31,7 @@ def search_with_noise(
     *,
     per_file: bool = False,
     prior: NoisePrior | None = None,
+    first: SearchResult | None = None,
 ) -> tuple[SearchResult, ExtraNoise]:
     """Search, and search again with the noise that the best of the models leaves.
 
@@ -47,6 +48,8 @@ def search_with_noise(
     per_file : bool
         Fit the noise of every file by itself.
     prior : NoisePrior, optional
+    first : SearchResult, optional
+        The search with the stated errors, if it is known.
 
     Returns
     -------
@@ -55,7 +58,7 @@ def search_with_noise(
     noise : ExtraNoise
         None (zeros) where the stated errors explain the residuals.
     """
-    result, noise = search(likelihood, separation_mas), ExtraNoise()
+    result, noise = first or search(likelihood, separation_mas), ExtraNoise()
     tried = [(_score(result), result, noise)]
     converged = False
     while not converged and len(tried) <= MAX_ROUNDS:

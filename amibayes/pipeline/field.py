@@ -70,10 +70,10 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
                 f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
                 "default one, a companion fits better than anywhere inside"
             ]
-    result, noise = _searched(likelihood, field, options)
-    if options.companion_diameter is None and shows_disc(likelihood, result):
-        free = replace(likelihood.model, companion_diameter_mas="free")
-        result, noise = _searched(likelihood.with_model(free), field, options)
+    first = search(likelihood, field)
+    if options.companion_diameter is None and shows_disc(likelihood, first):
+        first = _search_for_disc(likelihood, first)
+    result, noise = _searched(first, options)
     if options.separation_mas:
         warnings = _beyond(result)
     return FieldSearch(result, noise, tuple(warnings))
@@ -92,26 +92,32 @@ def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
     grid = result.grid
     box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
     point = refine(likelihood, result.theta, box, 0.0)
-    theta = with_disc(disc, np.array(point.theta), box)
-    chi2 = [
-        float(model.chi2(np.array(fit.theta))[0])
-        for model, fit in ((likelihood, point), (disc, refine(disc, theta, box, 0.0)))
-    ]
+    larger = refine(disc, with_disc(disc, np.array(point.theta), box), box, 0.0)
+    fits = (likelihood, point), (disc, larger)
+    chi2 = [float(model.chi2(np.array(fit.theta))[0]) for model, fit in fits]
     scaled = likelihood.n_independent * np.log(chi2[0] / chi2[1])
     return bool(min(chi2[0] - chi2[1], scaled) > SURELY_A_DISC)
 
 
-def _searched(
-    likelihood: Likelihood, field: tuple[float, float] | None, options: SearchOptions
-) -> tuple[SearchResult, ExtraNoise]:
-    """Search one field with the noise that was asked for."""
+def _search_for_disc(likelihood: Likelihood, point: SearchResult) -> SearchResult:
+    """Search again with a free disc of the companion, from what was found for a point."""
+    free = replace(likelihood.model, companion_diameter_mas="free")
+    disc, grid = likelihood.with_model(free), point.grid
+    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    known = np.array([with_disc(disc, np.array(m.theta), box) for m in point.modes])
+    return search(disc, (grid.inner_mas, grid.outer_mas), known=known)
+
+
+def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult, ExtraNoise]:
+    """Search the field of a search with stated errors with the noise that was asked for."""
     apart = options.file_noise is not False
+    likelihood, field = first.likelihood, (first.grid.inner_mas, first.grid.outer_mas)
     if options.robust:
         return search_robust(likelihood, field, free_scale=options.extra_noise, per_file=apart)
     prior = noise_prior(likelihood.observables, options)
     if options.extra_noise or options.channel_noise or prior.floors:
-        return search_with_noise(likelihood, field, per_file=apart, prior=prior)
-    return search(likelihood, field), ExtraNoise()
+        return search_with_noise(likelihood, field, per_file=apart, prior=prior, first=first)
+    return first, ExtraNoise()
 
 
 def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
