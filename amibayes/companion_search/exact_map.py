@@ -19,8 +19,9 @@ from amibayes.companion_search.phasors import WIDTH, LatticePhasors
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.units import FloatArray, IntArray
 
-LADDER = (0.05, 0.12, 0.25, 0.5, 0.8)
-"""Contrasts at which χ² is evaluated, in steps small enough for a local fit to close them."""
+LADDER = (0.05, 0.12, 0.25, 0.45, 0.7, 0.95)
+"""Contrasts at which χ² is evaluated, in steps small enough for a local fit to close them; the
+last one near 1, where phases of triangles turn over."""
 
 
 @dataclass(frozen=True, eq=False)

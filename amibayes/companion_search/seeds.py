@@ -29,8 +29,12 @@ NOT_FAINT = 0.05
 STRONG = 100.0
 """Δχ² above which c² counts even for faint companions, and a poor map may hide the best."""
 
-BRIGHT_STEPS_PER_FRINGE = 5
-"""Positions of the exact map per λ/B_max: from half of a step away a local fit arrives."""
+MIN_BRIGHT_STEPS, MAX_BRIGHT_STEPS = 5, 7
+"""Positions of the exact map per λ/B_max: from half of a step away a local fit arrives. Strong
+data need the finer ones, which cost twice as much."""
+
+EXACT_WORK = 4e7
+"""Model values (points, positions, contrasts) of an exact map: some two seconds."""
 
 PEAKS_PER_CONTRAST, MAX_BRIGHT_SEEDS = 8, 12
 """Peaks of the exact map that are fitted: at each contrast, and in all for each star."""
@@ -79,7 +83,10 @@ def trial_stars(likelihood: Likelihood, single: FloatArray, box: Box) -> list[Fl
 
 def bright_seeds(likelihood: Likelihood, nuisance: FloatArray, box: Box) -> FloatArray:
     """Peaks of the exact map at each of its contrasts, (n, n_dim), each place once."""
-    grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas / BRIGHT_STEPS_PER_FRINGE)
+    area = np.pi * (box.outer_mas**2 - box.inner_mas**2) / box.fringe_mas**2
+    affordable = np.sqrt(EXACT_WORK / (area * len(likelihood.samples) * len(LADDER)))
+    steps = np.clip(affordable, MIN_BRIGHT_STEPS, MAX_BRIGHT_STEPS)
+    grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas / float(steps))
     found = exact_map(likelihood, grid, nuisance)
     tops: list[tuple[float, int, float]] = []
     for chi2, contrast in zip(found.chi2, LADDER, strict=True):
