@@ -54,7 +54,7 @@ def coverage(name: str, vis2_error: float, closure_error_rad: float) -> Observab
         "pionier": (AT, np.linspace(1.53e-6, 1.77e-6, 4), (0.0, 20.0, 45.0)),
         "gravity": (UT, np.linspace(2.0e-6, 2.4e-6, 8), (0.0, 25.0)),
         "mirc4t": (CHARA[[0, 2, 4, 5]], np.linspace(1.5e-6, 1.75e-6, 6), (0.0, 30.0)),
-        "mirc6t": (CHARA, np.linspace(1.5e-6, 1.75e-6, 6), (0.0,)),
+        "mirc6t": (CHARA, np.linspace(1.5e-6, 1.75e-6, 4), (0.0,)),
     }[name]
     return exposures(stations, wavelengths, turns, errors)
 
