@@ -155,10 +155,9 @@ def add_model(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--limb-darkening",
         type=common.number_or_free,
-        default=0.0,
         metavar="ALPHA|free",
         help="brightness of the primary's disc goes as mu to the power of ALPHA (default: 0, a "
-        "uniform disc)",
+        "uniform disc; free where V2 reaches past the disc's first null)",
     )
     group.add_argument(
         "--companion-diameter",

@@ -12,7 +12,7 @@ from amibayes.companion_search.field import (
     look_inside,
     resolution_mas,
 )
-from amibayes.companion_search.optimise import refine, with_disc
+from amibayes.companion_search.optimise import fit_single, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
 from amibayes.companion_search.search import search
@@ -26,6 +26,7 @@ from amibayes.models.bands import reference_wavelength
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 from amibayes.pipeline.options import SearchOptions
+from amibayes.units import MAS
 
 DISC_CONTRAST = 0.03
 """Contrast below which a disc is not tried unasked: as large as the star's it would have a surface
@@ -146,18 +147,38 @@ def _beyond(result: SearchResult) -> list[str]:
     return found
 
 
+def past_first_null(likelihood: Likelihood) -> bool:
+    """Whether the star is so large that the longest baseline is past the null of its V².
+
+    There a uniform disc misses the height of the lobes, which limb darkening lowers, by more
+    than what a faint companion does; before the null a larger disc looks the same.
+    """
+    if not likelihood.observables.n_vis2:
+        return False
+    disc = likelihood.with_model(BinaryModel(1, "free"))
+    (diameter,), _ = fit_single(disc)
+    return bool(np.pi * diameter * MAS * likelihood.samples.frequency.max() > FIRST_NULL)
+
+
+FIRST_NULL = 3.83
+"""First zero of J₁."""
+
+
 def model_of(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
     """Make the model of one companion that the options ask for."""
     diameter, disc = options.diameter, options.companion_diameter
     coloured = options.contrast_slope != 0.0
     if diameter is None:
         diameter = "free" if likelihood.observables.n_vis2 else 0.0
+    darkening = options.limb_darkening
+    if darkening is None:
+        darkening = "free" if diameter == "free" and past_first_null(likelihood) else 0.0
     return BinaryModel(
         1,
         diameter,
         options.background,
         options.smearing,
-        limb_darkening=options.limb_darkening,
+        limb_darkening=darkening,
         companion_diameter_mas=0.0 if disc is None else disc,
         contrast_slope=options.contrast_slope,
         reference_wavelength_m=reference_wavelength(likelihood.observables) if coloured else 0.0,

@@ -35,8 +35,9 @@ class SearchOptions:
     observables : tuple of {"vis2", "cp"}
     diameter : float, "free" or None
         Diameter of the primary, mas. None: free where V² is used, else 0.
-    limb_darkening : float or "free"
-        Exponent α of the brightness μ^α of the primary's disc.
+    limb_darkening : float, "free" or None
+        Exponent α of the brightness μ^α of the primary's disc. None: 0, and free where V²
+        reaches past the first null of a free disc.
     companion_diameter : float, "free" or None
         Uniform-disc diameter of companions, mas. None: 0, or free where V² shows the disc of
         the companion that is found.
@@ -110,7 +111,7 @@ class SearchOptions:
     separation_mas: tuple[float, float] | None = None
     observables: tuple[str, ...] = OBSERVABLES
     diameter: float | Literal["free"] | None = None
-    limb_darkening: float | Literal["free"] = 0.0
+    limb_darkening: float | Literal["free"] | None = None
     companion_diameter: float | Literal["free"] | None = None
     contrast_slope: float | Literal["free"] = 0.0
     background: float | Literal["free"] = 0.0
