@@ -342,6 +342,7 @@ DATA_SETS: tuple[DataSet, ...] = (
         lambda d: companion(iota_peg(d), model(**BINARY_DISCS), (1.0, 30.0)),
         {},
         needs=("companion_diameter_mas",),
+        slow=True,
     ),
     *(
         DataSet(
