@@ -418,7 +418,7 @@ DATA_SETS: tuple[DataSet, ...] = (
             "flux ratio (%)": (0.97, 0.0),
         },
         jwst_product,
-        {},
+        {"flux ratio (%)": "the fit's response to light off the axis is corrected; truth 1.00"},
     ),
     DataSet(
         "NIRISS F480M images, simulated by ami_sim",
