@@ -286,6 +286,6 @@ def _minimise(
         except nlopt.RoundoffLimited:
             pass  # it can improve no further: the best point stands
         except nlopt.runtime_error:
-            continue  # its quadratic subproblem failed: the slower, sturdier one goes on
+            continue  # its quadratic subproblem failed: the slower one, which has none, goes on
         break
     return best * scale, least

@@ -100,7 +100,7 @@ def search(
         bank_contrast=survey.contrast,
         bank_sigma=survey.sigma,
         global_check=check,
-        warnings=_doubts(modes, aliases, found, check),
+        warnings=_warnings(modes, aliases, found, check),
         joint_gain=survey.gain if bank.joint else None,
     )
 
@@ -237,7 +237,7 @@ def innermost_first(
     -------
     modes : tuple of Mode
     aliases : tuple of Mode
-        Those the first one cannot be told from.
+        Those that fit as well as the first one.
     """
     thetas = np.array([m.theta for m in modes])
     data = likelihood.noise.whiten(likelihood.predict(thetas))
@@ -256,7 +256,7 @@ def innermost_first(
     return (first, *rest), tuple(m for m in group if m is not first)
 
 
-def _doubts(
+def _warnings(
     modes: Sequence[Mode], aliases: Sequence[Mode], found: Sequence[Mode], check: Mode
 ) -> tuple[str, ...]:
     warnings = []
