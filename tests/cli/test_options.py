@@ -19,7 +19,6 @@ from amibayes.pipeline.limits import LimitsOptions
 from amibayes.pipeline.options import SearchOptions
 from amibayes.support.options import EVIDENCE_METHODS, EXTRACTION_METHODS, entry
 
-
 TABLES = {"method": EXTRACTION_METHODS, "evidence_method": EVIDENCE_METHODS}
 """Choices that are a table, to which a kind may be added."""
 
