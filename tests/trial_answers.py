@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from amibayes.detection.verdict import STATEMENTS
 from amibayes.validation import QUICK
 from amibayes.validation.plan import ValidationPlan
 
@@ -18,7 +19,8 @@ def answers(plan: ValidationPlan, seed: int = 1, **spoilt: float):
     for kind in plan.kinds:
         alarm = rng.random() ** spoilt.get("alarm", 1.0)
         if kind == "alone":
-            yield {"false_alarm_probability": alarm}
+            star = "companion" if rng.random() < spoilt.get("verdict", 0.002) else "no companion"
+            yield {"false_alarm_probability": alarm, "statement": STATEMENTS.index(star)}
             continue
         rank = rng.random(3) ** np.array([1.0, 1.0, spoilt.get("contrast", 1.0)])
         chance = rng.random()
@@ -29,4 +31,5 @@ def answers(plan: ValidationPlan, seed: int = 1, **spoilt: float):
             "covered": rng.random((3, 2)) < spoilt.get("coverage", 1.0) * np.array([0.68, 0.95]),
             "found": rng.random() < chance * spoilt.get("found", 1.0),
             "expected": chance,
+            "statement": STATEMENTS.index("companion"),
         }

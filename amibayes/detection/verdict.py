@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
+
+import numpy as np
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.residuals import files_of
 
 Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
+
+STATEMENTS: tuple[Statement, ...] = get_args(Statement)
+"""All of them, in that order."""
 
 NAMES = {"vis2": "V²", "cp": "closure phases"}
 
@@ -61,7 +67,7 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    fit = chi2_survival(result.chi2_binary, result.ndof, result.likelihood.degrees)
+    fit = fit_probability(result)
     p_model = min(1.0, 2.0 * min(fit, structure.probability))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     for split in apart:
@@ -74,6 +80,27 @@ def verdict(
     if tested.detected:
         return Verdict("companion", _found(tested), p_model)
     return Verdict("no companion", _nothing(tested), p_model)
+
+
+def fit_probability(result: SearchResult) -> float:
+    """Probability of a χ² as large as that of the best fit, with the noise that was fitted.
+
+    Noise is fitted to each kind of observable of each file where its χ² asks for it: their
+    probabilities count, the smallest times their number. That of all data together would refuse
+    a model for misfits that noise within its prior explains, but that no part asks for.
+    """
+    likelihood = result.likelihood
+    difference = likelihood.difference(np.atleast_2d(result.theta))[:, 0]
+    covariance, share = likelihood.noise.covariance, result.ndof / likelihood.n_independent
+    masks = [f.of_kind(kind) for f in files_of(likelihood.observables) for kind in ("vis2", "cp")]
+    found = []
+    for at in (np.flatnonzero(mask) for mask in masks):
+        if not len(at):
+            continue
+        part = covariance.select(at)
+        chi2 = float((part.whiten(difference[at]) ** 2).sum())
+        found.append(chi2_survival(chi2, share * part.rank, likelihood.degrees))
+    return min(1.0, len(found) * min(found))
 
 
 def _apart(split: Consistency) -> str:

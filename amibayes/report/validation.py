@@ -40,6 +40,8 @@ EXPLAINED = {
     "come up with probability p.",
     "completeness": "Companions must be found as often as the detection limits of the same data "
     "state.",
+    "verdicts": "The model is right in every trial: it may be refused, and a single star called a "
+    "companion, no more often than stated.",
 }
 
 PICTURES = {
@@ -117,7 +119,15 @@ def _trials_json(validation: Validation) -> dict[str, Any]:
     def listed(array: Any) -> Any:
         return [listed(x) if np.ndim(x) else number(x) for x in array]
 
-    columns = ("false_alarm_probability", "truth", "rank", "covered", "found", "expected")
+    columns = (
+        "false_alarm_probability",
+        "truth",
+        "rank",
+        "covered",
+        "found",
+        "expected",
+        "statement",
+    )
     return {"kind": list(validation.kind)} | {
         name: listed(getattr(validation, name)) for name in columns
     }
@@ -207,7 +217,7 @@ def _section(validation: Validation, group: str, figures: dict[str, Figure]) -> 
         group.capitalize(),
         (EXPLAINED[group],),
         tables=(Table(caption, COLUMNS, rows),),
-        figures=(figures[PICTURES[group][0]],),
+        figures=(figures[PICTURES[group][0]],) if group in PICTURES else (),
     )
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from amibayes.detection.verdict import STATEMENTS
 from amibayes.units import BoolArray, FloatArray, IntArray
 from amibayes.validation.plan import RANGES, ValidationPlan
 from amibayes.validation.trial import COVERED, LEVELS, RANKED
@@ -37,7 +38,7 @@ class Check:
     Parameters
     ----------
     group : str
-        ``ranks``, ``coverage``, ``false alarms`` or ``completeness``.
+        ``ranks``, ``coverage``, ``false alarms``, ``completeness`` or ``verdicts``.
     name : str
     n : int
         Trials it rests on.
@@ -77,6 +78,8 @@ class Validation:
         1 where the interval of a quantity of `COVERED` at a level of `LEVELS` holds the truth.
     found, expected : (n,) float array
         Whether it was found, and the probability that the limits state for it.
+    statement : (n,) float array
+        Number of the verdict's statement in `amibayes.detection.verdict.STATEMENTS`.
     checks : tuple of Check
     """
 
@@ -89,6 +92,7 @@ class Validation:
     covered: FloatArray
     found: FloatArray
     expected: FloatArray
+    statement: FloatArray
     checks: tuple[Check, ...]
 
     @property
@@ -118,6 +122,7 @@ def tally(plan: ValidationPlan, seed: int, answers: Sequence[Mapping[str, Any]])
         "covered": np.full((len(COVERED), len(LEVELS)), np.nan),
         "found": np.nan,
         "expected": np.nan,
+        "statement": np.nan,
     }
     columns = {
         name: np.array([a.get(name, value) for a in answers], dtype=float)
@@ -129,6 +134,7 @@ def tally(plan: ValidationPlan, seed: int, answers: Sequence[Mapping[str, Any]])
         *_coverage_checks(columns["covered"]),
         *_alarm_checks(alarm[np.array(kinds) == "alone"], plan.null_draws),
         *_completeness_checks(columns["found"], columns["expected"]),
+        *_verdict_checks(kinds, columns["statement"], plan.alpha),
     )
     return Validation(plan, seed, kinds, alarm, **columns, checks=checks)
 
@@ -162,6 +168,27 @@ def _completeness_checks(found: FloatArray, expected: FloatArray) -> Iterable[Ch
     yield unequal("completeness", "companions found within the range of the limits", hit, chance)
     near = (chance > 0.05) & (chance < 0.95)
     yield unequal("completeness", "the same, near the limit", hit[near], chance[near])
+
+
+def _verdict_checks(kinds: Sequence[str], statement: FloatArray, alpha: float) -> Iterable[Check]:
+    """The model is right in every trial: how often it is refused, or a star called a companion."""
+    known = np.isfinite(statement)
+    alone = (np.array(kinds) == "alone")[known]
+    told = statement[known]
+    refused = told >= STATEMENTS.index("model rejected")
+    yield at_most("verdicts", "right models refused", refused, 2.0 * alpha)
+    companions = told[alone] == STATEMENTS.index("companion")
+    yield at_most("verdicts", "single stars called a companion", companions, alpha)
+
+
+def at_most(group: str, name: str, hits: BoolArray, largest: float) -> Check:
+    """Check that a rate is not above a stated one (one-sided binomial)."""
+    n, count = len(hits), int(np.sum(hits))
+    if n < FEWEST:
+        return Check(group, name, n, np.nan, largest, np.nan, 1.0)
+    p_value = float(stats.binomtest(count, n, largest, alternative="greater").pvalue)
+    error = float(np.sqrt(largest * (1.0 - largest) / n))
+    return Check(group, name, n, count / n, largest, error, p_value)
 
 
 def uniformity(group: str, name: str, values: FloatArray) -> Check:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,19 +10,21 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import calibrate
 from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.with_extra_noise import noise_averaged
 from amibayes.cube import Cube
 from amibayes.data.observables import Observables
+from amibayes.detection.verdict import STATEMENTS
 from amibayes.errors import AmibayesError, RunError
 from amibayes.extraction import ExtractOptions, extract
 from amibayes.instrument import load_instrument
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import at_its_place
 from amibayes.parallel import child_seeds
-from amibayes.pipeline.false_alarm import false_alarm
-from amibayes.pipeline.field import search_field
+from amibayes.pipeline.false_alarm import false_alarm, verdict_of
+from amibayes.pipeline.field import noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.posterior.grid import GridPosterior, grid_posterior
-from amibayes.posterior.priors import Prior
+from amibayes.posterior.priors import Prior, default_prior
 from amibayes.scene.sources import Point, Scene
 from amibayes.scene.spectrum import g2v
 from amibayes.simulation import Detector, Exposure, draw_maps, simulate
@@ -54,8 +57,9 @@ def run_trial(plan: ValidationPlan, piece: Piece) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``false_alarm_probability``, and for a companion ``truth`` (3,), ``rank`` (3,),
-        ``covered`` (3, 2), ``found``, ``expected`` (probability that it would be found).
+        ``false_alarm_probability``, ``statement`` (number in `STATEMENTS`), and for a
+        companion ``truth`` (3,), ``rank`` (3,), ``covered`` (3, 2), ``found``, ``expected``
+        (probability that it would be found).
 
     Raises
     ------
@@ -119,12 +123,28 @@ def _analysed(
     seeds: tuple[np.random.SeedSequence, np.random.SeedSequence],
 ) -> dict[str, Any]:
     options = SearchOptions(separation_mas=FIELD_MAS, alpha=plan.alpha, null_draws=plan.null_draws)
-    result = search_field(observables, options).result
-    tested = false_alarm(result, options, np.random.default_rng(seeds[0]), None, None)
-    answer: dict[str, Any] = {"false_alarm_probability": tested.probability}
+    field = search_field(observables, options)
+    result = field.result
+    streams = [np.random.default_rng(s) for s in child_seeds(seeds[0], 2)]
+    tested = false_alarm(result, options, streams[0])
+    verdict, _ = verdict_of(result, tested, observables, options, streams[1])
+    answer: dict[str, Any] = {
+        "false_alarm_probability": tested.probability,
+        "statement": STATEMENTS.index(verdict.statement),
+    }
     if truth is None:
         return answer
-    grid = grid_posterior(result.likelihood, prior)
+    # The posterior that a search delivers: averaged over the unknown extra noise.
+    delivered, _ = noise_averaged(
+        result,
+        None,
+        observables,
+        channels=field.noise.channels,
+        prior=noise_prior(observables, options),
+    )
+    own = default_prior(result.likelihood, *FIELD_MAS)
+    own = replace(own, contrast_min=prior.contrast_min, contrast_max=prior.contrast_max)
+    grid = grid_posterior(delivered.likelihood, own)
     limits = detection_limit(
         result, tested, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
     )

@@ -28,7 +28,7 @@ from amibayes.validation.trial import run_trial
 
 
 def test_a_sound_programme_passes() -> None:
-    """21 checks at 1e-3 on fixed seeds; 1 of 50 runs may fail one by chance, here none does."""
+    """23 checks at 1e-3 on fixed seeds; 1 of 50 runs may fail one by chance, here none does."""
     validation = tally(PLAN, 1, list(answers(PLAN)))
     assert validation.passed, [c for c in validation.checks if not c.passed]
     assert {c.n for c in validation.checks if c.group == "ranks"} == {100}
@@ -42,6 +42,7 @@ def test_a_sound_programme_passes() -> None:
         ("contrast", 2.0, "ranks"),
         ("coverage", 0.8, "coverage"),
         ("found", 0.75, "completeness"),
+        ("verdict", 0.06, "verdicts"),
     ],
 )
 def test_a_fault_is_found_where_it_is(fault: str, size: float, group: str) -> None:
@@ -120,10 +121,10 @@ def test_the_page_says_what_holds_and_what_fails(tmp_path) -> None:
     sound = tally(PLAN, 1, list(answers(PLAN)))
     bad = tally(PLAN, 3, list(answers(PLAN, 3, coverage=0.8)))
     failing = [check for check in bad.checks if not check.passed]
-    assert validation_table(sound)[-1] == "All 21 checks hold."
+    assert validation_table(sound)[-1] == "All 23 checks hold."
     *rows, last = validation_table(bad)[1:]
     assert [row[:52].strip() for row in rows] == [check.name for check in failing]
-    assert last.startswith(f"{len(failing)} of 21 checks fail: {failing[0].name}")
+    assert last.startswith(f"{len(failing)} of 23 checks fail: {failing[0].name}")
     figures = {}
     for name, drawing in validation_pictures(bad).items():
         save(drawing, tmp_path / f"{name}.png")
@@ -196,7 +197,7 @@ def test_command_writes_page_pictures_and_numbers(small, tmp_path, monkeypatch, 
     assert main(["validate", "--out", str(out), "--seed", "5", "--quiet"]) == 0
     content = json.loads((out / "validation.json").read_text())
     assert content["n_trials"] == 4
-    assert len(content["checks"]) == 21
+    assert len(content["checks"]) == 23
     assert content["trials"]["found"].count(None) == 1
     page = (out / "validation.html").read_text()
     assert page.count("data:image/png") == 4
