@@ -20,17 +20,20 @@ from amibayes.support.terminal import row, with_warnings
 EVEN = 0.5
 """Probability that the stated errors are correct, above which extra noise is left out."""
 
+UNRESOLVED = 2.0
+"""Errors that a disc has to measure before its size is given: below, a bound says more."""
+
 
 def summary(report: SearchReport, folder: Path) -> list[str]:
     """Write the result in at most 20 lines."""
     result = report.result
     used = result.likelihood.observables
     lines = [
+        *_statement(report),
         f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
         f"{len(result.grid)} positions",
-        *_statement(report),
         _verdict(report),
         *_best_fit(report),
         f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
@@ -133,8 +136,13 @@ def _nuisance_lines(result: SearchResult) -> list[str]:
     for k in parameters.nuisance:
         name = parameters[k].name
         label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
-        error = np.sqrt(result.theta_covariance[k, k])
-        lines.append(row(label, f"{result.theta[k]:.4f} +/- {error:.4f}{unit}"))
+        value, error = float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k]))
+        if name == "diameter_mas" and value < UNRESOLVED * error:
+            bound = value + UNRESOLVED * error
+            shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
+        else:
+            shown = f"{value:.4f} +/- {error:.4f}{unit}"
+        lines.append(row(label, shown))
     return lines
 
 
