@@ -74,8 +74,10 @@ class CubeStream:
         error: NDArray[Any] | None = None,
         dq: NDArray[Any] | None = None,
     ) -> None:
-        """Write consecutive integrations from number ``start`` on."""
-        for name, planes in (("SCI", images), ("ERR", error), ("DQ", dq)):
+        """Write consecutive integrations from number ``start`` on; without ``dq`` all are good."""
+        # Left unwritten, the bytes 0 of an unsigned plane would read as its highest bit.
+        flags = np.zeros(images.shape, dtype=np.uint32) if dq is None else dq
+        for name, planes in (("SCI", images), ("ERR", error), ("DQ", flags)):
             if planes is not None:
                 self._stream.write(name, start, planes)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 
@@ -28,6 +28,9 @@ class Systematics:
     vis2 : float
         Relative to V².
     closure_phase_rad : float
+    visibility : float
+        Additive, coherent error of the visibility: 2|V| times it in V². It is what is left near
+        a null, where a gain is nothing.
     instrument : str
         Entry of the table; empty for a floor that was asked for.
     reference : str
@@ -37,17 +40,25 @@ class Systematics:
     source: str
     vis2: float
     closure_phase_rad: float
+    visibility: float = 0.0
     instrument: str = ""
     reference: str = ""
 
 
 @cache
-def table() -> tuple[tuple[str, float, float, str], ...]:
-    """Name, V², closure phase in radians and reference of each instrument."""
+def table() -> tuple[Systematics, ...]:
+    """Floor of each instrument; of no file yet."""
     path = resources.files("amibayes.data") / "systematics.toml"
     found = tomllib.loads(path.read_text(encoding="utf-8"))
     return tuple(
-        (name, e["vis2"], float(np.radians(e["closure_phase_deg"])), e["reference"])
+        Systematics(
+            "",
+            e["vis2"],
+            float(np.radians(e["closure_phase_deg"])),
+            e["visibility"],
+            name,
+            e["reference"],
+        )
         for name, e in found.items()
     )
 
@@ -78,9 +89,9 @@ def systematics_of(
 
 def _tabulated(source: str, insnames: Sequence[str]) -> Systematics | None:
     for insname in insnames:
-        for name, vis2, closure, reference in table():
-            if insname.upper().startswith(name):
-                return Systematics(source, vis2, closure, name, reference)
+        for floor in table():
+            if insname.upper().startswith(floor.instrument):
+                return replace(floor, source=source)
     return None
 
 

@@ -177,11 +177,13 @@ def channel_covariance(
 
 
 def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:
-    """Floor of every row, (rank,), sorted as the layout."""
+    """Variance by the floors of every row, in its errors, (rank,), sorted as the layout."""
     out = np.zeros(len(layout.order))
     for floor in floors:
         here = layout.source == layout.names.index(floor.source)
-        out[here] = np.where(layout.vis2[here], floor.vis2, floor.closure_phase_rad)
+        gain = np.where(layout.vis2, floor.vis2, floor.closure_phase_rad) * layout.unit
+        coherent = floor.visibility * layout.amplitude
+        out[here] = (gain**2 + coherent**2)[here]
     return out
 
 
@@ -229,7 +231,7 @@ def correlation_of(
     if not layout.any:
         return Correlation()
     both = np.column_stack([residual, jacobian])[layout.order]
-    further = (floor_of_rows(layout, floors) * layout.unit) ** 2
+    further = floor_of_rows(layout, floors)
     loss = np.array([_losses(layout, both, further, phi) for phi in NEIGHBOUR])
     mass = np.exp(-0.5 * (loss - loss.min())) * _widths(NEIGHBOUR)[:, None]
     mass /= mass.sum()

@@ -34,6 +34,8 @@ class ChannelLayout:
         Shape of the common error in units of the errors, of unit mean square in each group.
     unit : (rank,) float array
         Root mean square of that shape in its group, before: V² (or a radian) in errors.
+    amplitude : (rank,) float array
+        Root mean square of 2|V| in errors of V², in the group; 0 of closure phases.
     vis2 : (rank,) bool array
         Rows of V².
     source : (rank,) int array
@@ -46,6 +48,7 @@ class ChannelLayout:
     gap: FloatArray
     weight: FloatArray
     unit: FloatArray
+    amplitude: FloatArray
     vis2: BoolArray
     source: IntArray
     names: tuple[str, ...]
@@ -87,14 +90,14 @@ class ChannelLayout:
                 self.starts, 0.0, np.power(neighbour, np.where(self.starts, 1, self.gap))
             )
 
-    def turned(self, common: FloatArray, neighbour: FloatArray, floor: FloatArray) -> ChannelRows:
-        """Rows for shares ρ, correlations φ and further common errors (rank,), sorted likewise.
+    def turned(self, common: FloatArray, neighbour: FloatArray, further: FloatArray) -> ChannelRows:
+        """Rows for shares ρ, correlations φ and variances of further common errors (rank,).
 
-        The last are relative for V², in radians for closure phases.
+        All sorted likewise; the last in units of the errors.
         """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
-        variance, further = np.ones(n), (floor * self.unit) ** 2
+        variance = np.ones(n)
         parts: list[tuple[IntArray, IntArray, FloatArray]] = []
         for first, last in pairwise(cuts):
             if last == first + 1:
@@ -109,7 +112,7 @@ class ChannelLayout:
             rest = np.maximum(variance_of(row, value, phi), 1.0)
             rest = (1.0 - rho) * rest
             # A floor says that exposures are too few to tell: no errors then shrink by a fit.
-            variance[first:last] = np.maximum(rest, 1.0) if floor[first] > 0.0 else rest
+            variance[first:last] = np.maximum(rest, 1.0) if further[first] > 0.0 else rest
             variance[first] += rho * (last - first)
             smooth = smooth_in(row, column, value, self.weight[first:last])
             variance[first:last] += further[first] * smooth
@@ -227,7 +230,9 @@ def channel_layout(data: Observables) -> ChannelLayout:
     begins = np.append(True, np.diff(group) != 0)[: len(group)]
     group = np.cumsum(begins) - 1
     gap = np.where(begins, np.inf, np.diff(channel, prepend=0).astype(float))
-    mean = np.bincount(group, weight**2) / np.maximum(np.bincount(group), 1)
+    count = np.maximum(np.bincount(group), 1)
+    mean = np.bincount(group, weight**2) / count
+    slope = np.bincount(group, _amplitudes(data)[first][order] ** 2) / count
     names = tuple(sorted({s.source for s in data.setups}))
     of_setup = np.array([names.index(s.source) for s in data.setups], dtype=np.intp)
     setup = np.concatenate([data.vis2.setup, data.closure_phase.setup])[first]
@@ -237,10 +242,19 @@ def channel_layout(data: Observables) -> ChannelLayout:
         gap,
         weight / np.sqrt(mean[group]),
         np.sqrt(mean[group]),
+        np.sqrt(slope[group]),
         (first < data.n_vis2)[order],
         of_setup[setup][order],
         names,
     )
+
+
+def _amplitudes(data: Observables) -> FloatArray:
+    """2|V| of V², not below its noise, in units of the errors, (n_data,); 0 of closure phases."""
+    sigma = np.sqrt(data.covariance.variance[: data.n_vis2])
+    out = np.zeros(data.covariance.size)
+    out[: data.n_vis2] = 2.0 * np.sqrt(np.maximum(np.abs(data.vis2.value), sigma)) / sigma
+    return out
 
 
 def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArray]:

@@ -219,7 +219,9 @@ def _table(hdu: Any, number: int) -> OITable:
             MappingProxyType(units),
             n_null=n_null,
         )
-    image = None if hdu.data is None else _native(hdu.data)
+    # An HDU of a kind that is no standard one has no data that could be read.
+    content = getattr(hdu, "data", None)
+    image = None if content is None else _native(content)
     return OITable(name, extver, number, _parsed(hdu.header), MappingProxyType({}), {}, image)
 
 

@@ -246,6 +246,8 @@ def _known_array(
         mapped = places @ np.linalg.lstsq(places, other, rcond=None)[0]
         if np.linalg.norm(mapped - other, axis=1).max() < limit:
             return start, here
+        if not np.isfinite(places).all() or not np.isfinite(other).all():
+            continue
         away, nearest = cKDTree(other).query(places)
         if away.max() < limit and len(np.unique(nearest)) == len(places):
             return start, nearest

@@ -94,6 +94,7 @@ def systematics_json(noise: ExtraNoise) -> list[Json]:
         {
             "path": f.source,
             "vis2_relative": f.vis2,
+            "visibility": f.visibility,
             "closure_phase_deg": float(np.degrees(f.closure_phase_rad)),
             "instrument": f.instrument or None,
             "reference": f.reference or None,

@@ -36,9 +36,9 @@ def exposures(n: int, insname: str = "PIONIER_Pnat", channels: int = 1) -> Obser
 
 
 def test_table_names_its_sources() -> None:
-    assert all(reference for *_, reference in table())
+    assert all(floor.reference for floor in table())
     assert {"PIONIER", "GRAVITY", "MATISSE", "AMBER", "IONIC", "MIRC", "MIRCX"} <= {
-        name for name, *_ in table()
+        floor.instrument for floor in table()
     }
 
 
@@ -99,3 +99,14 @@ def test_noise_that_a_floor_explains_is_not_added_again(rng) -> None:
     with_floor = fit_noise(Likelihood(noisy), theta, prior=NoisePrior(floors=(floor,)))
     assert not with_floor.any
     assert with_floor.floors == (floor,)
+
+
+def test_an_additive_visibility_error_is_what_is_left_near_a_null() -> None:
+    data = exposures(1)
+    value = np.full(data.n_vis2, 0.02)
+    near = replace(data, vis2=replace(data.vis2, value=value))
+    floor = Systematics(data.setups[0].source, 0.03, 0.0, visibility=0.02)
+    variance = noise_with_channels(near, (), [floor]).covariance.variance[: data.n_vis2]
+    # V² of (V + ε)² errs by 2Vε.
+    expected = 0.01**2 + (0.03 * value) ** 2 + 4.0 * value * 0.02**2
+    np.testing.assert_allclose(variance, expected, rtol=1e-9)
