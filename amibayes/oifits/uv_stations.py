@@ -49,6 +49,10 @@ class UVStations:
     factor: float
 
 
+MAX_BASELINE_M = 1e9
+"""Coordinates from here on are damage (the Earth is 1.3e7 m across), and their squares overflow."""
+
+
 def stations_from_uv(
     baseline_m: FloatArray,
     triangle_m: FloatArray,
@@ -106,9 +110,9 @@ def common_factor(baseline_m: FloatArray, triangle_m: FloatArray) -> float:
     baseline_m : (n, 2) float array
     triangle_m : (m, 2, 2) float array
     """
-    baseline = baseline_m[np.isfinite(baseline_m).all(axis=1)]
+    baseline = baseline_m[_on_earth(baseline_m).all(axis=1)]
     side = _sides(triangle_m).reshape(-1, 2)
-    side = side[np.isfinite(side).all(axis=1)]
+    side = side[_on_earth(side).all(axis=1)]
     if not len(baseline) or not len(side):
         return 1.0
     lengths = np.linalg.norm(baseline, axis=1), np.linalg.norm(side, axis=1)
@@ -134,6 +138,11 @@ def common_factor(baseline_m: FloatArray, triangle_m: FloatArray) -> float:
     return best
 
 
+def _on_earth(baseline_m: FloatArray) -> BoolArray:
+    """Which coordinates are numbers, and of a baseline that could be (any shape)."""
+    return np.abs(baseline_m) < MAX_BASELINE_M
+
+
 def _sides(triangle_m: FloatArray) -> FloatArray:
     """The three sides of each triangle as they are walked round, (m, 3, 2)."""
     return np.concatenate([triangle_m, -triangle_m.sum(axis=1, keepdims=True)], axis=1)
@@ -151,9 +160,9 @@ def _times(mjd: FloatArray) -> IntArray:
 def _arrays(baseline: FloatArray, sides: FloatArray, tolerance: float) -> list[FloatArray]:
     """Corners of the arrays that the triangles of one exposure make up, each (n_stations, 2)."""
     m = len(sides)
-    usable = np.isfinite(sides).all(axis=(1, 2))
+    usable = _on_earth(sides).all(axis=(1, 2))
     vectors = np.concatenate([sides[usable].reshape(-1, 2), baseline])
-    vectors = vectors[np.isfinite(vectors).all(axis=1)]
+    vectors = vectors[_on_earth(vectors).all(axis=1)]
     name, sign = _same_vectors(vectors, tolerance)
     number = int(usable.sum())
     side, turned = name[: 3 * number].reshape(number, 3), sign[: 3 * number].reshape(number, 3)
@@ -246,8 +255,6 @@ def _known_array(
         mapped = places @ np.linalg.lstsq(places, other, rcond=None)[0]
         if np.linalg.norm(mapped - other, axis=1).max() < limit:
             return start, here
-        if not np.isfinite(places).all() or not np.isfinite(other).all():
-            continue
         away, nearest = cKDTree(other).query(places)
         if away.max() < limit and len(np.unique(nearest)) == len(places):
             return start, nearest

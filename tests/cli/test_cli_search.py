@@ -216,6 +216,7 @@ def test_unusable_field_is_refused(target, tmp_path, capsys) -> None:
     assert "positions between" in error_of(capsys)
 
 
+@pytest.mark.slow
 def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> None:
     path = tmp_path / "none.oifits"
     write_oifits(path, simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1)))

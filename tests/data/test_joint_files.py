@@ -60,6 +60,7 @@ def files(tmp_path: Path) -> list[Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path, capsys) -> None:
     assert run("search", *files, *FAST, "--motion", "--json", "--out", tmp_path / "0") == 0
     results = [json.loads(capsys.readouterr().out)]

@@ -525,6 +525,7 @@ def test_command_writes_what_it_says(
     assert main(["extract", str(tmp_path / "none.fits"), "--out", str(tmp_path / "o2")]) == 3
 
 
+@pytest.mark.slow
 def test_star_is_told_from_the_middle_of_the_image_as_given(
     niriss: Instrument, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -571,6 +572,7 @@ def test_reader_is_told_of_pixels_too_large_for_the_fringes(name: str, coarse: b
     assert ("too large for the fringes" in notes) == coarse
 
 
+@pytest.mark.slow
 def test_temperature_sets_the_wavelength(niriss: Instrument, tmp_path: Path) -> None:
     """Against Planck's law over the filter's table, integrated here."""
     images = with_photons(binary_images(niriss, jittered(3, 19), (0.0, 0.0), 0.0), 20)

@@ -86,6 +86,7 @@ def test_correlated_kinds_share_the_relative_noise(rng) -> None:
     assert found == pytest.approx(noisy.log_prob([TRUTH])[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_of_the_posterior_is_the_noise_of_the_data() -> None:
     """Right errors: probably right. Understated by 3: certainly not, and the amount is told."""
     rng = np.random.default_rng(5)
@@ -140,6 +141,7 @@ def test_intervals_cover_whatever_the_errors_say(factor) -> None:
     logging.getLogger("coverage").info("factor %s: %s", factor, ", ".join(report))
 
 
+@pytest.mark.slow
 def test_chain_samples_the_average() -> None:
     """Against the grid posterior of the same average."""
     result, marginal = averaged(understated(TRUTH, 3.0, np.random.default_rng(8)))

@@ -93,6 +93,7 @@ def test_mean_and_scatter_of_the_distance() -> None:
     assert check.error == pytest.approx(float(stats.kstwo.std(100)), rel=0.02)
 
 
+@pytest.mark.slow
 def test_one_star_goes_the_whole_way_and_is_held_to_its_truth() -> None:
     """A companion a hundred times brighter than the limits of these data is found where it is."""
     plan = replace(QUICK, null_draws=400)
