@@ -160,7 +160,7 @@ def test_the_readme_prints_what_the_command_does(tmp_path: Path, monkeypatch, ca
     cals = sorted(str(p) for p in Path().glob(pattern))
     assert amibayes_command(["search", target, "--cal", *cals]) == 0
     printed = capsys.readouterr().out.splitlines()
-    (told,) = re.findall(r"^```\n(data .*?)^```", readme, re.MULTILINE | re.DOTALL)
+    (told,) = re.findall(r"^```\n(verdict .*?)^```", readme, re.MULTILINE | re.DOTALL)
     tail = "extrapolated"
     assert [x.split(tail)[0] for x in printed] == [x.split(tail)[0] for x in told.splitlines()]
 
