@@ -188,7 +188,7 @@ def test_too_few_null_draws_say_nothing(target, tmp_path, capsys) -> None:
     assert run("search", *words, "--out", tmp_path / "out") == 0
     result = json.loads(capsys.readouterr().out)
     assert result["significance"]["detected"] is None
-    assert any("100 null draws cannot tell" in w for w in result["warnings"])
+    assert any("100 null draws cannot measure" in w for w in result["warnings"])
 
 
 @pytest.mark.slow
