@@ -144,7 +144,7 @@ def test_tied_contrast_and_summary(files, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_whole_joint_job_with_posterior_evidence_and_limits(files, tmp_path, capsys) -> None:
-    words = (*files[:2], "--separation", "100:250", "--null-draws", "1000", "--json")
+    words = (*files[:2], "--separation", "100:250", "--null-draws", "3000", "--json")
     assert run("search", *words, "--companions", "0,1,2", "--out", tmp_path / "a") == 0
     result = json.loads(capsys.readouterr().out)
     posterior = result["posterior"]
