@@ -225,10 +225,7 @@ class BankStatistic:
         whole = likelihood.model.at_rest(companions)
         full = np.hstack([whole, np.broadcast_to(single, (len(companions), len(single)))])
         alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
-        change = likelihood.predict(full) - alone
-        closure = change[likelihood.samples.squares.shape[0] :]
-        closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-        return likelihood.noise.whiten(change)
+        return likelihood.noise.whiten(likelihood.wrapped(likelihood.predict(full) - alone))
 
     def draw_null(
         self,

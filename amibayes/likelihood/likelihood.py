@@ -199,10 +199,13 @@ class Likelihood:
         return np.concatenate([power, self.samples.legs @ np.angle(visibility)])
 
     def _difference(self, model: FloatArray) -> FloatArray:
-        difference = self.observables.data[:, None] - model
-        closure = difference[self._n2 :]
+        return self.wrapped(self.observables.data[:, None] - model)
+
+    def wrapped(self, change: FloatArray) -> FloatArray:
+        """Differences of data (n_data, n), closure phases the short way round; in place."""
+        closure = change[self._n2 :]
         closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
-        return difference
+        return change
 
 
 def single_likelihood(likelihood: Likelihood) -> Likelihood:
