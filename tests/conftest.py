@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import sys
 import time
 import warnings
@@ -90,10 +91,37 @@ def _written(folder: Path, theta: Sequence[float]) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def _target(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _written(tmp_path_factory.mktemp("target"), TRUTH)
+
+
 @pytest.fixture
-def target(tmp_path: Path) -> Path:
+def target(_target: Path, tmp_path: Path) -> Path:
     """A file of a star with a companion."""
-    return _written(tmp_path, TRUTH)
+    return Path(shutil.copy(_target, tmp_path))
+
+
+@pytest.fixture
+def full_pictures() -> None:
+    """Ask for pictures as a user has them, in a test outside the folders of `PICTURED`."""
+
+
+PICTURED = ("plots", "report")
+"""Folders of tests that look at pictures."""
+
+
+@pytest.fixture(autouse=True)
+def _sketches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are drawn small and without layout, two thirds of the time of a quick search."""
+    if request.path.parent.name in PICTURED or "full_pictures" in request.fixturenames:
+        return
+    monkeypatch.setattr("amibayes.plots.style.DPI", 40)
+    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", _no_layout)
+
+
+def _no_layout(engine: object, figure: object) -> None:
+    """Leave the axes where they are."""
 
 
 @pytest.fixture(scope="session")

@@ -122,7 +122,7 @@ def test_other_endings(error, said, monkeypatch, capsys) -> None:
     [
         (0, (), "posterior.h5"),
         pytest.param(200_000, (), "posterior.h5", marks=pytest.mark.slow),
-        (30_000, ("--no-posterior",), ".png"),
+        pytest.param(3_000, ("--no-posterior",), ".png", marks=pytest.mark.slow),
         pytest.param(700_000, ("--no-posterior",), "report.html", marks=pytest.mark.slow),
     ],
 )
@@ -198,9 +198,9 @@ LONG = ("--separation", "50:400", "--null-draws", "100000000", "--quiet")
     ("number", "workers", "pause"),
     [
         (signal.SIGINT, 1, 1.0),
-        (signal.SIGINT, 2, 1.0),  # while the workers start
+        pytest.param(signal.SIGINT, 2, 1.0, marks=pytest.mark.slow),  # while the workers start
         (signal.SIGINT, 2, 4.0),
-        (signal.SIGTERM, 1, 1.0),
+        pytest.param(signal.SIGTERM, 1, 1.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_is_stopped(number, workers, pause, target: Path, tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ KEYS = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
     words = (target, "--cal", *calibrators, "--out", out, "--separation", "50:400")
@@ -90,6 +91,7 @@ def test_json_on_standard_output_is_the_file_and_the_seed_decides(target, tmp_pa
 
 
 FAST = ("--null-draws", "0", "--no-posterior", "--no-limits")
+NARROW = (*FAST, "--separation", "80:200")
 
 
 @pytest.mark.parametrize(
@@ -117,17 +119,17 @@ def test_wrong_usage_is_one_line_and_status_2(words, message, target, tmp_path, 
 
 def test_nothing_is_overwritten_and_no_file_is_taken_twice(target, tmp_path, capsys) -> None:
     out = tmp_path / "out"
-    assert run("search", target, *FAST, "--out", out) == 0
+    assert run("search", target, *NARROW, "--out", out) == 0
     before = (out / "result.json").read_bytes()
     capsys.readouterr()
-    assert run("search", target, *FAST, "--out", out) == 2
+    assert run("search", target, *NARROW, "--out", out) == 2
     assert "is there already" in error_of(capsys)
     assert (out / "result.json").read_bytes() == before
-    assert run("search", target, *FAST, "--out", out, "--overwrite", "--quiet") == 0
+    assert run("search", target, *NARROW, "--out", out, "--overwrite", "--quiet") == 0
     assert capsys.readouterr().out == ""
-    assert run("search", target, target, *FAST, "--out", tmp_path / "twice") == 2
+    assert run("search", target, target, *NARROW, "--out", tmp_path / "twice") == 2
     assert "is given twice" in error_of(capsys)
-    assert run("search", target, "--cal", target, *FAST, "--out", tmp_path / "twice") == 2
+    assert run("search", target, "--cal", target, *NARROW, "--out", tmp_path / "twice") == 2
     assert "is given twice" in error_of(capsys)
 
 

@@ -124,8 +124,8 @@ def test_probability_is_uniform_in_400_null_sets(kind: str, stated_errors: bool)
 
 
 def test_probability_is_uniform_with_estimated_covariance() -> None:
-    """200 sets of 50 integrations of uneven baselines, which the expected noise takes for even."""
-    for column in Estimated(UNEVEN, 50).probabilities(200, np.random.default_rng(2)).T:
+    """80 sets of 50 integrations of uneven baselines, which the expected noise takes for even."""
+    for column in Estimated(UNEVEN, 50).probabilities(80, np.random.default_rng(2)).T:
         check(column, 1e-4, 0.05)
 
 

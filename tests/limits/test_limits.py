@@ -44,7 +44,8 @@ def found_by_a_full_search(theta: list[float], rng, threshold: float) -> bool:
     return bool(again.bank_delta_chi2.max() > threshold and away < 94.0)
 
 
-def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
+@pytest.mark.parametrize("n", [10, pytest.param(100, marks=pytest.mark.slow)])
+def test_completeness_at_the_limit_is_the_stated_one(n: int, setting) -> None:
     """Fresh companions at c50 and at c95, each found by an independent full search.
 
     The bounds add the binomial error of the count to what the fit's own error of c50 moves
@@ -52,7 +53,7 @@ def test_completeness_at_the_limit_is_the_stated_one(setting) -> None:
     """
     _, _, weight, limit = setting
     rng = np.random.default_rng(3)
-    n, k = 40, 3
+    k = 3
     for contrast, expected in ((limit.contrast_50[k], 0.5), (limit.contrast[k], 0.95)):
         places = zip(*offset(limit.separation_mas[k], rng.uniform(0, 360, n)), strict=True)
         found = sum(

@@ -90,6 +90,7 @@ def test_two_workers_give_the_same_bytes(star, whole, tmp_path) -> None:
     assert contents(tmp_path / "out") == whole
 
 
+@pytest.mark.slow
 def test_dask_workers_give_the_same_bytes_though_one_is_killed(star, whole, tmp_path) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
     from dask_cluster import end, free_port, start_dask, start_worker

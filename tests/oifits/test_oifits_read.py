@@ -462,7 +462,7 @@ def test_cut_files_are_unreadable(made: HandMade, tmp_path: Path) -> None:
 
 
 @settings(
-    max_examples=100,
+    max_examples=40,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -24,7 +24,9 @@ def searched(
 FREE = BinaryModel(diameter_mas="free")
 
 
-@pytest.mark.parametrize("covariance", ["diagonal", "assumed"])
+@pytest.mark.parametrize(
+    "covariance", ["diagonal", pytest.param("assumed", marks=pytest.mark.slow)]
+)
 def test_ax_cir_is_found_over_the_whole_field(data: Path, covariance: str) -> None:
     """Gallenne et al. (2014) and CANDID: x 6.24, y −28.51 mas, 0.8–0.82 mas, 0.98 → 0.73."""
     path = data / "oifits" / "axcir_pionier.oifits"
@@ -39,6 +41,7 @@ def test_ax_cir_is_found_over_the_whole_field(data: Path, covariance: str) -> No
         assert result.candid_n_sigma > 8.0
 
 
+@pytest.mark.slow
 def test_ax_cir_without_smearing_and_with_closures_alone(data: Path) -> None:
     """Without smearing PMOIRED finds 0.883 %; closures alone fall on a false peak at 6.5 mas."""
     path = data / "oifits" / "axcir_pionier.oifits"

@@ -76,7 +76,7 @@ def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
 ) -> None:
     words = ("limits", "--batch", survey, *CLOSED, "--quiet")
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert run(*words, "--out", whole, "--workers", 2) == 4
+    assert run(*words, "--out", whole) == 4
     expected = (whole / "summary.json").read_bytes()
     shutil.copytree(whole, cut)
     # As a killed run leaves it: the second target begun, nothing of it told.

@@ -48,7 +48,9 @@ def truncated(likelihood, start) -> np.ndarray:
     return theta
 
 
-@pytest.mark.parametrize("contrast", [0.006, 0.03, 0.3, 0.8])
+@pytest.mark.parametrize(
+    "contrast", [0.006, 0.8, *(pytest.param(c, marks=pytest.mark.slow) for c in (0.03, 0.3))]
+)
 def test_evidence_of_a_strong_companion_is_that_of_brute_force(contrast) -> None:
     likelihood, prior = problem([150.0, -80.0, contrast])
     mode = truncated(likelihood, [150.0, -80.0, contrast])

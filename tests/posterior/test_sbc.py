@@ -77,7 +77,9 @@ def test_ranks_of_the_chain_are_uniform(name) -> None:
     check(np.array(ranks))
 
 
-@pytest.mark.parametrize("contrast", [0.0, 0.003, 0.006])
+@pytest.mark.parametrize(
+    "contrast", [0.006, *(pytest.param(c, marks=pytest.mark.slow) for c in (0.0, 0.003))]
+)
 def test_chain_and_grid_are_one_posterior(contrast) -> None:
     """Kolmogorov–Smirnov distance of the samples, below 2.7/√n (p = 1e-6 for n independent)."""
     likelihood = Likelihood(simulated(niriss(), [150.0, -80.0, contrast], np.random.default_rng(3)))

@@ -322,7 +322,7 @@ def test_in_a_browser(browser: Any, folder: Path, size, scheme) -> None:
     looks_right(browser, folder / "report.html", size, scheme, len(list(folder.glob("*.png"))))
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP])
+@pytest.mark.parametrize("size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.slow)])
 def test_other_pages_in_a_browser(browser: Any, content, tmp_path: Path, size) -> None:
     """Nothing detected, two bands in motion, and a validation."""
     none, joint = copy.deepcopy(content), copy.deepcopy(content)
