@@ -1,9 +1,4 @@
-"""The posterior by emcee: started on the modes, stopped on the autocorrelation time.
-
-Sampled in (east, north, ln contrast, nuisance…), whose prior is flat. The chain is written
-whole after every segment, with the state of the random generator, so that a killed run
-goes on from there and ends with the same samples.
-"""
+"""The posterior of a search by emcee: walkers start on its modes; samples and their quality."""
 
 from __future__ import annotations
 
@@ -19,37 +14,28 @@ from astropy.table import QTable
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.errors import DataError, UsageError
-from amibayes.likelihood.likelihood import Likelihood
-from amibayes.posterior.chain_file import load_chain, save_chain
+from amibayes.posterior.chain import (
+    MAX_STEPS,
+    N_WALKERS,
+    EnsembleSampler,
+    burn_in,
+    long_enough,
+    longest,
+    split_rhat,
+    thinning,
+    times,
+)
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.independence import IndependenceProposal
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.priors import Prior
-from amibayes.support import request
-from amibayes.support.ensemble_moves import along_others
+from amibayes.posterior.sampler import ModelPrior
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
     position_angle_deg,
     separation,
 )
-
-N_WALKERS = 32
-"""Some ten times the number of parameters: moves take their directions from the others."""
-
-SEGMENT = 500
-"""Steps between two checks of the length of the chain, and between two writes of it."""
-
-MAX_STEPS = 30_000
-"""Steps after which a chain is given up: a minute or two."""
-
-ENOUGH = 50.0
-"""Autocorrelation times a chain must be long (Foreman-Mackey et al. 2013)."""
-
-
-GOOD_RHAT = 1.02
-"""Means of parts of the chain then differ by a fifth of the posterior's width at most."""
 
 START_WIDTH = 0.05
 """Longest scatter of the walkers' start, in units of the field."""
@@ -234,59 +220,11 @@ def sample(
     progress : callable, optional
         Called with (steps done, steps expected).
     """
-    likelihood, region = result.likelihood, Region.of(result)
+    region, parameters = Region.of(result), result.likelihood.parameters
     start = _start(result, prior, region, rng)
-    seed = int(rng.integers(2**32))
-    log_prob = _log_posterior(likelihood, prior, region)
-    # All of data, covariance, noise and model are in the values at the start.
-    digest = request.digest(
-        start, log_prob(start), prior, seed, region.places, grid is not None, emcee.__version__
-    )
-    backend = load_chain(path, digest) if path and resume else None
-    sampler = emcee.EnsembleSampler(
-        len(start),
-        start.shape[1],
-        log_prob,
-        vectorize=True,
-        moves=_moves(grid, region),
-        backend=backend,
-    )
-    state = emcee.State(start, random_state=np.random.RandomState(seed).get_state())
-    while not (done := _long_enough(sampler)) and sampler.iteration < max_steps:
-        sampler.run_mcmc(state if sampler.iteration == 0 else None, SEGMENT)
-        if path:
-            save_chain(sampler, path, digest)
-        if progress:
-            progress(sampler.iteration, int(ENOUGH * _time(sampler)))
-    return _posterior(sampler, result, prior, grid, done)
-
-
-def _moves(grid: GridPosterior | None, region: Region) -> list[tuple[emcee.moves.Move, float]]:
-    """Moves and how often each is made."""
-    along = along_others()
-    if grid is None:
-        return along
-    inside = region.holds(*grid.cells.position)
-    if not grid.probability[inside].any():  # too improbable for cells of its own
-        return along
-    leaps = IndependenceProposal(grid.within(inside))
-    return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(leaps), 0.5)]
-
-
-def _log_posterior(
-    likelihood: Likelihood, prior: Prior, region: Region
-) -> Callable[[FloatArray], FloatArray]:
-    parameters = likelihood.parameters
-    place = parameters.place()
-
-    def log_posterior(x: FloatArray) -> FloatArray:
-        density = np.where(region.holds(*x[:, place].T), prior.log_density(x), -np.inf)
-        inside = np.isfinite(density)
-        if inside.any():
-            density[inside] += likelihood.log_prob(physical(x[inside], parameters))
-        return density
-
-    return log_posterior
+    walkers = EnsembleSampler(start, region, grid, path, resume, max_steps, progress)
+    chain = walkers.run(result.likelihood.log_prob, ModelPrior(prior, parameters), rng)
+    return _posterior(chain, result, prior, grid)
 
 
 def _start(
@@ -310,65 +248,31 @@ def _start(
     return np.asarray(inside[:N_WALKERS])
 
 
-def _times(sampler: emcee.EnsembleSampler) -> FloatArray:
-    """Integrated autocorrelation times of the second two thirds of the chain, steps, (n_dim,)."""
-    chain = sampler.get_chain()[sampler.iteration // 3 :]
-    return np.asarray(emcee.autocorr.integrated_time(chain, tol=0))
-
-
-def _longest(times: FloatArray) -> float:
-    return float(np.nanmax(times)) if np.isfinite(times).any() else np.inf
-
-
-def _time(sampler: emcee.EnsembleSampler) -> float:
-    return _longest(_times(sampler))
-
-
-def _long_enough(sampler: emcee.EnsembleSampler) -> bool:
-    if sampler.iteration < 2 * SEGMENT:
-        return False
-    kept = sampler.iteration - sampler.iteration // 3
-    return bool(kept > ENOUGH * _time(sampler) and _split_rhat(sampler).max() < GOOD_RHAT)
-
-
-def _split_rhat(sampler: emcee.EnsembleSampler) -> FloatArray:
-    """Split-R̂ of the parameters, every walker's second two thirds cut in two, (n_dim,)."""
-    chain = sampler.get_chain()[sampler.iteration // 3 :]
-    half = len(chain) // 2
-    halves = np.concatenate([chain[:half], chain[half : 2 * half]], axis=1)
-    within = halves.var(axis=0, ddof=1).mean(axis=0)
-    between = halves.mean(axis=0).var(axis=0, ddof=1)
-    return np.asarray(np.sqrt(((half - 1) / half * within + between) / within))
-
-
 def _posterior(
     sampler: emcee.EnsembleSampler,
     result: SearchResult,
     prior: Prior,
     grid: GridPosterior | None,
-    converged: bool,
 ) -> Posterior:
-    times = _times(sampler)
-    time, parameters = _longest(times), result.likelihood.parameters
-    burn = sampler.iteration // 3
-    thin = max(1, int(0.5 * time)) if np.isfinite(time) else 1
+    parameters, each = result.likelihood.parameters, times(sampler)
+    burn, thin = burn_in(sampler), thinning(sampler)
     return Posterior(
         names=parameters.names,
         samples=physical(sampler.get_chain(discard=burn, thin=thin, flat=True), parameters),
         log_prob=sampler.get_log_prob(discard=burn, thin=thin, flat=True),
         chain=physical(sampler.get_chain(), parameters),
         chain_log_prob=sampler.get_log_prob(),
-        autocorrelation_time=time,
+        autocorrelation_time=longest(each),
         n_steps=sampler.iteration,
         n_burn=burn,
         n_walkers=sampler.nwalkers,
-        split_rhat=float(_split_rhat(sampler).max()),
+        split_rhat=float(split_rhat(sampler).max()),
         acceptance=float(np.mean(sampler.acceptance_fraction)),
-        converged=converged,
+        converged=long_enough(sampler),
         prior=prior,
         mode_probability=mode_probabilities(result, prior, grid),
         mode_method="laplace" if grid is None else "grid",
         elsewhere=float("nan") if grid is None else elsewhere(result, grid),
-        times=times,
-        rhats=_split_rhat(sampler),
+        times=each,
+        rhats=split_rhat(sampler),
     )

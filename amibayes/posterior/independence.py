@@ -1,4 +1,4 @@
-"""Proposals of a chain out of a grid posterior: they lead from mode to mode."""
+"""Draws out of a grid posterior: proposals that lead a chain from mode to mode, and a sampler."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import logsumexp
 
 from amibayes.posterior.grid import GridPosterior
-from amibayes.units import (
-    FloatArray,
-    IntArray,
-)
+from amibayes.posterior.laplace import physical
+from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
+from amibayes.units import FloatArray, IntArray
+
+N_DRAWS = 20_000
+"""ln Z is then known to a per cent, where the grid is as fine as it is by default."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +91,35 @@ class IndependenceProposal:
     @cached_property
     def _nodes_cumulated(self) -> FloatArray:
         return _cumulated(self.grid.nuisance_probability)
+
+
+@dataclass(frozen=True, eq=False)
+class GridSampler:
+    """Draws of a grid posterior, weighted by likelihood times prior over their own density.
+
+    Parameters
+    ----------
+    grid : GridPosterior
+        Of the same likelihood and prior.
+    n_draws : int
+    """
+
+    grid: GridPosterior
+    n_draws: int = N_DRAWS
+
+    def sample(self, log_prob: LogProb, prior: ModelPrior, rng: np.random.Generator) -> Draws:
+        """Sample the posterior of one companion and measure its evidence."""
+        random = np.random.RandomState(int(rng.integers(2**32)))
+        x, log_density = IndependenceProposal(self.grid).draw(self.n_draws, random)
+        samples = physical(x, prior.parameters)
+        value = log_prob(samples)
+        log_weight = value + prior.prior.log_density(x) - log_density
+        log_sum = float(logsumexp(log_weight))
+        weights = np.exp(log_weight - log_sum)
+        # Relative error of a mean of weights, which sum to 1 here.
+        error = float(np.sqrt(max((weights**2).sum() - 1.0 / self.n_draws, 0.0)))
+        evidence = {"log_z": log_sum - np.log(self.n_draws), "log_z_error": error}
+        return Draws(samples, value, weights, evidence)
 
 
 def _cumulated(probability: FloatArray) -> FloatArray:
