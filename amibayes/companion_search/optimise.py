@@ -59,17 +59,32 @@ SHAPE_START, LARGE_DISC = 0.4, 1.3
 and a disc beyond its first null is another minimum."""
 
 
+STAR_STARTS = (0.0, 0.15, 0.5)
+"""Limb darkening and background, as parts of their ranges, at which fits of a star's diameter
+begin: with more of them, the diameters of the minima are others."""
+
+FINEST_STEP = 0.0025
+"""Scale of a star's parameters in their fit, as a part of their ranges."""
+
+
 def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
     """Best fit without a companion: its parameters (n_nuisance,) and deviance."""
     without = single_likelihood(likelihood)
     bounds = np.array(without.parameters.bounds(without.parameters.nuisance)).reshape(-1, 2)
     if not len(bounds):
         return np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0])
-    # A disc has lobes: the fit starts from the best of a ladder of values.
-    ladder = bounds[:, 0] + np.outer(np.linspace(0.0, 1.0, 201) ** 2, bounds[:, 1] - bounds[:, 0])
-    start = ladder[np.argmin(without.chi2(ladder))]
-    scale = np.maximum(ladder[10], 1e-6)
-    return _minimise(_objective(without, scale), start, scale, bounds)
+    lower, width = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
+    scale = np.maximum(lower + FINEST_STEP * width, 1e-6)
+    objective = _objective(without, scale)
+    disc = np.array([name == "diameter_mas" for name in without.parameters.names])
+    fits = []
+    for rest in STAR_STARTS if disc.any() and not disc.all() else STAR_STARTS[:1]:
+        # A disc has lobes: a fit starts from the best of a ladder of diameters.
+        part = np.where(disc | ~disc.any(), np.linspace(0.0, 1.0, 201)[:, None] ** 2, rest)
+        ladder = lower + part * width
+        start = ladder[np.argmin(without.chi2(ladder))]
+        fits.append(_minimise(objective, start, scale, bounds))
+    return min(fits, key=lambda fit: fit[1])
 
 
 def starting_points(
