@@ -11,6 +11,7 @@ from amibayes.errors import UsageError
 from amibayes.support.options import (
     CLIP_CALIBRATORS,
     NOISE_PRIOR,
+    NULL_DRAWS,
     CalibrationMethod,
     ClosureCovariance,
     ContrastSharing,
@@ -131,15 +132,16 @@ def add_separation(group: argparse._ActionsContainer) -> None:
     )
 
 
-def add_null_draws(group: argparse._ActionsContainer, default: int, least: int = 0) -> None:
-    """Add ``--null-draws``."""
+def add_null_draws(group: argparse._ActionsContainer, default: int | None, least: int = 0) -> None:
+    """Add ``--null-draws``; without a default it is chosen by what a search costs."""
+    stated = "%(default)s" if default else f"{NULL_DRAWS}, fewer where data are many"
     group.add_argument(
         "--null-draws",
         type=common.non_negative_integer if least == 0 else common.positive_integer,
         default=default,
         metavar="N",
         help="null searches for the false-alarm probability"
-        f"{'; 0: none' if least == 0 else ''} (default: %(default)s)",
+        f"{'; 0: none' if least == 0 else ''} (default: {stated})",
     )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
-from amibayes.support.options import EVIDENCE_METHODS, NULL_DRAWS, OBSERVABLES, SAMPLERS
+from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS
 
 if TYPE_CHECKING:
     from amibayes.parallel import Journals
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     data_options.add_data(data)
     common.add_image_options(parser)
     stages = parser.add_argument_group("stages")
-    data_options.add_null_draws(stages, NULL_DRAWS)
+    data_options.add_null_draws(stages, None)
     stages.add_argument("--no-posterior", action="store_true", help="leave the posterior out")
     stages.add_argument(
         "--bootstrap",

@@ -9,9 +9,10 @@ import numpy as np
 from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.seeds import MODE_LIMIT
+from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.parameters import Box
 from amibayes.units import MAS, FloatArray
 
 SURELY_NOT_NOISE = 30.0
@@ -20,8 +21,9 @@ SURELY_NOT_NOISE = 30.0
 MAX_LOOKED_AT = 40_000
 """Positions of the look around the field."""
 
-MAX_WORK = 60_000_000
-"""Positions times points of the (u, v) plane of the look outside: a few seconds."""
+MAX_WORK, WORK_PER_POSITION = 300_000_000, 1000
+"""Positions times points of the (u, v) plane of the look outside, and how many more points a
+position is worth: some three seconds."""
 
 COARSE_STEPS_PER_FRINGE = 4
 """Positions per λ/B_max of the look outside: half of the search's, which costs 20 % of a peak."""
@@ -113,13 +115,14 @@ def choose_field(likelihood: Likelihood) -> tuple[tuple[float, float], float | N
     fringe = resolution_mas(likelihood)
     if not np.isfinite([inner, outer]).all():
         return (inner, outer), None
-    step = fringe / COARSE_STEPS_PER_FRINGE
-    affordable = step * float(np.sqrt(MAX_WORK / max(len(likelihood.samples), 1) / np.pi))
-    farthest = min(outermost(likelihood), affordable)
-    if farthest <= outer or likelihood.n_independent <= len(likelihood.parameters):
+    if likelihood.n_independent <= len(likelihood.parameters):
         return (inner, outer), None
     # A moving companion is looked for at rest, alike in all bands: a first look.
     still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0, bands=()))
+    still, farthest = _affordable(still, Box(inner, outermost(likelihood), fringe))
+    if farthest <= outer:
+        return (inner, outer), None
+    step = fringe / COARSE_STEPS_PER_FRINGE
     single = fit_single(still)[0]
     within = _gains(still, make_grid(inner, outer, step), single)
     grid = make_grid(outer, farthest, step)
@@ -129,11 +132,24 @@ def choose_field(likelihood: Likelihood) -> tuple[tuple[float, float], float | N
     best = int(beyond.argmax())
     left = single_likelihood(still).chi2(single[None])[0] - beyond[best]
     # Errors that are too small make the gains of noise too large in proportion.
-    least = MODE_LIMIT * max(left / likelihood.n_independent, 1.0)
+    least = MODE_LIMIT * max(left / still.n_independent, 1.0)
     if beyond[best] < within.max() + max(least, NOTABLY_BETTER * within.max()):
         return (inner, outer), None
     place = float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
     return (inner, MARGIN * place), place
+
+
+def _affordable(likelihood: Likelihood, box: Box) -> tuple[Likelihood, float]:
+    """Data and outer edge, mas, of a look within `MAX_WORK`: large data have channels averaged."""
+    step, reach = box.fringe_mas / COARSE_STEPS_PER_FRINGE, 0.0
+    for n in (min(MAX_COARSE_DATA, len(likelihood.samples)), len(likelihood.samples)):
+        # Points of more than this do not stay in the processor's cache.
+        points = (n + WORK_PER_POSITION) * max(n / MAX_COARSE_DATA, 1.0)
+        reach = min(box.outer_mas, step * np.sqrt(MAX_WORK / points / np.pi))
+        coarse = coarse_likelihood(likelihood, replace(box, outer_mas=reach))
+        if len(coarse.samples) <= 2 * n:
+            return coarse, float(reach)
+    return likelihood, float(reach)
 
 
 def _gains(likelihood: Likelihood, grid: Grid, single: FloatArray) -> FloatArray:

@@ -29,8 +29,13 @@ from amibayes.models.parameters import Box
 from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray
 
-GRID_STEPS_PER_FRINGE = 8
-"""Lattice points per λ/B_max."""
+MIN_STEPS, MAX_STEPS = 5, 8
+"""Lattice points per λ/B_max: a peak loses 3 % of its gain on average with 8, 6 % with 5
+((2J₁(x)/x)² of its distance, baselines in a disc). Null searches are on the same lattice."""
+
+AFFORDABLE_WORK = 1e8
+"""Positions times data of a search, beyond which the lattice is made coarser: ten thousand null
+searches of that take half a minute."""
 
 MAX_POSITIONS = 2_000_000
 """Positions of a search: more would take hours and all the memory."""
@@ -116,8 +121,11 @@ def _refuse_underdetermined(likelihood: Likelihood) -> None:
 
 
 def _grid(likelihood: Likelihood, box: Box) -> Grid:
-    """Positions of the field, `GRID_STEPS_PER_FRINGE` per fringe."""
-    step = box.fringe_mas / GRID_STEPS_PER_FRINGE
+    """Positions of the field, as many per fringe as can be afforded."""
+    patches = np.pi * (box.outer_mas**2 - box.inner_mas**2) / box.fringe_mas**2
+    with np.errstate(all="ignore"):  # a damaged baseline may be of any length
+        steps = np.sqrt(AFFORDABLE_WORK / likelihood.n_independent / patches)
+    step = box.fringe_mas / float(np.clip(np.nan_to_num(steps), MIN_STEPS, MAX_STEPS))
     finest = step / rates_per_axis(likelihood)
     _refuse_huge(box.inner_mas, box.outer_mas, finest, likelihood.observables.source)
     grid = make_grid(box.inner_mas, box.outer_mas, step)

@@ -113,6 +113,12 @@ class TemplateBank:
         return self.n_contrasts > 1 or self._moves
 
     @property
+    def work(self) -> float:
+        """Products that the search of one data set takes."""
+        rates = len(self.rates_mas_yr) if self._moves else 1
+        return float(len(self)) * self.n_data * self.n_contrasts * rates
+
+    @property
     def n_nuisance(self) -> int:
         """Number of nuisance directions."""
         return int(self.nuisance_basis.shape[1])

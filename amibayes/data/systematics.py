@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
@@ -11,6 +11,7 @@ from importlib import resources
 import numpy as np
 
 from amibayes.data.observables import Measurements, Observables
+from amibayes.units import FloatArray
 
 MIN_EXPOSURES = 10
 """Exposures of a file from which on their own scatter tells calibration errors: the variance
@@ -82,9 +83,30 @@ def systematics_of(
         vis2, degrees = choice
         floors = (Systematics(s, vis2, float(np.radians(degrees))) for s in sources)
         return tuple(f for f in floors if f.vis2 > 0.0 or f.closure_phase_rad > 0.0)
-    few = [s for s in sources if n_exposures(data, s) < MIN_EXPOSURES]
-    found = [_tabulated(s, [x.insname for x in data.setups if x.source == s]) for s in few]
+    return tabulated(data, [s for s in sources if n_exposures(data, s) < MIN_EXPOSURES])
+
+
+def tabulated(data: Observables, sources: Iterable[str]) -> tuple[Systematics, ...]:
+    """Floors of the table, of those files that have one."""
+    found = [_tabulated(s, [x.insname for x in data.setups if x.source == s]) for s in sources]
     return tuple(f for f in found if f is not None and f.vis2 + f.closure_phase_rad > 0.0)
+
+
+def calibration_errors(data: Observables) -> FloatArray:
+    """Calibration errors that the table gives for unflagged data, (n_data,), whatever their number.
+
+    Standard deviations, V² then closure phases in radians; 0 for files without an entry.
+    """
+    data = data.unflagged()
+    out = np.zeros(data.covariance.size)
+    for floor in tabulated(data, dict.fromkeys(s.source for s in data.setups)):
+        own = np.array([s.source == floor.source for s in data.setups])
+        value = np.abs(data.vis2.value)
+        vis2 = np.hypot(floor.vis2 * value, 2.0 * np.sqrt(value) * floor.visibility)
+        out[: data.n_vis2] += np.where(own[data.vis2.setup], vis2, 0.0)
+        here = own[data.closure_phase.setup]
+        out[data.n_vis2 :] += np.where(here, floor.closure_phase_rad, 0.0)
+    return out
 
 
 def _tabulated(source: str, insnames: Sequence[str]) -> Systematics | None:

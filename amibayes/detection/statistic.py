@@ -221,11 +221,22 @@ class BankStatistic:
         companions : (n, 3) float array
             east_mas, north_mas, contrast (the same in every band, at rest).
         """
+        return self.likelihood.noise.whiten(self.change_by(companions))
+
+    def change_by(self, companions: FloatArray) -> FloatArray:
+        """Change of the data (n_data, n) by companions (n, 3), not whitened; see `signal_of`."""
         likelihood, single = self.likelihood, self.single
         whole = likelihood.model.at_rest(companions)
         full = np.hstack([whole, np.broadcast_to(single, (len(companions), len(single)))])
         alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
-        return likelihood.noise.whiten(likelihood.wrapped(likelihood.predict(full) - alone))
+        return likelihood.wrapped(likelihood.predict(full) - alone)
+
+    @property
+    def strongest(self) -> FloatArray:
+        """East and north, mas, and contrast of what the data show most of, (1, 3)."""
+        at, grid = int(self.field(self.observed).argmax()), self.bank.grid
+        contrast = self.bank.scan(self.observed)[0][at]
+        return np.array([[grid.east_mas[at], grid.north_mas[at], max(contrast, 0.0)]])
 
     def draw_null(
         self,

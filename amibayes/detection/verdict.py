@@ -9,8 +9,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
+from amibayes.data.systematics import calibration_errors
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.statistic import BankStatistic
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.residuals import files_of
 
@@ -20,6 +22,12 @@ STATEMENTS: tuple[Statement, ...] = get_args(Statement)
 """All of them, in that order."""
 
 NAMES = {"vis2": "V²", "cp": "closure phases"}
+
+
+WITHIN = (
+    "; what the fit leaves holds structure, smaller than the calibration errors known of the "
+    "instrument"
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +41,8 @@ class Verdict:
         The reason, one sentence.
     p_model : float
         Probability of data that fit as badly, were the best model of the family and its noise
-        the true one: the smaller one of χ² and of structure in the residuals, times two.
+        the true one: the smaller one of χ² and of structure in the residuals, times two;
+        structure within the errors of the calibration does not count.
     """
 
     statement: Statement
@@ -46,6 +55,8 @@ def verdict(
     tested: Significance,
     structure: Significance,
     splits: Sequence[Consistency],
+    *,
+    structured: bool = True,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -59,6 +70,9 @@ def verdict(
         Of one more component, in what the best fit leaves.
     splits : sequence of Consistency
         Empty where no companion is detected.
+    structured : bool
+        Whether that structure is more than what the calibration of the instrument may leave: see
+        `within_calibration`. Structure that is not does not speak against the model.
 
     Notes
     -----
@@ -68,7 +82,7 @@ def verdict(
     """
     alpha = tested.alpha
     fit = fit_probability(result)
-    p_model = min(1.0, 2.0 * min(fit, structure.probability))
+    p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     for split in apart:
         if split.split != "observables":
@@ -77,9 +91,11 @@ def verdict(
         return Verdict("model rejected", _rejected(result, fit, structure), p_model)
     for split in apart:
         return Verdict("inconsistent data", _apart(split), p_model)
+    small = 2.0 * structure.probability < alpha
+    left = WITHIN if small and not structured else ""
     if tested.detected:
-        return Verdict("companion", _found(tested), p_model)
-    return Verdict("no companion", _nothing(tested), p_model)
+        return Verdict("companion", _found(tested) + left, p_model)
+    return Verdict("no companion", _nothing(tested) + left, p_model)
 
 
 def fit_probability(result: SearchResult) -> float:
@@ -101,6 +117,26 @@ def fit_probability(result: SearchResult) -> float:
         chi2 = float((part.whiten(difference[at]) ** 2).sum())
         found.append(chi2_survival(chi2, share * part.rank, likelihood.degrees))
     return min(1.0, len(found) * min(found))
+
+
+def within_calibration(test: BankStatistic) -> bool:
+    """Whether one more component changes the data by less than calibration errors known of them.
+
+    Errors that hold for whole nights (diameters of calibrators, drifts) repeat from exposure to
+    exposure as the light of a companion does: no null draw and no randomisation has them. Only
+    their size is known, from the table of instruments. Changes are compared in units of these
+    errors, as a root mean square over all data; data without an entry are never within.
+
+    Parameters
+    ----------
+    test : BankStatistic
+        Of one more component.
+    """
+    errors = calibration_errors(test.likelihood.observables)
+    if not (errors > 0.0).all():
+        return False
+    change = test.change_by(test.strongest)[:, 0] / errors
+    return bool(np.mean(change**2) < 1.0)
 
 
 def _apart(split: Consistency) -> str:

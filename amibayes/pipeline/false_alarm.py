@@ -9,14 +9,15 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.consistency import Consistency, consistency
-from amibayes.detection.false_alarm import Significance, significance
-from amibayes.detection.randomised import randomised
-from amibayes.detection.statistic import statistic_of
-from amibayes.detection.verdict import Verdict, verdict
+from amibayes.detection.false_alarm import Significance, draws_needed, significance
+from amibayes.detection.randomised import Randomised, randomised
+from amibayes.detection.statistic import BankStatistic, statistic_of
+from amibayes.detection.verdict import Verdict, verdict, within_calibration
 from amibayes.detection.whiteness import correlated
 from amibayes.parallel import Executor, Journal, Progress, spawn
 from amibayes.pipeline.field import noise_prior
 from amibayes.pipeline.options import SearchOptions
+from amibayes.support.options import NULL_DRAWS
 
 MAX_RANDOMISED = 5000
 """Randomised data sets: enough for an upper bound of 7e-4 where none is above."""
@@ -24,6 +25,16 @@ MAX_RANDOMISED = 5000
 
 STRUCTURE_DRAWS = 2000
 """Null draws of the structure that a fit leaves: a probability of 5e-4 is enough to reject."""
+
+FIRST_DRAWS, NOT_SMALL = 500, 0.1
+"""Draws after which a probability is given, if it is larger than that: no more would be made of
+it if it were known better."""
+
+NULL_WORK = 1e12
+"""Positions times data of all null searches together: half a minute of one core."""
+
+LEAST_DRAWS = 3000
+"""Null searches where each is dear: α is then known to a half."""
 
 
 def false_alarm(
@@ -40,9 +51,10 @@ def false_alarm(
     """
     test = statistic_of(result, stated_errors=not options.extra_noise)
     spawned = np.random.default_rng(spawn(rng, 1)[0])
+    wanted = null_draws(test, options)
     found = significance(
         test,
-        options.null_draws,
+        wanted,
         rng,
         options.alpha,
         executor=executor,
@@ -52,9 +64,30 @@ def false_alarm(
     if correlated(result) is not None:
         # Laws fitted to draws that are too good say nothing of what lies beyond them.
         found = replace(found, tail=None)
-    draws = min(options.null_draws, MAX_RANDOMISED)
-    check = randomised(test, draws, spawned, executor=executor, progress=progress)
+    check = _randomised(test, min(wanted, MAX_RANDOMISED), spawned, executor, progress)
     return replace(found, field=test.field(test.observed)).beside(check)
+
+
+def null_draws(test: BankStatistic, options: SearchOptions) -> int:
+    """Find how many null searches are made: by default as many as their cost allows."""
+    if options.null_draws is not None:
+        return options.null_draws
+    least = max(LEAST_DRAWS, draws_needed(options.alpha))
+    return max(least, min(NULL_DRAWS, int(NULL_WORK / test.bank.work)))
+
+
+def _randomised(
+    test: BankStatistic,
+    draws: int,
+    rng: np.random.Generator,
+    executor: Executor | None,
+    progress: Progress | None = None,
+) -> Randomised:
+    """Compare with randomised residuals, few where these already reach the statistic often."""
+    few = randomised(test, min(FIRST_DRAWS, draws), rng, executor=executor)
+    if few.probability is None or few.probability > NOT_SMALL or draws <= FIRST_DRAWS:
+        return few
+    return randomised(test, draws, rng, executor=executor, progress=progress)
 
 
 def second_false_alarm(
@@ -70,13 +103,12 @@ def second_false_alarm(
     data and of the null sets.
     """
     test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
-    return significance(
-        test, options.null_draws, rng, options.alpha, executor=executor, progress=progress
-    )
+    draws = null_draws(test, options)
+    return significance(test, draws, rng, options.alpha, executor=executor, progress=progress)
 
 
 def structure(
-    result: SearchResult,
+    test: BankStatistic,
     options: SearchOptions,
     rng: np.random.Generator,
     executor: Executor | None = None,
@@ -84,12 +116,14 @@ def structure(
     """Find the chance that noise alone leaves as much structure beside the best fit.
 
     That of a second companion, with fewer draws, and randomised residuals where they say
-    something.
+    something. ``test`` is of one more component beside the best fit.
     """
-    test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
-    draws = min(options.null_draws, STRUCTURE_DRAWS)
+    draws = min(null_draws(test, options), STRUCTURE_DRAWS)
+    few = significance(test, min(FIRST_DRAWS, draws), rng, options.alpha, executor=executor)
+    if few.probability > NOT_SMALL:
+        return few
     found = significance(test, draws, rng, options.alpha, executor=executor)
-    return found.beside(randomised(test, draws, rng, executor=executor))
+    return found.beside(_randomised(test, draws, rng, executor))
 
 
 def verdict_of(
@@ -105,5 +139,7 @@ def verdict_of(
     if tested.detected:
         data = stated.only(options.observables) if options.extra_noise else None
         splits = consistency(result, rng, stated=data, prior=noise_prior(stated, options))
-    rest = structure(result, options, rng, executor)
-    return verdict(result, tested, rest, splits), splits
+    test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
+    rest = structure(test, options, rng, executor)
+    better = rest.probability > options.alpha or not within_calibration(test)
+    return verdict(result, tested, rest, splits, structured=better), splits

@@ -163,11 +163,11 @@ def measure_limits(
 
 
 def _refuse(options: LimitsOptions) -> None:
-    alpha = options.search.alpha
-    if options.criterion == "injection" and not reachable(alpha, options.search.null_draws):
+    alpha, draws = options.search.alpha, options.search.null_draws
+    few = draws is not None and not reachable(alpha, draws)
+    if options.criterion == "injection" and few:
         raise UsageError(
-            f"{options.search.null_draws} null draws cannot measure a false-alarm probability of "
-            f"{alpha:g}",
+            f"{draws} null draws cannot measure a false-alarm probability of {alpha:g}",
             source="--null-draws",
             remedy=f"give {draws_needed(alpha)} or more, or another --criterion",
         )
@@ -239,7 +239,7 @@ def _one_limit(
     with run.stage(f"search {name}"):
         found = search_field(data, search)
     tested = None
-    if search.null_draws:
+    if search.null_draws != 0:
         with run.stage(f"null searches {name}"):
             tested = false_alarm(
                 found.result, search, streams[0], run.executor, run.progress,

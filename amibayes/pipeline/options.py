@@ -13,7 +13,6 @@ from amibayes.support.options import (
     CLIP_CALIBRATORS,
     EVIDENCE_METHODS,
     NOISE_PRIOR,
-    NULL_DRAWS,
     OBSERVABLES,
     SEED,
     CalibrationMethod,
@@ -67,8 +66,9 @@ class SearchOptions:
     calibrator_diameters : str, optional
         Uniform discs, as ``0.31:0.02,0.4`` in mas, or a table; see
         `amibayes.calibration.diameters_of`.
-    null_draws : int
-        0 leaves the false-alarm probability out.
+    null_draws : int, optional
+        0 leaves the false-alarm probability out. By default 10 000, and fewer where data and
+        positions are so many that these would take minutes.
     alpha : float
         False-alarm probability of a detection.
     contrast : {"tied", "per-filter"}, optional
@@ -127,7 +127,7 @@ class SearchOptions:
     bin_channels: int = 1
     merge_epochs_days: float | None = None
     calibrator_diameters: str | None = None
-    null_draws: int = NULL_DRAWS
+    null_draws: int | None = None
     alpha: float = ALPHA
     contrast: ContrastSharing | None = None
     motion: bool = False

@@ -134,7 +134,7 @@ class Tests:
 
 
 def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
-    if not options.null_draws:
+    if options.null_draws == 0:
         return Tests()
     with run.stage("significance"):
         first = false_alarm(

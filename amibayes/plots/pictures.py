@@ -63,7 +63,7 @@ class Stages:
     @classmethod
     def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Stages:
         """Those of a run that has yet to begin."""
-        tested = options.null_draws > 0
+        tested = options.null_draws != 0
         limits = options.limits and tested
         return cls(several, calibrated, tested, options.posterior, limits)
 

@@ -13,7 +13,8 @@ from scipy.special import j0, j1
 
 from amibayes.data.observables import Measurements, Observables, join
 from amibayes.detection.consistency import Consistency
-from amibayes.detection.verdict import Verdict
+from amibayes.detection.statistic import statistic_of
+from amibayes.detection.verdict import Verdict, within_calibration
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
 from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
@@ -22,7 +23,7 @@ from amibayes.units import MAS, offset
 Visibility = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Complex visibility at spatial frequencies along east and north, cycles per mas."""
 
-OPTIONS = SearchOptions(separation_mas=(60.0, 300.0), alpha=0.01, null_draws=500)
+OPTIONS = SearchOptions(separation_mas=(60.0, 300.0), alpha=0.01, null_draws=2000)
 
 
 def star(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -133,6 +134,26 @@ def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:
     found, splits = told(join(parts), rng)
     assert found.statement == "inconsistent data", found
     assert {"files"} <= {s.split for s in splits}
+
+
+@pytest.mark.parametrize(
+    ("insname", "second", "within"),
+    [
+        ("PIONIER_Pnat", 0.003, True),
+        ("PIONIER_Pnat", 0.1, False),
+        ("NIRISS", 0.003, False),
+    ],
+)
+def test_structure_counts_where_it_exceeds_the_calibration_errors_of_the_table(
+    insname: str, second: float, within: bool
+) -> None:
+    """3 % of V² and half a degree: what a component of some 1 % of light changes."""
+    rng = np.random.default_rng(4)
+    data = observed(niriss(), points((0.0, 150.0, 0.05), (120.0, -90.0, second)), rng)
+    data = replace(data, setups=(replace(data.setups[0], insname=insname),))
+    test = statistic_of(search_field(data, OPTIONS).result, beside=True)
+    assert within_calibration(test) is within
+    assert test.strongest[0, 2] < 2.0 * second or second < 0.01
 
 
 @pytest.mark.slow
