@@ -63,11 +63,11 @@ def search_with_noise(
     converged = False
     while not converged and len(tried) <= MAX_ROUNDS:
         before = noise
-        noise = _best_noise(likelihood, result, per_file=per_file, prior=prior)
+        noise, noisy = _best_noise(likelihood, result, per_file=per_file, prior=prior)
         converged = _same(before, noise)
         if not converged:
             known = np.array([mode.theta for mode in result.modes])
-            result = search(with_noise(likelihood, noise), separation_mas, known=known)
+            result = search(noisy, separation_mas, known=known)
             tried.append((_score(result), result, noise))
     if converged:
         return tried[-1][1], tried[-1][2]
@@ -78,14 +78,16 @@ def search_with_noise(
 
 def _best_noise(
     stated: Likelihood, result: SearchResult, *, per_file: bool, prior: NoisePrior | None
-) -> ExtraNoise:
+) -> tuple[ExtraNoise, Likelihood]:
     """The noise of that solution of a search which, each with its own noise, is most likely."""
     found = []
     for mode in result.modes[:MODES_TRIED]:
         theta = np.array(mode.theta)
-        noise = fit_noise(stated, theta, per_file=per_file, prior=prior)
-        found.append((float(with_noise(stated, noise).log_prob(theta)[0]), noise))
-    return max(found, key=lambda f: f[0])[1]
+        likelihood = stated.expecting(theta)
+        noise = fit_noise(likelihood, theta, per_file=per_file, prior=prior)
+        found.append((noise, with_noise(likelihood, noise), theta))
+    noise, noisy, _ = max(found, key=lambda f: float(f[1].log_prob(f[2])[0]))
+    return noise, noisy
 
 
 MODES_TRIED = 3
@@ -169,6 +171,9 @@ def noise_averaged(
             per_file=per_file,
         )
     else:
+        expected = profile.observables.vis2.expected
+        stated = stated.unflagged()
+        stated = replace(stated, vis2=replace(stated.vis2, expected=expected))
         noise = averaged_noise(
             profile.noise, stated, fits, per_file=per_file, channels=channels, prior=prior
         )

@@ -96,6 +96,10 @@ class Measurements:
         Which `Setup`, which table row and which spectral channel each entry comes from.
     flag : (n,) bool array
         True where the number must not be used.
+    expected : (n,) float array, optional
+        The same numbers as a fit has them. What is proportional to them (a gain that channels
+        share) must not be made proportional to the measured ones, whose noise it would follow:
+        fits would then be drawn towards zero (Peelle's puzzle).
     """
 
     value: FloatArray
@@ -110,11 +114,13 @@ class Measurements:
     row: IntArray
     channel: IntArray
     flag: BoolArray
+    expected: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.value)
         for field in fields(self):
-            if len(getattr(self, field.name)) != n:
+            column = getattr(self, field.name)
+            if column is not None and len(column) != n:
                 raise ValueError(f"{field.name} has another length than value")
         _freeze(self)
 
@@ -123,7 +129,9 @@ class Measurements:
 
     def select(self, keep: IntArray | BoolArray) -> Measurements:
         """The entries ``keep``, in that order."""
-        return Measurements(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        present = {name: column[keep] for name, column in columns.items() if column is not None}
+        return Measurements(**present)
 
     @cached_property
     def sets(self) -> tuple[IntArray, ...]:
@@ -367,8 +375,9 @@ def join(parts: Sequence[Observables]) -> Observables:
 
 
 def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurements:
-    columns = {
-        f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(parts[0])
-    }
+    names = [f.name for f in fields(parts[0])]
+    if any(p.expected is None for p in parts):
+        names.remove("expected")
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
     return Measurements(**columns)

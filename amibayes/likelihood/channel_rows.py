@@ -253,8 +253,14 @@ def _amplitudes(data: Observables) -> FloatArray:
     """2|V| of V², not below its noise, in units of the errors, (n_data,); 0 of closure phases."""
     sigma = np.sqrt(data.covariance.variance[: data.n_vis2])
     out = np.zeros(data.covariance.size)
-    out[: data.n_vis2] = 2.0 * np.sqrt(np.maximum(np.abs(data.vis2.value), sigma)) / sigma
+    out[: data.n_vis2] = 2.0 * np.sqrt(np.maximum(_pattern(data), sigma)) / sigma
     return out
+
+
+def _pattern(data: Observables) -> FloatArray:
+    """V² as a fit expects them, (n_vis2,): the measured ones have noise of their own."""
+    expected = data.vis2.expected
+    return np.abs(data.vis2.value if expected is None else expected)
 
 
 def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
@@ -267,7 +273,7 @@ def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArr
     sigma = np.sqrt(data.covariance.variance)
     # The pattern of a gain is V² itself, not below its noise; that of an offset is flat.
     shape = np.ones(len(sigma))
-    shape[:n_vis2] = np.maximum(np.abs(data.vis2.value), sigma[:n_vis2])
+    shape[:n_vis2] = np.maximum(_pattern(data), sigma[:n_vis2])
     vis2, strength = np.arange(len(sigma)) < n_vis2, np.log(shape / sigma)
     if isinstance(data.covariance, DiagonalCovariance):
         keys = np.stack([~vis2, setup, row])

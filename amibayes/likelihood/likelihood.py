@@ -104,6 +104,16 @@ class Likelihood:
         visibility = self.model.visibility(self.samples, self._sets(theta))
         return self._observe(visibility)
 
+    def expecting(self, theta: FloatArray) -> Likelihood:
+        """The same with V² of a fit (n_dim,) as what is expected of the data.
+
+        Noise that is made for these data afterwards has gains in proportion to them.
+        """
+        data = self.observables
+        vis2 = np.asarray(self.predict(theta)[: data.n_vis2, 0])
+        known = replace(data, vis2=replace(data.vis2, expected=vis2))
+        return Likelihood(known, self.model, self.noise)
+
     def residuals(self, theta: ArrayLike) -> FloatArray:
         """Whitened residuals data − model, (n_independent, n)."""
         return self.noise.whiten(self.difference(theta))

@@ -201,7 +201,8 @@ def _concatenated(parts: list[Measurements], k: int) -> Measurements:
     empty = {"u_m": np.empty((0, k)), "v_m": np.empty((0, k))}
     whole = {"stations": np.empty((0, k + 1), np.intp), "flag": np.empty(0, bool)}
     whole |= {name: np.empty(0, np.intp) for name in ("setup", "row", "channel")}
-    start = {f.name: (empty | whole).get(f.name, np.empty(0)) for f in fields(Measurements)}
+    names = [f.name for f in fields(Measurements) if f.name != "expected"]
+    start = {name: (empty | whole).get(name, np.empty(0)) for name in names}
     return Measurements(
         **{
             name: np.concatenate([s, *(getattr(p, name) for p in parts)])
