@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from amibayes.cube.container import DO_NOT_USE, JUMP_DET, SATURATED, Cube
+from amibayes.cube.timing import GroupTiming
 from amibayes.support.fits_errors import reporting_damage
-from amibayes.units import BoolArray, FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 GAIN_E_DN = 1.61
 """Electrons per DN of NIRISS (1.61 to 1.62)."""
@@ -28,6 +29,22 @@ LEFT_OUT = 1e6
 
 SAMPLE = 64
 """Integrations that the mean ramp and the read noise are taken from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Differences of successive groups of some integrations.
+
+    Parameters
+    ----------
+    values : (n, m, ny, nx) array
+        In the file's unit; 0 where they may not be used.
+    good : (n, m, ny, nx) bool array
+        Those that may be used.
+    """
+
+    values: FloatArray
+    good: BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,38 +59,47 @@ class RampFile:
     hdus : mapping
         SCI (n_int, n_groups, ny, nx) and, where the file has them, GROUPDQ and PIXELDQ.
     mjd : (n_int,) array, optional
-    group_time_s : float
+    timing : GroupTiming
     """
 
     template: Cube
     n_integrations: int
     hdus: dict[str, Any]
     mjd: FloatArray | None
-    group_time_s: float
+    timing: GroupTiming
 
     def read(self, start: int = 0, stop: int | None = None) -> Cube:
         """Fit the slopes of the integrations from ``start`` up to ``stop``."""
+        return self.read_with_time(start, stop)[0]
+
+    def read_with_time(self, start: int = 0, stop: int | None = None) -> tuple[Cube, FloatArray]:
+        """As `read`, and the mean time (n, ny, nx) from the reset that each slope is of, s."""
         part = slice(start, self.n_integrations if stop is None else stop)
         if part.start >= part.stop:
-            return self.template
-        difference, good = self._differences(part)
-        photons, read = self._noise
-        slope, error = weighted_slopes(difference, good, photons, read)
+            return self.template, np.zeros(self.template.images.shape)
+        found = self.differences(part)
+        slope, error, when = self._weights.slopes(found)
         dq = np.zeros(slope.shape, dtype=np.uint32)
-        dq |= self._pixel_flags
-        dq[~good.any(axis=1)] |= DO_NOT_USE
-        dq[~good.all(axis=1)] |= JUMP_DET
-        time = self.group_time_s
+        dq |= self.pixel_flags
+        dq[~found.good.any(axis=1)] |= DO_NOT_USE
+        dq[~found.good.all(axis=1)] |= JUMP_DET
+        time = self.timing.group_s
         mjd = None if self.mjd is None else self.mjd[part]
-        return replace(self.template, images=slope / time, error=error / time, dq=dq, mjd=mjd)
+        cube = replace(self.template, images=slope / time, error=error / time, dq=dq, mjd=mjd)
+        return cube, when
 
     def chunks(self, size: int = 64) -> Iterator[Cube]:
         """Read everything, ``size`` integrations at a time."""
         for start in range(0, self.n_integrations, size):
             yield self.read(start, min(start + size, self.n_integrations))
 
-    def _differences(self, part: slice) -> tuple[FloatArray, BoolArray]:
-        """Differences of groups (n, n_groups − 1, ny, nx), and which may be used."""
+    @property
+    def gain_e(self) -> float:
+        """Electrons of the file's unit."""
+        return 1.0 if "electron" in self.template.unit.lower() else GAIN_E_DN
+
+    def differences(self, part: slice) -> Differences:
+        """Differences of groups of the integrations of a slice."""
         with reporting_damage(self.template.source):
             groups = np.asarray(self.hdus["SCI"].section[part], dtype=float)
             flags = self.hdus.get("GROUPDQ")
@@ -84,78 +110,96 @@ class RampFile:
             good &= (dq & (DO_NOT_USE | SATURATED)) == 0
             cut = (dq & JUMP_DET) > 0
         used = good[:, 1:] & good[:, :-1] & ~cut[:, 1:]
-        return np.where(used, np.diff(np.nan_to_num(groups), axis=1), 0.0), used
+        return Differences(np.where(used, np.diff(np.nan_to_num(groups), axis=1), 0.0), used)
 
     @cached_property
-    def _pixel_flags(self) -> Any:
+    def pixel_flags(self) -> Any:
+        """Data quality flags (ny, nx) that hold for all integrations, or 0."""
         flags = self.hdus.get("PIXELDQ")
         if flags is None:
             return np.uint32(0)
         return np.asarray(flags.section[:, :]).astype(np.uint32)
 
     @cached_property
-    def _noise(self) -> tuple[FloatArray, float]:
+    def noise(self) -> tuple[FloatArray, float]:
         """Photon variance of a difference (ny, nx), and read variance of one group, in units².
 
         The unit's gain tells what photons make of the mean ramp; what is left of the scatter
         of faint pixels is the reads'.
         """
-        n = self.n_integrations
-        difference, good = self._differences(slice(0, min(n, SAMPLE)))
+        found = self.differences(slice(0, min(self.n_integrations, SAMPLE)))
+        difference, good = found.values, found.good
         count = np.maximum(good.sum(axis=(0, 1)), 1)
         mean = difference.sum(axis=(0, 1)) / count
-        gain = 1.0 if "electron" in self.template.unit.lower() else GAIN_E_DN
-        photons = np.maximum(mean, 0.0) / gain
+        photons = np.maximum(mean, 0.0) / self.gain_e
         off = np.where(good, difference - mean, 0.0)
         variance = (off**2).sum(axis=(0, 1)) / np.maximum(count - 1, 1)
         faint = mean <= np.median(mean)
-        read = 0.5 * float(np.median((variance - photons)[faint & (count > 1)]))
+        spare = variance - photons * float(np.diag(self.timing.photon_covariance).mean())
+        read = 0.5 * float(np.median(spare[faint & (count > 1)]))
         return photons, max(read, 1e-6 * float(np.median(variance[faint])), 1e-12)
 
+    @cached_property
+    def _weights(self) -> SlopeWeights:
+        return SlopeWeights.of(*self.noise, self.timing)
 
-def weighted_slopes(
-    difference: FloatArray, good: BoolArray, photons: FloatArray, read: float
-) -> tuple[FloatArray, FloatArray]:
-    """Slopes of ramps by generalised least squares, and their standard deviations.
+
+@dataclass(frozen=True, eq=False)
+class SlopeWeights:
+    """Generalised least squares of the slope of every pixel.
 
     Parameters
     ----------
-    difference : (n, m, ny, nx) array
-        Of successive groups.
-    good : (n, m, ny, nx) bool array
-        Those that may be used.
-    photons : (ny, nx) array
-        Photon variance of one difference.
-    read : float
-        Variance of one group's read noise.
-
-    Returns
-    -------
-    slope, error : (n, ny, nx) arrays
-        Per group; 0 and infinite where no difference may be used.
+    covariance : (n_pixels, m, m) array
+        Of the differences of a ramp.
+    weight : (n_pixels, m) array
+        Rows of 1ᵀC⁻¹: what each difference counts.
+    middle_s : (m,) array
+        Times of the differences.
     """
-    n, m, ny, nx = difference.shape
-    covariance = _tridiagonal(photons.ravel(), read, m)
-    whole = np.linalg.inv(covariance).sum(axis=1)  # rows of 1ᵀC⁻¹, (pixels, m)
-    weight = np.broadcast_to(whole, (n, ny * nx, m)).copy()
-    used = good.reshape(n, m, -1).swapaxes(1, 2)
-    some = ~used.all(axis=2)
-    if some.any():
-        pixel = np.nonzero(some)[1]
-        cut = covariance[pixel] + np.einsum(
-            "pk,kl->pkl", np.where(used[some], 0.0, LEFT_OUT * covariance[pixel, 0, :1]), np.eye(m)
-        )
-        weight[some] = np.where(used[some], np.linalg.inv(cut).sum(axis=1), 0.0)
-    total = weight.sum(axis=2)
-    data = difference.reshape(n, m, -1).swapaxes(1, 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slope = np.where(total > 0.0, (weight * data).sum(axis=2) / total, 0.0)
-        error = np.where(total > 0.0, 1.0 / np.sqrt(total), np.inf)
-    return slope.reshape(n, ny, nx), error.reshape(n, ny, nx)
 
+    covariance: FloatArray
+    weight: FloatArray
+    middle_s: FloatArray
 
-def _tridiagonal(photons: FloatArray, read: float, m: int) -> FloatArray:
-    """Covariance (n_pixels, m, m) of the differences of a ramp."""
-    beside = np.eye(m, k=1) + np.eye(m, k=-1)
-    reads = read * (2.0 * np.eye(m) - beside)
-    return np.asarray(reads + photons[:, None, None] * np.eye(m))
+    @classmethod
+    def of(cls, photons: FloatArray, read: float, timing: GroupTiming) -> SlopeWeights:
+        """Weights for a photon variance (ny, nx) of a difference and that of a group's read."""
+        by_photons = photons.reshape(-1, 1, 1) * timing.photon_covariance
+        covariance = by_photons + read * timing.read_covariance
+        return cls(covariance, np.linalg.inv(covariance).sum(axis=1), timing.middle_s)
+
+    def slopes(self, found: Differences) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Slopes of ramps, their standard deviations, and the mean times that they are of.
+
+        Returns
+        -------
+        slope, error, time : (n, ny, nx) arrays
+            Per group; 0, infinite and 0 where no difference may be used.
+        """
+        n, m, ny, nx = found.values.shape
+        good = found.good.reshape(n, m, -1)
+        weight = self.weight.T
+        total = np.broadcast_to(weight.sum(axis=0), (n, ny * nx)).copy()
+        slope = np.einsum("nmp,mp->np", found.values.reshape(n, m, -1), weight)
+        time = np.broadcast_to(self.middle_s @ weight, (n, ny * nx)).copy()
+        some = ~good.all(axis=1)
+        if some.any():
+            number, pixel = np.nonzero(some)
+            own = self._cut(good[number, :, pixel], pixel)
+            total[some], time[some] = own.sum(axis=1), own @ self.middle_s
+            slope[some] = (own * found.values.reshape(n, m, -1)[number, :, pixel]).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lit = total > 0.0
+            slope, time = (np.where(lit, x / total, 0.0) for x in (slope, time))
+            error = np.where(lit, 1.0 / np.sqrt(total), np.inf)
+        shape = (n, ny, nx)
+        return slope.reshape(shape), error.reshape(shape), time.reshape(shape)
+
+    def _cut(self, used: BoolArray, pixel: IntArray) -> FloatArray:
+        """Weights (k, m) of some ramps of which only the differences ``used`` (k, m) count."""
+        covariance = self.covariance[pixel]
+        large = LEFT_OUT * np.einsum("kmm->km", covariance).max(axis=1)[:, None]
+        none = np.where(used, 0.0, large)
+        cut = covariance + none[:, :, None] * np.eye(used.shape[1])
+        return np.where(used, np.linalg.inv(cut).sum(axis=1), 0.0)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from amibayes.cube import header as keys
 from amibayes.cube.container import NEVER_USED, Cube
 from amibayes.cube.ramps import RampFile
+from amibayes.cube.timing import timing_of
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
 from amibayes.support.fits_errors import reporting_damage
@@ -174,7 +175,8 @@ def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> R
     template = _template(header, science, given, source, _comments(hdus, science))
     unit = "electron/s" if "electron" in template.unit.lower() else "DN/s"
     template = replace(template, unit=unit)
-    return RampFile(template, n, parts, _mid_times(hdus, n, header, source), step)
+    timing = timing_of(header, groups, step)
+    return RampFile(template, n, parts, _mid_times(hdus, n, header, source), timing)
 
 
 @contextmanager

@@ -17,6 +17,9 @@ from amibayes.units import DEGREE, MAS, FloatArray
 
 DAY_S = 86400.0
 
+SHIFT_KEYWORDS = ("BNDSHFTX", "BNDSHFTY")
+"""Displacement of pixels' sides by charge in simulated images, pixels per electron."""
+
 COMMENTS = {
     "TELESCOP": "telescope",
     "INSTRUME": "instrument",
@@ -53,6 +56,7 @@ COMMENTS = {
     "ZEROREAD": "the read after the reset is kept",
     "RDNOISE": "[electron] CDS read noise",
     "FLATERR": "rms relative error of the flat",
+    **dict.fromkeys(SHIFT_KEYWORDS, "[pixel/electron] shift of sides by charge, true"),
     "N_SRC": "sources, see the table SCENE",
 }
 

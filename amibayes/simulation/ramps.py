@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.ramps.transfer import SIDES, gains
 from amibayes.simulation.detector import Detector
 from amibayes.units import FloatArray
 
@@ -37,8 +38,8 @@ def read_ramps(
 
     Parameters
     ----------
-    rate_e_s : (n_int, ny, nx) array
-        Electrons per second that light makes in each pixel.
+    rate_e_s : (n_int, ny, nx) array, or (n_groups, n_int, ny, nx)
+        Electrons per second that light makes in each pixel, in every frame where it changes.
     detector : Detector
         What happens to them.
     n_groups : int
@@ -51,19 +52,68 @@ def read_ramps(
     Ramps
     """
     expected = (rate_e_s + (detector.dark_e_s + detector.background_e_s)) * detector.frame_time_s
-    reads = np.empty((detector.n_reads(n_groups), *expected.shape))
+    frames = np.broadcast_to(expected, (n_groups, *expected.shape[-3:]))
+    reads = np.empty((detector.n_reads(n_groups), *frames.shape[1:]))
     rng.standard_normal(out=reads)
     reads *= detector.single_read_noise_e
-    charge = np.zeros(expected.shape)
+    if detector.stripe_noise_e > 0.0:
+        reads += striped(reads.shape, detector.stripe_noise_e, rng.spawn(1)[0])
+    charge = np.zeros(frames.shape[1:])
     n_good: NDArray[np.int16] | None = None
     first = int(detector.zero_read)
     for group in range(n_groups):
-        charge += rng.poisson(expected) if detector.photon_noise else expected
+        light = collected(charge, frames[group], detector)
+        charge += rng.poisson(light) if detector.photon_noise else light
         if detector.cosmic_rays_s > 0.0:
             _add_hits(charge, detector, rng)
         reads[first + group] += measured_signal(charge, detector)
         n_good = _count_good(n_good, charge, detector.full_well_e, first + group)
     return Ramps(linearised(reads, detector), n_good)
+
+
+def collected(charge: FloatArray, light: FloatArray, detector: Detector) -> FloatArray:
+    """Electrons that pixels collect in a frame, their boundaries moved by what they hold.
+
+    Parameters
+    ----------
+    charge : (n_int, ny, nx) array
+        At the start of the frame.
+    light : (n_int, ny, nx) array
+        Electrons that the frame's light makes in pixels of equal size.
+    detector : Detector
+
+    Returns
+    -------
+    (n_int, ny, nx) array
+        Of the same sum.
+    """
+    strength = (detector.boundary_shift_x, detector.boundary_shift_y)
+    if not any(strength):
+        return light
+    # Boundaries where they are half-way through the frame: exact to second order in time.
+    gained = gains(SIDES, charge + 0.5 * light, light)
+    return np.maximum(light + np.tensordot(strength, gained, axes=1), 0.0)
+
+
+def striped(shape: tuple[int, ...], noise_e: float, rng: np.random.Generator) -> FloatArray:
+    """Noise of reads (n_reads, n_int, 1, nx) that columns share, its power 1/f across them.
+
+    Parameters
+    ----------
+    shape : (n_reads, n_int, ny, nx)
+    noise_e : float
+        Standard deviation, that of what all columns share included.
+    rng : numpy Generator
+    """
+    n = shape[-1]
+    # Twice as long as the image is wide: the ends of a Fourier series are neighbours.
+    frequency = np.fft.rfftfreq(2 * n)
+    amplitude = 1.0 / np.sqrt(np.maximum(frequency, frequency[1]))
+    white = np.fft.rfft(rng.standard_normal((*shape[:2], 1, 2 * n)))
+    # Of unit white noise every frequency but the first and last counts twice in the variance.
+    power = (2.0 * (amplitude**2).sum() - amplitude[0] ** 2 - amplitude[-1] ** 2) / (2 * n)
+    series = np.fft.irfft(white * amplitude / np.sqrt(power), 2 * n)[..., :n]
+    return np.asarray(noise_e * series)
 
 
 def measured_signal(charge: FloatArray, detector: Detector) -> FloatArray:

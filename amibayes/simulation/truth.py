@@ -9,6 +9,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from amibayes import __version__
+from amibayes.cube.write import SHIFT_KEYWORDS
 from amibayes.instrument import instrument_names
 from amibayes.units import MAS
 
@@ -83,6 +84,8 @@ def _truth(observation: Observation, pointings: Pointings, rate_e_s: float) -> d
         "ZEROREAD": detector.zero_read,
         "RDNOISE": detector.read_noise_e,
         "FLATERR": detector.flat_error,
+        SHIFT_KEYWORDS[0]: detector.boundary_shift_x,
+        SHIFT_KEYWORDS[1]: detector.boundary_shift_y,
         "N_SRC": len(scene.components),
     }
     if scene.magnitude is not None:

@@ -22,6 +22,7 @@ LAYERS = [
     "instrument",
     "optics",
     "cube",
+    "ramps",
     "simulation",
     "data",
     "oifits",

@@ -1,0 +1,1 @@
+"""Ramps: charge that passes between pixels, measured and taken out."""

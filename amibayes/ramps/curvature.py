@@ -1,0 +1,211 @@
+"""How the current of every pixel changes while charge collects: what ramps know of migration.
+
+A pixel whose area and response stay what they are collects at a constant current, whatever it
+is. What changes along the ramp is hence free of the image: the mean over integrations of the
+change, B in the current F + B·t, is all that a fit of migration needs of an exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_dilation, gaussian_filter
+
+from amibayes.cube.container import NEVER_USED, flag_bits
+from amibayes.cube.ramps import RampFile
+from amibayes.cube.timing import GroupTiming
+from amibayes.ramps.transfer import KINDS, gains
+from amibayes.units import BoolArray, FloatArray, IntArray, read_only
+
+CHUNK = 64
+"""Integrations that are worked on together."""
+
+BATCHES = 24
+"""Means of so many parts of an exposure: their scatter owes nothing to a model of the noise."""
+
+MIN_SHARE = 0.5
+"""A difference, or a pixel, is left out where it is good in a smaller share of the ramps."""
+
+SURROUNDINGS = np.ones((3, 3), dtype=bool)
+"""What passes to and from a pixel that is not known spoils those around it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """What the ramps of one exposure say, in electrons and seconds.
+
+    Parameters
+    ----------
+    source : str
+    n_integrations, n_differences : int
+        Of what was used.
+    time_s : float
+        Mean time from the reset.
+    current : (ny, nx) array
+        Mean electrons per second at that time, in every pixel.
+    change : (ny, nx) array
+        Mean change of the current, electrons per second squared.
+    sigma : (ny, nx) array
+        Standard deviation of it by photon and read noise; infinite where it is not used.
+    batches : (b, ny, nx) array
+        Means of `change` over parts of the exposure; none with fewer than two integrations.
+    gains : (len(KINDS), ny, nx) array
+        Mean over integrations of what a coefficient of 1 per electron makes of the change.
+    bend_chi2 : float
+        χ² of what is left of the mean ramps beside a linear change.
+    bend_dof : int
+    """
+
+    source: str
+    n_integrations: int
+    n_differences: int
+    time_s: float
+    current: FloatArray
+    change: FloatArray
+    sigma: FloatArray
+    batches: FloatArray
+    gains: FloatArray
+    bend_chi2: float
+    bend_dof: int
+
+    def __post_init__(self) -> None:
+        read_only(self, "current", "change", "sigma", "batches", "gains")
+
+    @property
+    def used(self) -> BoolArray:
+        """(ny, nx) pixels that count."""
+        return np.asarray(np.isfinite(self.sigma))
+
+
+@dataclass(frozen=True, eq=False)
+class _Weights:
+    """Linear estimates of current and change of every pixel out of the differences of a ramp.
+
+    Parameters
+    ----------
+    kept : (k,) int array
+        Differences that are used.
+    matrix : (2, k, n_pixels) array
+    sigma : (n_pixels,) array
+        Of the change, in one integration.
+    inverse : (n_pixels, k, k) array
+        Inverse covariance of the differences, as currents.
+    lag_s : (k,) array
+        Times of the differences from their mean.
+    """
+
+    kept: IntArray
+    matrix: FloatArray
+    sigma: FloatArray
+    inverse: FloatArray
+    lag_s: FloatArray
+
+
+def _weights(kept: IntArray, photons: FloatArray, read: float, timing: GroupTiming) -> _Weights:
+    """Generalised least squares of a straight line; ``photons`` and ``read`` in electrons²."""
+    by_photons, by_reads = (
+        c[np.ix_(kept, kept)] for c in (timing.photon_covariance, timing.read_covariance)
+    )
+    covariance = photons.reshape(-1, 1, 1) * by_photons + read * by_reads
+    inverse = np.linalg.inv(covariance) * timing.group_s**2
+    lag = timing.middle_s[kept] - timing.middle_s[kept].mean()
+    design = np.stack([np.ones(len(kept)), lag], axis=1)
+    half = design.T @ inverse
+    known = np.linalg.inv(half @ design)
+    matrix = np.moveaxis(known @ half, 0, 2)
+    return _Weights(kept, matrix, np.sqrt(known[:, 1, 1]), inverse, lag)
+
+
+class _Sums:
+    """Sums over integrations of one exposure."""
+
+    def __init__(self, shape: tuple[int, int], kept: int, batches: int) -> None:
+        self.count = np.zeros((batches, *shape))
+        self.change = np.zeros((batches, *shape))
+        self.current = np.zeros(shape)
+        self.ramp = np.zeros((kept, *shape))
+        self.gains = np.zeros((len(KINDS), *shape))
+        self.n = 0
+
+    def add(
+        self, number: IntArray, current: FloatArray, change: FloatArray, whole: BoolArray
+    ) -> None:
+        """Add integrations of a running number: their currents, changes and whole ramps."""
+        batch = number % len(self.count)
+        np.add.at(self.count, batch, whole)
+        np.add.at(self.change, batch, np.where(whole, change, 0.0))
+        self.current += np.where(whole, current, 0.0).sum(axis=0)
+
+
+def curvature_of(file: RampFile) -> Curvature | None:
+    """Measure how the currents of an exposure change; None with fewer than three differences.
+
+    Two differences tell a change, but not whether it is one that charge makes: a reset that
+    still decays, or a pointing that drifts, look the same.
+    """
+    gain = file.gain_e
+    photons, read = (x * gain**2 for x in file.noise)
+    kept = _usable(file)
+    if len(kept) < 3:
+        return None
+    weights = _weights(kept, np.maximum(photons, 1e-6), read, file.timing)
+    shape = photons.shape
+    bad = np.broadcast_to(np.asarray(file.pixel_flags) & flag_bits(NEVER_USED), shape) > 0
+    usual = filled(photons / file.timing.group_s, ~bad)
+    sums = _Sums(shape, len(kept), min(BATCHES, file.n_integrations))
+    for start in range(0, file.n_integrations, CHUNK):
+        part = slice(start, min(start + CHUNK, file.n_integrations))
+        found = file.differences(part)
+        whole = found.good[:, kept].all(axis=1) & ~bad
+        steps = found.values[:, kept] * (gain / file.timing.group_s)
+        flat = steps.reshape(*steps.shape[:2], -1)
+        current, change = np.einsum("nkp,ikp->inp", flat, weights.matrix).reshape(2, -1, *shape)
+        sums.add(np.arange(part.start, part.stop), current, change, whole)
+        sums.ramp += np.where(whole[:, None], steps, 0.0).sum(axis=0)
+        light = np.where(whole, current, usual)
+        sums.gains += gains(KINDS, light, light).sum(axis=1)
+    return _averaged(sums, weights, file, bad)
+
+
+def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) -> Curvature:
+    n, count = file.n_integrations, sums.count.sum(axis=0)
+    lost = bad | (count < MIN_SHARE * n)
+    divisor = np.maximum(count, 1.0)
+    current, change = sums.current / divisor, sums.change.sum(axis=0) / divisor
+    sigma = weights.sigma.reshape(count.shape) / np.sqrt(divisor)
+    sigma = np.where(binary_dilation(lost, SURROUNDINGS), np.inf, sigma)
+    batches = sums.change / np.maximum(sums.count, 1.0)
+    batches = np.where(sums.count > 0.0, batches, change)
+    left = sums.ramp / divisor - current - change * weights.lag_s[:, None, None]
+    flat = left.reshape(len(left), -1)
+    chi2 = divisor.ravel() * np.einsum("kp,pkl,lp->p", flat, weights.inverse, flat)
+    used = np.isfinite(sigma).ravel()
+    return Curvature(
+        file.template.source,
+        n,
+        len(weights.kept),
+        float(file.timing.middle_s[weights.kept].mean()),
+        filled(current, ~lost),
+        change,
+        sigma,
+        batches if len(batches) > 1 else batches[:0],
+        sums.gains / n,
+        float(chi2[used].sum()),
+        int(used.sum()) * (len(weights.kept) - 2),
+    )
+
+
+def _usable(file: RampFile) -> IntArray:
+    """Differences that are good in most ramps: groups may be flagged in all of them."""
+    good = file.differences(slice(0, min(CHUNK, file.n_integrations))).good
+    return np.flatnonzero(good.mean(axis=(0, 2, 3)) > MIN_SHARE)
+
+
+def filled(image: FloatArray, good: BoolArray) -> FloatArray:
+    """Image (ny, nx) with the Gaussian-weighted mean of good neighbours where it is not good."""
+    if good.all():
+        return image
+    weight = gaussian_filter(good.astype(float), 1.0)
+    smooth = gaussian_filter(np.where(good, image, 0.0), 1.0) / np.maximum(weight, 1e-12)
+    return np.where(good, image, smooth)
