@@ -23,9 +23,9 @@ from amibayes import Scene, load_instrument
 from amibayes.calibration import calibrate
 from amibayes.cube import Cube
 from amibayes.extraction import Extraction, ExtractOptions, extract_all
-from amibayes.extraction.averaging import average
 from amibayes.extraction.fourier.fine_image import FineImage
 from amibayes.extraction.fourier.sampling import split
+from amibayes.extraction.frames import average
 from amibayes.extraction.image_plane import shift_of
 from amibayes.extraction.response import pointing_response, star_image
 from amibayes.parallel import SerialExecutor

@@ -12,6 +12,7 @@ from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import sparse_covariance, wrapped
 from amibayes.calibration.weighted import TransferFunction
 from amibayes.data.observables import CovarianceKind, Observables
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import DataError
 from amibayes.oifits.correlations import Pairs, given_covariance
 from amibayes.units import BoolArray, FloatArray
@@ -55,11 +56,13 @@ def apply_response(
             source=target.source,
             remedy="use brighter calibrators",
         )
-    used = target.select(*_on_entries(target, keep)).unflagged()
+    sharing = target.select(*_on_entries(target, keep)).unflagged()
+    used = sharing.without_shared_errors()
     key, sign = keys.key[keep], keys.sign[keep]
     value, target_slope, response_slope = _values(used, key, sign, response)
     spread = coo_array((response_slope, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
     own = diags_array(target_slope)
+    shared = _shared(sharing.shared, target_slope, response.shared, key, response_slope)
     by_target = csr_array(own @ sparse_covariance(used.covariance) @ own)
     by_response = csr_array(spread @ response.covariance @ spread.T)
     kind = _kind(target, calibrators, keys)
@@ -68,11 +71,32 @@ def apply_response(
         made.covariance, by_target, used.freedom, by_response, response.freedom
     )
     if used.scatter is None and response.scatter is None:
-        return replace(made, freedom=freedom)
+        return replace(made, freedom=freedom).with_shared_errors(shared)
     by_target = by_target if used.scatter is None else csr_array(own @ used.scatter @ own)
     if response.scatter is not None:
         by_response = csr_array(spread @ response.scatter @ spread.T)
-    return replace(made, freedom=freedom, scatter=csr_array(by_target + by_response))
+    scatter = csr_array(by_target + by_response)
+    return replace(made, freedom=freedom, scatter=scatter).with_shared_errors(shared)
+
+
+def _shared(
+    target: SharedErrors | None,
+    target_slope: FloatArray,
+    response: SharedErrors | None,
+    key: np.ndarray,
+    response_slope: FloatArray,
+) -> SharedErrors | None:
+    """What is left of errors that target and calibrators have in common."""
+    names = tuple(dict.fromkeys([n for s in (target, response) if s is not None for n in s.names]))
+    if not names:
+        return None
+    nothing = np.zeros(len(key))
+    changes = [
+        target_slope * (nothing if target is None else target.change(name))
+        + response_slope * (nothing if response is None else response.change(name)[key])
+        for name in names
+    ]
+    return SharedErrors(names, np.stack(changes, axis=1))
 
 
 def _values(
@@ -193,6 +217,7 @@ def _rebuilt(
         covariance_kind=kind,
         notes=(*target.notes, *notes),
         scatter=None,
+        shared=None,
     )
 
 

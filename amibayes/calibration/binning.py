@@ -23,6 +23,7 @@ from amibayes.data.observables import (
     Setup,
     closure_sets,
 )
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
 from amibayes.oifits.correlations import Pairs, given_covariance
 from amibayes.units import FloatArray, IntArray
@@ -162,7 +163,7 @@ def _averaged(
     made = [new for new, _ in averages]
     combine = _stacked([matrix for _, matrix in averages])
     covariance = combine @ sparse_covariance(observables.covariance) @ combine.T
-    scatter = observables.scatter
+    scatter, shared = observables.scatter, observables.shared
     upper = triu(covariance, 1).tocoo()
     pairs = Pairs(upper.row.astype(np.intp), upper.col.astype(np.intp), upper.data)
     closure = made[1].select(~made[1].flag)
@@ -180,6 +181,7 @@ def _averaged(
             independent=everywhere & (observables.covariance_kind == "diagonal"),
         ),
         scatter=None if scatter is None else csr_array(combine @ scatter @ combine.T),
+        shared=None if shared is None else SharedErrors(shared.names, combine @ shared.changes),
     )
 
 

@@ -105,4 +105,5 @@ def without_disc(calibrator: Observables, diameter_mas: float) -> Observables:
         vis2=replace(m, value=np.where(m.flag, m.value, m.value * factor)),
         covariance=scaled(calibrator.covariance, every),
         scatter=None if scatter is None else (scatter * every[:, None] * every[None]).tocsr(),
+        shared=None if calibrator.shared is None else calibrator.shared.scaled(every),
     )

@@ -69,6 +69,7 @@ def flag_by_rule(observables: Observables, rules: Sequence[str]) -> Observables:
         closure_phase=replace(observables.closure_phase, flag=closure),
         covariance=observables.covariance.select(np.flatnonzero(used)),
         scatter=None if observables.scatter is None else observables.scatter[used][:, used],
+        shared=None if observables.shared is None else observables.shared.select(used),
     )
 
 

@@ -10,7 +10,7 @@ is one more draw. k is integrated out exactly; τ has a half-normal prior and is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import emcee
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import ClosureSet, Transfer, closure_sets
-from amibayes.calibration.weighted import TransferFunction
+from amibayes.calibration.weighted import TransferFunction, shared_changes
 from amibayes.errors import RunError
 from amibayes.support.ensemble_moves import along_others
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -305,7 +305,14 @@ def hierarchical_response(
     population = population_of(transfers, keys, known, covariate)
     tau = sample_tau(population, rng)
     value, covariance = predictive(population, tau, len(keys))
-    return TransferFunction(value, covariance, known, tau)
+
+    def combine(changes: FloatArray) -> FloatArray:
+        # The mean is linear in what the calibrators see, at any scatter between them.
+        moved = [replace(t, value=own) for t, own in zip(transfers, changes, strict=True)]
+        return predictive(population_of(moved, keys, known, covariate), tau, len(keys))[0]
+
+    shared = shared_changes(transfers, combine)
+    return TransferFunction(value, covariance, known, tau, shared=shared)
 
 
 def predictive(

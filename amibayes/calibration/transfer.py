@@ -12,6 +12,7 @@ from amibayes.calibration.matching import Keys, Match, match
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import sparse_covariance
 from amibayes.data.observables import Observables
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.scene.disc import uniform_disc
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -31,12 +32,15 @@ class Transfer:
     seen : (n_keys,) bool array
     scatter : (n_keys, n_keys) sparse array, optional
         The covariance by measured scatter alone; see `amibayes.data.observables.Observables`.
+    shared : SharedErrors, optional
+        Errors in common with other data, of the keys; the covariances do not hold them.
     """
 
     value: FloatArray
     covariance: csr_array
     seen: BoolArray
     scatter: csr_array | None = None
+    shared: SharedErrors | None = None
 
     @property
     def variance(self) -> FloatArray:
@@ -52,6 +56,7 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
     diameter : (diameter, error)
         Uniform disc in mas; the error makes all its V² err together.
     """
+    shared, calibrator = calibrator.shared, calibrator.without_shared_errors()
     found = match(calibrator, keys)
     n_vis2 = calibrator.n_vis2
     scale, slope = _disc_correction(calibrator, found, diameter[0])
@@ -76,6 +81,7 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
         csr_array(covariance),
         np.bincount(found.key, minlength=len(keys)) > 0,
         None if scatter is None else csr_array(scatter),
+        None if shared is None else SharedErrors(shared.names, combine @ shared.changes),
     )
 
 

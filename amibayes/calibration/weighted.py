@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import Transfer, kernel_projector
 from amibayes.data.degrees_of_freedom import Freedom
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.units import BoolArray, FloatArray
 
 
@@ -32,6 +33,8 @@ class TransferFunction:
         Of the covariance, where calibrators have estimated ones.
     scatter : (n_keys, n_keys) sparse array, optional
         The covariance by the scatter of the calibrators' integrations alone, where it is known.
+    shared : SharedErrors, optional
+        Errors in common with other data; the covariances do not hold them.
     """
 
     value: FloatArray
@@ -40,6 +43,7 @@ class TransferFunction:
     tau: FloatArray | None = None
     freedom: Freedom | None = None
     scatter: csr_array | None = None
+    shared: SharedErrors | None = None
 
 
 def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:
@@ -122,7 +126,32 @@ def weighted_response(transfers: Sequence[Transfer], keys: Keys) -> TransferFunc
         _combined(inflate, weight, [t.covariance for t in transfers]),
         known,
         scatter=_combined(inflate, weight, scatters) if measured else None,
+        shared=shared_changes(
+            transfers, lambda own: kernel_projector(keys, known) @ (weight * own).sum(axis=0)
+        ),
     )
+
+
+def shared_changes(
+    transfers: Sequence[Transfer], combine: Callable[[FloatArray], FloatArray]
+) -> SharedErrors | None:
+    """Errors that calibrators have in common with other data, in what they are combined to.
+
+    Parameters
+    ----------
+    transfers : sequence of Transfer
+    combine : callable
+        From the changes (n_calibrators, n_keys) of all to that of the response (n_keys,).
+    """
+    names = dict.fromkeys(n for t in transfers if t.shared is not None for n in t.shared.names)
+    if not names:
+        return None
+    nothing = np.zeros(len(transfers[0].value))
+    changes = [
+        combine(np.array([nothing if t.shared is None else t.shared.change(n) for t in transfers]))
+        for n in names
+    ]
+    return SharedErrors(tuple(names), np.stack(changes, axis=1))
 
 
 def _combined(

@@ -76,6 +76,15 @@ def add_image_options(parser: argparse.ArgumentParser) -> None:
         "wavelength of the filter)",
     )
     group.add_argument(
+        "--charge-migration",
+        type=charge_migration,
+        default="fit",
+        metavar="fit|VALUE|off",
+        help="charge that passes between pixels: fitted to ramps, and the instrument's value for "
+        "slopes (fit); displacement of pixels' sides, pixels per electron; or left in (off) "
+        "(default: %(default)s)",
+    )
+    group.add_argument(
         "--method",
         choices=tuple(EXTRACTION_METHODS),
         default=next(iter(EXTRACTION_METHODS)),
@@ -97,7 +106,11 @@ def image_options_of(arguments: argparse.Namespace) -> ImageOptions:
         "position_angle_deg": arguments.position_angle,
         "bad_flags": _flags(arguments.bad_flags),
     }
-    extraction = ExtractOptions(method=arguments.method, temperature_k=arguments.temperature)
+    extraction = ExtractOptions(
+        method=arguments.method,
+        temperature_k=arguments.temperature,
+        charge_migration=arguments.charge_migration,
+    )
     return ImageOptions(extraction, header)
 
 
@@ -119,6 +132,11 @@ def finite_float(text: str) -> float:
     if not abs(value) < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not finite")
     return value
+
+
+def charge_migration(text: str) -> float | str:
+    """Parse ``fit``, ``off`` or a number."""
+    return text if text in ("fit", "off") else finite_float(text)
 
 
 def add_seed_option(parser: argparse._ActionsContainer) -> None:

@@ -15,6 +15,7 @@ from amibayes.data.closure import closure_matrix
 from amibayes.data.covariance import Covariance, stack_covariances
 from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.shared_errors import SharedErrors, joined_errors, vis2_first, with_shared
 from amibayes.data.tables import observables_html, observables_table
 from amibayes.errors import DataError
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -177,6 +178,8 @@ class Observables:
         Of an estimated covariance; without it the covariance counts as known.
     scatter : sparse array, optional
         The covariance as the measured scatter alone has it, without the expected noise.
+    shared : SharedErrors, optional
+        Errors in common with other data sets; both covariances hold them.
 
     Raises
     ------
@@ -193,9 +196,11 @@ class Observables:
     notes: tuple[str, ...] = ()
     freedom: Freedom | None = None
     scatter: csr_array | None = None
+    shared: SharedErrors | None = None
 
     def __post_init__(self) -> None:
         sizes = [self.covariance.size, *([] if self.scatter is None else self.scatter.shape)]
+        sizes += [] if self.shared is None else [len(self.shared.changes)]
         for size in sizes:
             if size != len(self.data):
                 raise DataError(
@@ -261,7 +266,23 @@ class Observables:
             closure_phase=self.closure_phase.select(closure_phase),
             covariance=self.covariance.select(np.flatnonzero(used)),
             scatter=None if self.scatter is None else self.scatter[used][:, used],
+            shared=None if self.shared is None else self.shared.select(used),
         )
+
+    def with_shared_errors(self, shared: SharedErrors | None) -> Observables:
+        """The same data with errors in common with others put into the covariance."""
+        return self._with_shared(shared, 1.0)
+
+    def without_shared_errors(self) -> Observables:
+        """Data with the covariance of their own errors only."""
+        return replace(self._with_shared(self.shared, -1.0), shared=None)
+
+    def _with_shared(self, shared: SharedErrors | None, sign: float) -> Observables:
+        if shared is None:
+            return self
+        scatter = None if self.scatter is None else shared.added(self.scatter, sign)
+        whole = with_shared(self.covariance, shared, sign)
+        return replace(self, covariance=whole, scatter=scatter, shared=shared)
 
     def only(self, kinds: Sequence[str]) -> Observables:
         """The data of the given kinds, out of ``vis2`` and ``cp``.
@@ -344,33 +365,33 @@ def closure_sets(closure_phase: Measurements) -> Sequence[IntArray]:
 
 
 def join(parts: Sequence[Observables]) -> Observables:
-    """Lay independent data sets together for one fit.
+    """Lay data sets together for one fit.
 
     The kind of the whole covariance is that of its least certain part, in the order
     given, estimated, assumed, diagonal; its freedom that of `stacked_freedom`.
     """
     if len(parts) == 1:
         return parts[0]
+    if any(p.shared is not None for p in parts):  # which correlate the parts
+        own = join([p.without_shared_errors() for p in parts])
+        return own.with_shared_errors(
+            joined_errors([(p.n_vis2, p.n_closure_phases, p.shared) for p in parts])
+        )
     shifts = np.cumsum([0, *(len(p.setups) for p in parts)])
-    order = [np.arange(p.n_vis2) for p in parts], [np.arange(p.n_closure_phases) for p in parts]
-    starts = np.cumsum([0, *(p.covariance.size for p in parts)])
-    vis2_first = np.concatenate(
-        [s + i for s, i in zip(starts, order[0], strict=False)]
-        + [s + p.n_vis2 + i for s, p, i in zip(starts, parts, order[1], strict=False)]
-    ).astype(np.intp)
+    order = vis2_first([(p.n_vis2, p.n_closure_phases) for p in parts])
     kinds: list[CovarianceKind] = ["diagonal", "assumed", "estimated", "given"]
     known = [p.n_integrations for p in parts if p.n_integrations is not None]
     scatter = stacked_scatter((p.covariance, p.scatter) for p in parts)
     return Observables(
         _concatenate([p.vis2 for p in parts], shifts),
         _concatenate([p.closure_phase for p in parts], shifts),
-        stack_covariances([p.covariance for p in parts]).select(vis2_first),
+        stack_covariances([p.covariance for p in parts]).select(order),
         min((p.covariance_kind for p in parts), key=kinds.index),
         tuple(s for p in parts for s in p.setups),
         min(known) if known else None,
         tuple(n for p in parts for n in p.notes),
         stacked_freedom((p.n_independent, p.freedom) for p in parts),
-        None if scatter is None else scatter[vis2_first][:, vis2_first],
+        None if scatter is None else scatter[order][:, order],
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,13 @@ from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.outliers import outlying
 from amibayes.data.shrinkage import Shrunk, shrunk_covariance
 from amibayes.errors import DataError
-from amibayes.extraction.averaging import Average, average
-from amibayes.extraction.frames import Frames, concatenated, measure_file, select
+from amibayes.extraction.charge import (
+    CubeMigration,
+    observable_changes,
+    shared_errors,
+    visit_migration,
+)
+from amibayes.extraction.frames import Average, Frames, average, concatenated, measure_file, select
 from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
@@ -29,6 +34,7 @@ from amibayes.extraction.response import off_axis_response, pointing_response, s
 from amibayes.extraction.table import independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import exposures, visit_maps
+from amibayes.ramps.correction import MigrationFree
 from amibayes.support.options import EXTRACTION_METHODS
 from amibayes.units import ComplexArray, FloatArray
 
@@ -61,6 +67,8 @@ class Extraction:
         One per file: view, reference image, operators.
     options : ExtractOptions
     sources : tuple of str
+    charge : CubeMigration
+        What was done about charge migration.
     """
 
     observables: Observables
@@ -71,6 +79,7 @@ class Extraction:
     operators: tuple[ExtractionOperator, ...]
     options: ExtractOptions
     sources: tuple[str, ...]
+    charge: CubeMigration = field(default_factory=CubeMigration)
 
     @property
     def rejected(self) -> list[tuple[str, int, str]]:
@@ -123,22 +132,25 @@ def extract_all(
     *,
     one_star: bool = True,
     maps: Sequence[MaskMap | None] | None = None,
+    charges: Sequence[CubeMigration] | None = None,
     **header: Any,
 ) -> list[Extraction]:
     """As `extract`, with everything that was found on the way, one for each exposure.
 
     Cubes that name no star are exposures of ``one_star``, or each of another one. ``maps`` of
-    the mask, one for each cube, are by default those of `visit_maps` of these cubes.
+    the mask and ``charges`` that pass between pixels, one for each cube, are by default those
+    of `visit_maps` and `visit_migration` of these cubes.
     """
     given = [cubes] if isinstance(cubes, Cube | str | Path) else list(cubes)
     if not given:
         raise DataError("no cube to extract", remedy="give at least one file")
     chosen = options or ExtractOptions()
     chosen.refuse_unused()
-    maps = visit_maps(given, chosen, header) if maps is None else maps
+    charges = visit_migration(given, chosen, header) if charges is None else charges
+    maps = visit_maps(given, chosen, header, charges) if maps is None else maps
     parts = [
-        _measured(cube, index, chosen, header, mask_map)
-        for index, (cube, mask_map) in enumerate(zip(given, maps, strict=True))
+        _measured(cube, index, chosen, header, mask_map, charge)
+        for index, (cube, mask_map, charge) in enumerate(zip(given, maps, charges, strict=True))
     ]
     groups = exposures(parts, lambda part: part.template, one_star=one_star)
     return [_finished(_numbered(group), chosen) for group in groups]
@@ -154,6 +166,8 @@ class _Part:
     physical: FloatArray
     response: OffAxisResponse
     pointed: ComplexArray
+    charge: CubeMigration
+    changes: FloatArray | None
 
 
 def _numbered(parts: list[_Part]) -> list[_Part]:
@@ -170,10 +184,15 @@ def _measured(
     options: ExtractOptions,
     header: dict[str, Any],
     mask_map: MaskMap | None,
+    charge: CubeMigration,
 ) -> _Part:
-    with opened(cube, **header) as file:
+    with opened(cube, **header) as raw:
+        file = charge.applied(raw)
         operator = make_operator(file, options, mask_map)
         frames, samples, flux = measure_file(operator, file, index)
+        changes = None
+        if isinstance(file, MigrationFree):
+            changes = observable_changes(file, operator, samples, flux)
     template = file.template
     frames = _with_times(frames, template)
     if not options.keep_all:
@@ -192,6 +211,8 @@ def _measured(
         operator.sampling.expected_covariance(flux, samples, operator.variance, operator.skewness),
         response,
         pointing_response(star, operator.sampling, frames.shift_px),
+        charge,
+        changes,
     )
 
 
@@ -211,10 +232,25 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     basis = independent_basis(view)
     shrunk = shrunk_covariance(mean.deviation, physical, basis, n_vis2, options.covariance)
     notes = _unnamed(parts) + _of_headers(parts) + _notes(view, frames, shrunk)
+    notes += tuple(dict.fromkeys(note for p in parts for note in p.charge.notes))
     sources = tuple(p.template.source for p in parts)
     observables = _tabled(parts[0], frames, mean, shrunk, basis, notes, sources)
+    observables = _sharing(observables, parts, frames)
     operators = tuple(p.operator for p in parts)
-    return Extraction(observables, frames, mean, shrunk, physical, operators, options, sources)
+    return Extraction(
+        observables, frames, mean, shrunk, physical, operators, options, sources, parts[0].charge
+    )
+
+
+def _sharing(observables: Observables, parts: list[_Part], frames: Frames) -> Observables:
+    """Put in what errors of the charge migration do to the mean of all files."""
+    weight = np.bincount(frames.file[frames.used], minlength=len(parts)) / frames.used.sum()
+    changes = [
+        (p.charge.migration, w * p.changes)
+        for p, w in zip(parts, weight, strict=True)
+        if p.charge.migration is not None and p.changes is not None
+    ]
+    return observables.with_shared_errors(shared_errors(changes))
 
 
 def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Average, FloatArray]:

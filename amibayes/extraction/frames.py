@@ -1,4 +1,4 @@
-"""Numbers of every integration, and which of the integrations are kept."""
+"""Numbers of every integration, which of the integrations are kept, and their average."""
 
 from __future__ import annotations
 
@@ -220,3 +220,46 @@ def _criteria(frames: Frames) -> list[tuple[str, FloatArray, float]]:
     lit = np.maximum(frames.flux, 0.0)
     middle = float(np.median(lit[frames.used])) if frames.used.any() else 0.0
     return [("flux", lit, 1e-3 * middle), ("shape", frames.misfit, 0.02)]
+
+
+@dataclass(frozen=True, eq=False)
+class Average:
+    """Mean observables of some integrations.
+
+    Parameters
+    ----------
+    vis2 : (n_baselines,) array
+    closure_phase : (n_triangles,) array
+        Phase of the mean bispectrum, radians.
+    deviation : (n, n_baselines + n_triangles) array
+        What each integration deviates from the mean by, V² and closure phase, to first
+        order in its noise; its mean is zero.
+    """
+
+    vis2: FloatArray
+    closure_phase: FloatArray
+    deviation: FloatArray
+
+
+def average(frames: Frames, pointed: ComplexArray, triangles: IntArray) -> Average:
+    """Average power and bispectrum, not their ratios and phases.
+
+    Parameters
+    ----------
+    frames : Frames
+        The integrations to be used.
+    pointed : (n, n_baselines) complex array
+        What each integration's pointing makes of a visibility of 1.
+    triangles : (n_triangles, 3) int array
+        Baselines ij, jk, ik of every triangle.
+    """
+    power = frames.power / np.abs(pointed) ** 2
+    turn = pointed / np.abs(pointed)
+    ij, jk, ik = (turn[:, index] for index in triangles.T)
+    bispectrum = frames.bispectrum * (ij * jk).conj() * ik
+    square = frames.square.mean()
+    vis2 = power.mean(axis=0) / square
+    by_vis2 = (power - frames.square[:, None] * vis2) / square
+    total = bispectrum.mean(axis=0)
+    by_closure = (bispectrum / total).imag
+    return Average(vis2, np.angle(total), np.concatenate([by_vis2, by_closure], axis=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 from amibayes.errors import UsageError
 from amibayes.support.options import (
@@ -20,6 +20,9 @@ METHODS = EXTRACTION_METHODS
 
 COLDEST_K = 100.0
 """A blackbody that is colder has no light in these filters."""
+
+MAX_MIGRATION = 1e-5
+"""Sides of pixels that move farther per electron would leave no pixel where it is."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,10 @@ class ExtractOptions:
         them, or as the header and the options say.
     keep_all : bool
         Leave no integration out that can be measured at all.
+    charge_migration : "fit", "off", or float
+        Charge that passes between pixels: fitted to the ramps of a visit, or of the
+        instrument's file where there are none; left in; or this displacement of pixels'
+        sides, pixels per electron.
 
     Raises
     ------
@@ -62,6 +69,7 @@ class ExtractOptions:
     temperature_k: float | None = None
     geometry: Geometry = "fitted"
     keep_all: bool = False
+    charge_migration: float | Literal["fit", "off"] = "fit"
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -78,6 +86,18 @@ class ExtractOptions:
         if self.temperature_k is not None and not self.temperature_k >= COLDEST_K:
             raise UsageError(
                 f"temperature is {self.temperature_k:g} K; it must be at least {COLDEST_K:g}"
+            )
+
+        self._check_migration()
+
+    def _check_migration(self) -> None:
+        value = self.charge_migration
+        if value in ("fit", "off"):
+            return
+        if not isinstance(value, float) or not abs(value) <= MAX_MIGRATION:
+            raise UsageError(
+                f"charge migration is {value!r}",
+                remedy=f"give fit, off, or pixels per electron up to {MAX_MIGRATION:g}",
             )
 
     def refuse_unused(self) -> None:

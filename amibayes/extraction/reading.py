@@ -16,6 +16,7 @@ from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables, Setup
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.errors import DataError, UsageError
+from amibayes.extraction.charge import CubeMigration, visit_migration
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.options import ExtractOptions
@@ -49,11 +50,14 @@ class ImageOptions:
         what the files say.
     maps : mapping of path to MaskMap
         Maps of the mask that targets and calibrators share, from `of_one_visit`.
+    charges : mapping of path to CubeMigration
+        What is done about charge migration, likewise.
     """
 
     extraction: ExtractOptions = field(default_factory=ExtractOptions)
     header: Mapping[str, Any] = field(default_factory=dict)
     maps: Mapping[str, MaskMap | None] = field(default_factory=dict)
+    charges: Mapping[str, CubeMigration] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -133,8 +137,14 @@ def _is_cube(contents: Contents) -> bool:
 def _extracted(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    known = [images.maps.get(path) for path in paths] if images.maps else None
-    found = extract_all(paths, images.extraction, one_star=one_star, maps=known, **images.header)
+    found = extract_all(
+        paths,
+        images.extraction,
+        one_star=one_star,
+        maps=[images.maps.get(path) for path in paths] if images.maps else None,
+        charges=[images.charges[path] for path in paths] if images.charges else None,
+        **images.header,
+    )
     return [e.observables for e in found]
 
 
@@ -297,7 +307,7 @@ def _given(path: str | Path) -> Given:
 
 
 def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None) -> ImageOptions:
-    """Find what the image cubes among files share, target's and calibrators': maps of the mask.
+    """Find what image cubes, target's and calibrators', share: the mask's map, and migration.
 
     Raises
     ------
@@ -306,5 +316,10 @@ def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None
     """
     chosen = images or ImageOptions()
     cubes = [str(path) for path in paths if format_of(path).read is _extracted]
-    maps = visit_maps(cubes, chosen.extraction, chosen.header)
-    return replace(chosen, maps=dict(zip(cubes, maps, strict=True)))
+    charges = visit_migration(cubes, chosen.extraction, chosen.header)
+    maps = visit_maps(cubes, chosen.extraction, chosen.header, charges)
+    return replace(
+        chosen,
+        maps=dict(zip(cubes, maps, strict=True)),
+        charges=dict(zip(cubes, charges, strict=True)),
+    )

@@ -51,6 +51,7 @@ def described(extraction: Extraction) -> dict[str, Any]:
         "variance_scale": {"vis2": shrunk.scale_vis2, "closure_phase": shrunk.scale_closure},
         "correlation_in_time": shrunk.correlation,
         "block": shrunk.block,
+        "charge_migration": extraction.charge.as_json(),
         "notes": list(extraction.observables.notes),
     }
 

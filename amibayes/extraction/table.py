@@ -15,7 +15,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup, join
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.errors import DataError
-from amibayes.extraction.averaging import Average
+from amibayes.extraction.frames import Average
 from amibayes.extraction.view import View
 from amibayes.units import FloatArray, IntArray
 
@@ -148,7 +148,8 @@ def integrations(extraction: Extraction) -> Observables:
             "holds one integration only", source=extraction.sources[0], remedy="leave it as it is"
         )
     vis2, closure = series(extraction)
-    mean = extraction.observables
+    mean = extraction.observables.without_shared_errors()
+    shared = extraction.observables.shared
     covariance = mean.covariance
     assert isinstance(covariance, BlockCovariance)
     n = len(used)
@@ -156,7 +157,8 @@ def integrations(extraction: Extraction) -> Observables:
     whole = BlockCovariance(covariance.size, blocks)
     # The scatter is that of these very data: what it does not tell of the covariance they do
     # not tell again, and a t likelihood of all of them would be too narrow.
-    one = replace(mean, covariance=whole, covariance_kind="given", freedom=None, scatter=None)
+    alone = replace(mean, covariance=whole, covariance_kind="given", freedom=None, scatter=None)
+    one = alone.with_shared_errors(shared)
     time = extraction.frames.mjd[used]
     parts = []
     for k in range(n):

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from amibayes.cube import Cube
 from amibayes.cube.source import opened
+from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.mask_map import MapEstimate, MaskMap, combined
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import map_estimate, maps_mask
@@ -63,7 +64,10 @@ def _start(template: Cube) -> tuple[float, float]:
 
 
 def visit_maps(
-    cubes: Sequence[Images], options: ExtractOptions, header: Mapping[str, Any]
+    cubes: Sequence[Images],
+    options: ExtractOptions,
+    header: Mapping[str, Any],
+    charges: Sequence[CubeMigration] | None = None,
 ) -> list[MaskMap | None]:
     """Find one map of the mask for all cubes of an instrument and filter.
 
@@ -74,13 +78,19 @@ def visit_maps(
     options : ExtractOptions
     header : mapping
         As for `amibayes.extraction.extract`.
+    charges : sequence of CubeMigration, optional
+        What is taken out of each cube first; nothing by default.
 
     Returns
     -------
     list of MaskMap or None
         None where the pixels are not known, or the geometry is to be as stated.
     """
-    found = [_estimate(cube, options, header) for cube in cubes]
+    charges = [CubeMigration()] * len(cubes) if charges is None else charges
+    found = [
+        _estimate(cube, options, header, charge)
+        for cube, charge in zip(cubes, charges, strict=True)
+    ]
     maps: list[MaskMap | None] = []
     for own in found:
         if own is None:
@@ -92,9 +102,10 @@ def visit_maps(
 
 
 def _estimate(
-    cube: Images, options: ExtractOptions, header: Mapping[str, Any]
+    cube: Images, options: ExtractOptions, header: Mapping[str, Any], charge: CubeMigration
 ) -> tuple[Cube, MapEstimate | None, Distortion] | None:
-    with opened(cube, **header) as file:
-        if not maps_mask(file, options):
+    with opened(cube, **header) as raw:
+        if not maps_mask(raw, options):
             return None
+        file = charge.applied(raw)
         return (file.template, *map_estimate(file, options))

@@ -2,6 +2,7 @@
 
 from amibayes.instrument.bandpass import Bandpass, Channels
 from amibayes.instrument.catalogue import (
+    ChargeMigration,
     Distortion,
     HeaderRules,
     Instrument,
@@ -15,6 +16,7 @@ from amibayes.instrument.mask import Mask
 __all__ = [
     "Bandpass",
     "Channels",
+    "ChargeMigration",
     "Distortion",
     "HeaderRules",
     "Instrument",

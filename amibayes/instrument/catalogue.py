@@ -66,6 +66,23 @@ class Distortion:
 
 
 @dataclass(frozen=True)
+class ChargeMigration:
+    """What is known before of charge that passes between pixels (`amibayes.ramps`).
+
+    Parameters
+    ----------
+    per_e : float
+        Displacement of the side between two pixels per electron by which their charges
+        differ, pixels.
+    error : float
+        Its standard deviation.
+    """
+
+    per_e: float
+    error: float
+
+
+@dataclass(frozen=True)
 class Planning:
     """Published count rates that exposures are planned with.
 
@@ -103,6 +120,7 @@ class Instrument:
     header : HeaderRules
     planning : Planning, optional
     distortion : Distortion
+    charge_migration : ChargeMigration, optional
     """
 
     name: str
@@ -113,6 +131,7 @@ class Instrument:
     header: HeaderRules = field(default_factory=HeaderRules)
     planning: Planning | None = None
     distortion: Distortion = field(default_factory=Distortion)
+    charge_migration: ChargeMigration | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.pixel_scale_rad < 1.0:
@@ -232,6 +251,7 @@ def _loaded(path: Path, filter: str | None) -> Instrument:
         header=_header(top.section("header")) if "header" in top else HeaderRules(),
         planning=_planning(top.section("planning")) if "planning" in top else None,
         distortion=_distortion(top.section("distortion")) if "distortion" in top else Distortion(),
+        charge_migration=_migration(top),
     )
     top.refuse_unknown(("source", "note"))
     return instrument
@@ -286,6 +306,15 @@ def _distortion(section: Section) -> Distortion:
     if matrix.shape != (2, 2) or abs(np.linalg.det(matrix) - 1.0) > MAX_DISTORTION:
         raise section.fault("matrix", "is not two rows of two numbers, nearly the unit matrix")
     found = Distortion(matrix, section.number("error", above=0.0))
+    section.refuse_unknown(("source", "note"))
+    return found
+
+
+def _migration(top: Section) -> ChargeMigration | None:
+    if "charge_migration" not in top:
+        return None
+    section = top.section("charge_migration")
+    found = ChargeMigration(section.number("per_e"), section.number("error", above=0.0))
     section.refuse_unknown(("source", "note"))
     return found
 

@@ -18,6 +18,7 @@ from amibayes.calibration import (
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
+from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.reading import check_together, of_one_visit, read_observations
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
@@ -43,6 +44,8 @@ class Prepared:
     calibration : Calibration, optional
     vetting : Vetting, optional
     warnings : tuple of str
+    charge_migration : CubeMigration, optional
+        What was done about it in the first image cube.
     """
 
     observables: Observables
@@ -50,6 +53,7 @@ class Prepared:
     calibration: Calibration | None = None
     vetting: Vetting | None = None
     warnings: tuple[str, ...] = ()
+    charge_migration: CubeMigration | None = None
 
 
 def prepare(
@@ -84,7 +88,8 @@ def prepare(
     )
     vetting, calibration, observables = _calibrated(parts, references, options, rng, run)
     warnings = (*vetting_warnings(vetting), *calibration_warnings(calibration), *joined)
-    return Prepared(observables, tuple(references), calibration, vetting, warnings)
+    charge = next(iter(images.charges.values()), None)
+    return Prepared(observables, tuple(references), calibration, vetting, warnings, charge)
 
 
 def read(

@@ -10,6 +10,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.verdict import Verdict
+from amibayes.extraction.charge import CubeMigration
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.limit import DetectionLimit
@@ -45,6 +46,7 @@ class SearchReport:
     verdict: Verdict | None = None
     consistency: tuple[Consistency, ...] = ()
     bootstrap: Bootstrap | None = None
+    charge_migration: CubeMigration | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 
 

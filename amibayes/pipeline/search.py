@@ -269,6 +269,7 @@ def _report(
         evidence=posterior.evidence,
         noise_posterior=posterior.noise,
         bootstrap=posterior.resampled,
+        charge_migration=ready.charge_migration,
         warnings=_warnings(ready, found, tests, posterior),
     )
 

@@ -108,7 +108,7 @@ def _weights(kept: IntArray, photons: FloatArray, read: float, timing: GroupTimi
         c[np.ix_(kept, kept)] for c in (timing.photon_covariance, timing.read_covariance)
     )
     covariance = photons.reshape(-1, 1, 1) * by_photons + read * by_reads
-    inverse = np.linalg.inv(covariance) * timing.group_s**2
+    inverse: FloatArray = np.asarray(np.linalg.inv(covariance), dtype=float) * timing.group_s**2
     lag = timing.middle_s[kept] - timing.middle_s[kept].mean()
     design = np.stack([np.ones(len(kept)), lag], axis=1)
     half = design.T @ inverse
@@ -145,7 +145,7 @@ def curvature_of(file: RampFile) -> Curvature | None:
     still decays, or a pointing that drifts, look the same.
     """
     gain = file.gain_e
-    photons, read = (x * gain**2 for x in file.noise)
+    photons, read = file.noise[0] * gain**2, file.noise[1] * gain**2
     kept = _usable(file)
     if len(kept) < 3:
         return None

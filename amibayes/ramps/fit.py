@@ -103,7 +103,7 @@ def fit_migration(exposures: Sequence[Curvature]) -> MigrationFit:
     -------
     MigrationFit
     """
-    kinds = ALWAYS
+    kinds: tuple[str, ...] = ALWAYS
     found = _solved(exposures, kinds)
     for further in FURTHER:
         more = _solved(exposures, (*kinds, further))

@@ -73,7 +73,7 @@ def gain(kind: str, charge: FloatArray, current: FloatArray) -> FloatArray:
     (…, ny, nx) array
         Electrons per second; those of all pixels add up to zero, but for linearity.
     """
-    return gains((kind,), charge, current)[0]
+    return np.asarray(gains((kind,), charge, current)[0])
 
 
 def gains(kinds: Sequence[str], charge: FloatArray, current: FloatArray) -> FloatArray:

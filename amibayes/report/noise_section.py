@@ -20,7 +20,8 @@ def noise(content: Json) -> Section:
     """Show whether the stated errors explain the residuals, and the noise that was added."""
     found = content["noise"]
     tables = (*_posterior(found.get("posterior")), *_outliers(content.get("robust")))
-    text = (_added(found), *_robust(content.get("robust")))
+    charge = _charge_migration(found.get("charge_migration"))
+    text = (_added(found), *charge, *_robust(content.get("robust")))
     return Section("Noise", text, tables=tables)
 
 
@@ -33,6 +34,25 @@ def _added(found: Json) -> str:
         f"{plain(closure, 2)}° in closure phase was added in quadrature, and every χ² and error "
         "on this page includes it."
     )
+
+
+def _charge_migration(found: Json | None) -> tuple[str, ...]:
+    """Say what was taken out of images, and where its strength is from."""
+    if not found:
+        return ()
+    if found["source"] == "off":
+        return ("Charge migration between pixels was not taken out of the images.",)
+    value, error = 1e7 * found["value_per_e"], 1e7 * found["error_per_e"]
+    origin = {"fit": "fitted to the ramps", "instrument": "of the instrument's file"}
+    whence = origin.get(found["source"], found["source"])
+    text = (
+        f"Charge migration of {plain(value)} ± {plain(error)} · 10⁻⁷ pixels per electron "
+        f"({whence}) was taken out of the images; what its error does to target and calibrators "
+        "alike is in the covariance."
+    )
+    if found.get("explained") is False:
+        text += " The ramps change in other ways too."
+    return (text,)
 
 
 def _posterior(found: Json | None) -> tuple[Table, ...]:

@@ -97,6 +97,9 @@ def _noise(report: SearchReport) -> Json:
         "systematics": systematics_json(report.noise),
         **in_errors_json(report.noise, report.observables.only(report.options.observables)),
         "posterior": posterior or None,
+        "charge_migration": None
+        if report.charge_migration is None
+        else report.charge_migration.as_json(),
     }
 
 

@@ -1,0 +1,225 @@
+"""Charge migration of a visit: fitted to its ramps, or as the instrument's file has it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amibayes.cube import Cube
+from amibayes.cube.ramps import RampFile
+from amibayes.cube.source import Source, opened
+from amibayes.cube.write import SHIFT_KEYWORDS
+from amibayes.data.shared_errors import SharedErrors
+from amibayes.errors import UsageError
+from amibayes.extraction.operator import ExtractionOperator
+from amibayes.extraction.options import ExtractOptions
+from amibayes.instrument import ChargeMigration, load_instrument
+from amibayes.ramps.correction import MigrationFree, electrons_of, slope_time_s
+from amibayes.ramps.curvature import Curvature, curvature_of
+from amibayes.ramps.fit import MigrationFit, fit_migration
+from amibayes.ramps.migration import Migration
+from amibayes.ramps.transfer import gains
+from amibayes.units import ComplexArray, FloatArray
+
+TOO_FEW_GROUPS = "ramps of fewer than 4 groups cannot tell charge migration from flux"
+
+
+@dataclass(frozen=True, eq=False)
+class CubeMigration:
+    """What is done about charge migration in one cube.
+
+    Parameters
+    ----------
+    migration : Migration, optional
+        Taken out; nothing is where it is absent.
+    fit : MigrationFit, optional
+        Of the ramps of the visit.
+    notes : tuple of str
+        What a reader of the result has to know.
+    """
+
+    migration: Migration | None = None
+    fit: MigrationFit | None = None
+    notes: tuple[str, ...] = ()
+
+    def applied(self, file: Source) -> Source:
+        """The file without it."""
+        if self.migration is None:
+            return file
+        template = file.template
+        electrons = electrons_of(template)
+        assert electrons is not None
+        time = None if isinstance(file, RampFile) else slope_time_s(template.header)
+        return MigrationFree(file, self.migration, electrons, time)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain numbers: value, error, source, and the tests of a fit."""
+        if self.migration is None:
+            return {"value_per_e": 0.0, "error_per_e": 0.0, "source": "off"}
+        fitted = self.migration.source == "fit" and self.fit is not None
+        return self.fit.as_json() if fitted and self.fit else self.migration.as_json()
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """One cube of a visit."""
+
+    template: Cube
+    is_ramp: bool
+    curvature: Curvature | None
+    stated: ChargeMigration | None
+
+
+def visit_migration(
+    cubes: Sequence[Cube | str | Path], options: ExtractOptions, header: Mapping[str, Any]
+) -> list[CubeMigration]:
+    """Find what charge migration is taken out of each cube, one fit for all of a detector.
+
+    Parameters
+    ----------
+    cubes : sequence of Cube or path
+        Of targets and calibrators.
+    options : ExtractOptions
+    header : mapping
+        As for `amibayes.extraction.extract`.
+    """
+    if options.charge_migration == "off":
+        return [CubeMigration() for _ in cubes]
+    known = [_known(cube, options, header) for cube in cubes]
+    fits = {name: _fitted([k for k in known if _detector(k) == name])
+            for name in dict.fromkeys(map(_detector, known))}  # fmt: skip
+    return [_decided(k, fits[_detector(k)], options) for k in known]
+
+
+def _detector(known: _Known) -> str:
+    return known.template.instrument.upper()
+
+
+def _known(cube: Cube | str | Path, options: ExtractOptions, header: Mapping[str, Any]) -> _Known:
+    with opened(cube, **header) as file:
+        is_ramp = isinstance(file, RampFile)
+        wanted = options.charge_migration == "fit" and isinstance(file, RampFile)
+        curvature = curvature_of(file) if wanted and isinstance(file, RampFile) else None
+        return _Known(file.template, is_ramp, curvature, _stated(file.template))
+
+
+def _stated(template: Cube) -> ChargeMigration | None:
+    """What the instrument's file knows; nothing of images that were simulated without."""
+    shifts = [template.header.get(key) for key in SHIFT_KEYWORDS]
+    if all(shift == 0.0 for shift in shifts):
+        return None
+    try:
+        return load_instrument(template.instrument, template.filter).charge_migration
+    except UsageError:
+        return None  # the extraction says what is wrong
+
+
+def _fitted(known: Sequence[_Known]) -> MigrationFit | None:
+    measured = [k.curvature for k in known if k.curvature is not None]
+    return fit_migration(measured) if measured else None
+
+
+def _decided(known: _Known, fit: MigrationFit | None, options: ExtractOptions) -> CubeMigration:
+    migration, notes = _chosen(known, fit, options)
+    if migration is None:
+        return CubeMigration(None, fit, notes)
+    if not known.is_ramp:
+        missing = _missing(known.template)
+        if missing:
+            return CubeMigration(
+                None, fit, (*notes, f"charge migration not taken out: the header lacks {missing}")
+            )
+    return CubeMigration(migration, fit, (*notes, stated(migration)))
+
+
+def _chosen(
+    known: _Known, fit: MigrationFit | None, options: ExtractOptions
+) -> tuple[Migration | None, tuple[str, ...]]:
+    """What to take out, and what there is to say of how that was found."""
+    if isinstance(options.charge_migration, float):
+        return Migration.isotropic(options.charge_migration, 0.0, "given"), ()
+    before = known.stated
+    notes = (TOO_FEW_GROUPS,) if known.is_ramp and known.curvature is None else ()
+    if fit is not None and (before is None or fit.migration.mean[1] < before.error):
+        if not fit.explained:
+            notes = (*notes, f"charge migration does not explain all that changes along the "
+                     f"ramps (p = {min(fit.p_value, fit.bend_p_value):.2g})")  # fmt: skip
+        return fit.migration, notes
+    if before is None:
+        return None, notes
+    return Migration.isotropic(before.per_e, before.error, "instrument"), notes
+
+
+def _missing(template: Cube) -> str:
+    """What the correction of slopes asks of a header and does not find; empty where it does."""
+    wanted = []
+    if slope_time_s(template.header) is None:
+        wanted.append("NGROUPS and TGROUP")
+    if electrons_of(template) is None:
+        wanted.append("a unit of electrons or DN per second")
+    return ", and ".join(wanted)
+
+
+def stated(migration: Migration) -> str:
+    """Say in a line what is taken out."""
+    value, error = migration.mean
+    origin = {"fit": "fitted to ramps", "instrument": "of the instrument's file"}
+    return (
+        f"charge migration taken out: {1e7 * value:.2f} ± {1e7 * error:.2f} e-7 pixels per "
+        f"electron, {origin.get(migration.source, migration.source)}"
+    )
+
+
+def observable_changes(
+    file: MigrationFree, operator: ExtractionOperator, samples: ComplexArray, flux: float
+) -> FloatArray:
+    """Changes (n_observables, r) of V² and closure phases by errors of the coefficients.
+
+    Parameters
+    ----------
+    file : MigrationFree
+    operator : ExtractionOperator
+    samples : (n_samples,) complex array
+        Mean of the file, without migration.
+    flux : float
+        Likewise.
+
+    Returns
+    -------
+    (n_observables, r) array
+        For one standard deviation along each of `Migration.directions`.
+    """
+    migration, sampling = file.migration, operator.sampling
+    current = operator.reference.image * file.electrons
+    moved = gains(migration.kinds, file.mean_time_s * current, current)
+    images = -np.tensordot(migration.directions.T, moved, axes=1) / file.electrons
+    view = operator.view
+    pixels = images[:, view.rows, view.columns].reshape(len(images), operator.scatter.size)
+    by_flux, by_samples = sampling.apply(pixels)
+    sides = []
+    for sign in (1.0, -1.0):
+        moved_samples = samples + sign * by_samples
+        vis2 = sampling.power(moved_samples) / (flux + sign * by_flux)[:, None] ** 2
+        sides.append((vis2, sampling.bispectrum(moved_samples)))
+    (high, high3), (low, low3) = sides
+    closure = np.angle(high3 * low3.conj())
+    return np.asarray(0.5 * np.concatenate([high - low, closure], axis=1).T)
+
+
+def shared_errors(parts: Sequence[tuple[Migration, FloatArray]]) -> SharedErrors | None:
+    """Sum of changes (n_observables, r) by each migration, under names that others share."""
+    total: dict[str, FloatArray] = {}
+    for migration, changes in parts:
+        what = ", ".join(
+            f"{k} {v:.9e}" for k, v in zip(migration.kinds, migration.value, strict=True)
+        )
+        for k, change in enumerate(changes.T, 1):
+            name = f"charge migration {k} ({what})"
+            total[name] = total.get(name, 0.0) + change
+    if not total:
+        return None
+    return SharedErrors(tuple(total), np.stack(list(total.values()), axis=1))
