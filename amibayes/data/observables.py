@@ -269,20 +269,17 @@ class Observables:
             shared=None if self.shared is None else self.shared.select(used),
         )
 
-    def with_shared_errors(self, shared: SharedErrors | None) -> Observables:
-        """The same data with errors in common with others put into the covariance."""
-        return self._with_shared(shared, 1.0)
-
-    def without_shared_errors(self) -> Observables:
-        """Data with the covariance of their own errors only."""
-        return replace(self._with_shared(self.shared, -1.0), shared=None)
-
-    def _with_shared(self, shared: SharedErrors | None, sign: float) -> Observables:
+    def with_shared_errors(self, shared: SharedErrors | None, sign: float = 1.0) -> Observables:
+        """Data with errors in common with others put into the covariance, or taken out of it."""
         if shared is None:
             return self
         scatter = None if self.scatter is None else shared.added(self.scatter, sign)
         whole = with_shared(self.covariance, shared, sign)
         return replace(self, covariance=whole, scatter=scatter, shared=shared)
+
+    def without_shared_errors(self) -> Observables:
+        """Data with the covariance of their own errors only."""
+        return replace(self.with_shared_errors(self.shared, -1.0), shared=None)
 
     def only(self, kinds: Sequence[str]) -> Observables:
         """The data of the given kinds, out of ``vis2`` and ``cp``.
@@ -373,10 +370,8 @@ def join(parts: Sequence[Observables]) -> Observables:
     if len(parts) == 1:
         return parts[0]
     if any(p.shared is not None for p in parts):  # which correlate the parts
-        own = join([p.without_shared_errors() for p in parts])
-        return own.with_shared_errors(
-            joined_errors([(p.n_vis2, p.n_closure_phases, p.shared) for p in parts])
-        )
+        shared = joined_errors([(p.n_vis2, p.n_closure_phases, p.shared) for p in parts])
+        return join([p.without_shared_errors() for p in parts]).with_shared_errors(shared)
     shifts = np.cumsum([0, *(len(p.setups) for p in parts)])
     order = vis2_first([(p.n_vis2, p.n_closure_phases) for p in parts])
     kinds: list[CovarianceKind] = ["diagonal", "assumed", "estimated", "given"]
