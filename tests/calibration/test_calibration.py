@@ -698,9 +698,13 @@ def test_match_of_a_calibrator_with_itself(instrument: Instrument) -> None:
     np.testing.assert_array_equal(np.sort(found.entry), np.arange(56))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n_calibrators", [3, 5])
-@pytest.mark.parametrize("tau", [0.0, 2.0])
+@pytest.mark.parametrize(
+    ("n_calibrators", "tau"),
+    [
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((3, 2.0), (5, 0.0))),
+        *(pytest.param(*pair, marks=pytest.mark.release) for pair in ((3, 0.0), (5, 2.0))),
+    ],
+)
 def test_coverage_of_the_whole_calibration(
     n_calibrators: int, tau: float, rng: np.random.Generator
 ) -> None:

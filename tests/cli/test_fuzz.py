@@ -215,7 +215,12 @@ def test_damage_that_once_did_harm(originals, tmp_path) -> None:
     assert failures([cases[k] for k in FOUND], tmp_path) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("first", "last"), [(28, 300), (300, 3000)])
+@pytest.mark.parametrize(
+    ("first", "last"),
+    [
+        pytest.param(28, 200, marks=pytest.mark.slow),
+        pytest.param(200, 3000, marks=pytest.mark.release),
+    ],
+)
 def test_many_damaged_files(first: int, last: int, originals, tmp_path) -> None:
     assert failures(make_cases(originals, last)[first:], tmp_path) == []

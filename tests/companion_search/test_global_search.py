@@ -140,9 +140,11 @@ def test_no_fit_is_better_than_the_search_by_more_than_1(name: str, seed: int) -
     assert excess(case(name, seed), 6, seed) < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "n", [pytest.param(10, marks=pytest.mark.slow), pytest.param(60, marks=pytest.mark.release)]
+)
 @pytest.mark.parametrize("name", COVERAGES)
-def test_no_fit_of_many_is_better_than_the_search_by_more_than_1(name: str) -> None:
-    """60 binaries of each coverage."""
-    found = [excess(case(name, seed), 60, seed) for seed in range(100, 160)]
+def test_no_fit_of_many_is_better_than_the_search_by_more_than_1(name: str, n: int) -> None:
+    """10 or 60 binaries of each coverage, each with as many starts."""
+    found = [excess(case(name, seed), n, seed) for seed in range(100, 100 + n)]
     assert max(found) < 1.0

@@ -89,13 +89,16 @@ def test_probability_is_uniform_where_channels_err_together() -> None:
     assert stats.binomtest(int((signs < 0.05).sum()), 60, 0.05).pvalue > 1e-4
 
 
-@pytest.mark.slow
-def test_probability_is_uniform_over_a_thousand_sets_that_err_together() -> None:
+@pytest.mark.parametrize(
+    "n",
+    [pytest.param(150, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.release)],
+)
+def test_probability_is_uniform_over_many_sets_that_err_together(n: int) -> None:
     """KS p > 1e-3; shares below 0.01 and 0.05 within binomial chance 1e-3."""
-    signs = reported(1000, 4)[:, 1]
+    signs = reported(n, 4)[:, 1]
     assert stats.kstest(signs, "uniform").pvalue > 1e-3
     for level in (0.01, 0.05):
-        assert stats.binomtest(int((signs < level).sum()), 1000, level).pvalue > 1e-3
+        assert stats.binomtest(int((signs < level).sum()), n, level).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(("kinds", "n"), [(("vis2", "cp"), 10), (("cp",), 20)])

@@ -156,7 +156,7 @@ def test_structure_counts_where_it_exceeds_the_calibration_errors_of_the_table(
     assert test.strongest[0, 2] < 2.0 * second or second < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_confusion_of_forty_of_each_kind() -> None:
     """Shares with bounds of 4.5 binomial σ about what was measured over 200 of each."""
     table: dict[str, dict[str, int]] = {}

@@ -107,16 +107,18 @@ def test_noise_of_the_posterior_is_the_noise_of_the_data() -> None:
     assert (~inside).sum() <= 6
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    "n", [pytest.param(80, marks=pytest.mark.slow), pytest.param(300, marks=pytest.mark.release)]
+)
 @pytest.mark.parametrize("factor", [1.0, 3.0])
-def test_intervals_cover_whatever_the_errors_say(factor) -> None:
-    """300 companions of 20σ; 68 and 95 % intervals of east, north and contrast.
+def test_intervals_cover_whatever_the_errors_say(factor, n) -> None:
+    """Companions of 20σ; 68 and 95 % intervals of east, north and contrast.
 
     Right errors must not be over-covered by more than 5 % (the price of asking), understated
     ones not under-covered; binomial chance of each bound 1e-4.
     """
     rng = np.random.default_rng(77)
-    n, ranks = 300, []
+    ranks = []
     box = Box(*FIELD, 188.0)
     for _ in range(n):
         truth = np.array(

@@ -85,9 +85,12 @@ def test_probability_of_any_companion_is_that_of_the_injections(setting) -> None
     assert np.isnan([limit.probability(r, 1e-3) for r in (0.9 * rho[0], 1.1 * rho[-1])]).all()
 
 
-@pytest.mark.slow
-def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) -> None:
-    """c50 and c95 of `measure_limits` against the search job's own verdict on 1000 new data sets.
+@pytest.mark.parametrize(
+    "n",
+    [pytest.param(100, marks=pytest.mark.slow), pytest.param(1000, marks=pytest.mark.release)],
+)
+def test_completeness_of_fresh_simulations_through_the_job(n: int, tmp_path) -> None:
+    """c50 and c95 of `measure_limits` against the search job's own verdict on new data sets.
 
     Each is simulated in the space of the data, read by nothing of the limits, searched as
     `search_companion` does (extra noise and all), weighed by the statistic without scale, and
@@ -97,7 +100,7 @@ def test_completeness_of_a_thousand_fresh_simulations_through_the_job(tmp_path) 
     asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=100_000)
     options = LimitsOptions(asked, observables=("vis2", "cp"), n_separations=8)
     limit = measure_limits([tmp_path / "t.oifits"], options=options).main.limit
-    rng, k, n = np.random.default_rng(21), 4, 1000
+    rng, k = np.random.default_rng(21), 4
     for contrast, expected, error in (
         (limit.contrast_50[k], 0.5, limit.log_error_50[k]),
         (limit.contrast[k], 0.95, limit.log_error[k]),

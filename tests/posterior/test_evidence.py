@@ -189,8 +189,13 @@ def test_impossible_requests_say_so(monkeypatch) -> None:
         search_second(few)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("contrast", [0.0, 0.005, 0.05])
+@pytest.mark.parametrize(
+    "contrast",
+    [
+        pytest.param(0.005, marks=pytest.mark.slow),
+        *(pytest.param(c, marks=pytest.mark.release) for c in (0.0, 0.05)),
+    ],
+)
 def test_nested_sampling_agrees_with_the_grid_everywhere(contrast) -> None:
     pytest.importorskip("dynesty")
     result, prior = problem([150.0, -80.0, contrast])
@@ -200,7 +205,7 @@ def test_nested_sampling_agrees_with_the_grid_everywhere(contrast) -> None:
     assert agree(nested, (grid.log_z, 0.0))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("theta", [STRONG_PAIR, [150.0, -80.0, 0.01, 0.0, 60.0, 0.0]])
 def test_nested_sampling_agrees_on_two_companions(theta) -> None:
     pytest.importorskip("dynesty")

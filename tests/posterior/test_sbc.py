@@ -51,23 +51,30 @@ def check(ranks: np.ndarray) -> None:
     logging.getLogger("sbc").info("%s", ", ".join(report))
 
 
-@pytest.mark.slow
+def sizes(slow: int, release: int) -> pytest.MarkDecorator:
+    """Numbers of truths in each range of contrast."""
+    marks = (pytest.mark.slow, pytest.mark.release)
+    numbers = zip((slow, release), marks, strict=True)
+    return pytest.mark.parametrize("n", [pytest.param(n, marks=mark) for n, mark in numbers])
+
+
+@sizes(70, 170)
 @pytest.mark.parametrize("name", list(RANGES))
-def test_ranks_of_the_grid_posterior_are_uniform(name) -> None:
-    """170 truths in each range of contrast, 510 in all: three minutes on one core."""
+def test_ranks_of_the_grid_posterior_are_uniform(name, n) -> None:
+    """A third of a second each on one core."""
     ranks = []
-    for prior, truth, likelihood in truths(name, 170, seed=11):
+    for prior, truth, likelihood in truths(name, n, seed=11):
         grid = grid_posterior(likelihood, prior)
         ranks.append([grid.cdf(n, x) for n, x in zip(NAMES, truth, strict=True)])
     check(np.array(ranks))
 
 
-@pytest.mark.slow
+@sizes(15, 30)
 @pytest.mark.parametrize("name", list(RANGES))
-def test_ranks_of_the_chain_are_uniform(name) -> None:
-    """30 truths in each range, 90 in all: two and a half minutes on one core."""
+def test_ranks_of_the_chain_are_uniform(name, n) -> None:
+    """Two seconds each on one core."""
     ranks = []
-    for k, (prior, truth, likelihood) in enumerate(truths(name, 30, seed=12)):
+    for k, (prior, truth, likelihood) in enumerate(truths(name, n, seed=12)):
         result = search(likelihood, FIELD)
         grid = grid_posterior(likelihood, prior)
         posterior = sample(result, prior, np.random.default_rng([13, k]), grid=grid)
