@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from amibayes.oifits import write_oifits
 
@@ -24,6 +25,14 @@ settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_configure() -> None:
+    """Give each of several workers one thread for its matrices: more would only wait."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        threadpool_limits(1)
+        for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
 
 
 def _greet_arviz() -> None:

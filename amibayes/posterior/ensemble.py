@@ -179,8 +179,9 @@ class Posterior:
             "posterior": {name: kept[..., k] for k, name in enumerate(self.names)},
             "sample_stats": {"lp": self.chain_log_prob[self.n_burn :].T},
         }
-        # Version 1 takes one dictionary of groups and returns an xarray.DataTree.
-        old = hasattr(arviz, "InferenceData")
+        # Version 1 takes one dictionary of groups and returns an xarray.DataTree; from 1.3 on it
+        # calls that InferenceData too.
+        old = int(arviz.__version__.split(".")[0]) < 1
         return arviz.from_dict(**groups) if old else arviz.from_dict(groups)
 
     def __repr__(self) -> str:
