@@ -103,8 +103,9 @@ class BinaryModel:
 
     @property
     def coloured(self) -> bool:
-        """Whether the flux ratio goes with wavelength."""
-        return self.contrast_slope != 0.0
+        """Whether a flux ratio goes with wavelength."""
+        around = any(getattr(c, "coloured", False) for c in self.surroundings)
+        return self.contrast_slope != 0.0 or around
 
     @property
     def moves(self) -> bool:

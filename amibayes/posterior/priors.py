@@ -55,6 +55,8 @@ class Prior:
     half_cauchy : tuple of float
         Scale of the half-Cauchy distribution of each nuisance parameter over its range; 0 for a
         uniform one, which all are by default.
+    log_uniform : tuple of int
+        Which of the nuisance parameters, by their place among them, are log-uniform.
     """
 
     inner_mas: float
@@ -68,6 +70,7 @@ class Prior:
     fastest_mas_yr: float = 0.0
     shapes: tuple[tuple[float, float], ...] = ()
     half_cauchy: tuple[float, ...] = ()
+    log_uniform: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         _check("separation", self.inner_mas, self.outer_mas, least=0.0)
@@ -105,7 +108,10 @@ class Prior:
     def ranges(self) -> tuple[Range, ...]:
         """Distributions of the nuisance parameters."""
         scales = self.half_cauchy or (0.0,) * len(self.nuisance)
-        return tuple(Range(*r, s) for r, s in zip(self.nuisance, scales, strict=True))
+        return tuple(
+            Range(*r, s, k in self.log_uniform)
+            for k, (r, s) in enumerate(zip(self.nuisance, scales, strict=True))
+        )
 
     def _parameters_of(self, n_dim: int) -> Parameters:
         """Parameters of vectors of a length."""
@@ -204,6 +210,25 @@ class Prior:
             theta[:, k] = one.quantile(cube[:, k])
         return theta
 
+    def to_cube(self, theta: FloatArray) -> FloatArray:
+        """Turn parameter sets (n, n_dim) into uniform numbers, the inverse of `from_cube`.
+
+        What lies outside the prior goes to its edge.
+        """
+        cube = np.array(theta, dtype=float)
+        parameters = self._parameters_of(theta.shape[1])
+        for k in range(1, parameters.companions + 1):
+            east, north = parameters.place(k)
+            cube[:, east] = self.ring_cdf(np.hypot(theta[:, east], theta[:, north]))
+            turn = np.arctan2(theta[:, east], theta[:, north]) / (2.0 * np.pi)
+            cube[:, north] = turn % 1.0
+        bright, rates = parameters.contrasts, parameters.rates
+        cube[:, bright] = self.contrast_cdf(theta[:, bright])
+        cube[:, rates] = 0.5 * (1.0 + theta[:, rates] / (self.fastest_mas_yr or 1.0))
+        for k, one in self._bounded(parameters):
+            cube[:, k] = one.cdf(theta[:, k])
+        return np.asarray(np.clip(cube, 0.0, 1.0))
+
     def _contrast_at(self, probability: FloatArray) -> FloatArray:
         if self.contrast_form == "uniform":
             return self.contrast_min + (self.contrast_max - self.contrast_min) * probability
@@ -216,22 +241,28 @@ class Prior:
 
 @dataclass(frozen=True)
 class Range:
-    """Uniform between two limits, or the part of a half-Cauchy distribution between them.
+    """Uniform or log-uniform between two limits, or the part of a half-Cauchy distribution there.
 
     Parameters
     ----------
     low, high : float
     scale : float
         Of the half-Cauchy distribution: half of it lies below; 0 for the uniform one.
+    logarithmic : bool
+        Uniform in the logarithm.
     """
 
     low: float
     high: float
     scale: float = 0.0
+    logarithmic: bool = False
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Log-density at any values."""
         inside = (x >= self.low) & (x <= self.high)
+        if self.logarithmic:
+            safe = np.where(inside, x, self.low)
+            return np.where(inside, -np.log(safe * np.log(self.high / self.low)), -np.inf)
         if not self.scale:
             return np.where(inside, -np.log(self.high - self.low), -np.inf)
         shape = -np.log1p((x / self.scale) ** 2) - np.log(self.scale * np.diff(self._angles)[0])
@@ -239,10 +270,22 @@ class Range:
 
     def quantile(self, probability: FloatArray) -> FloatArray:
         """Value below which a probability lies."""
+        if self.logarithmic:
+            return np.asarray(self.low * (self.high / self.low) ** probability)
         if not self.scale:
             return np.asarray(self.low + (self.high - self.low) * probability)
         first, last = self._angles
         return np.asarray(self.scale * np.tan(first + (last - first) * probability))
+
+    def cdf(self, x: FloatArray) -> FloatArray:
+        """Probability of a smaller value, the inverse of `quantile`."""
+        x = np.clip(x, self.low, self.high)
+        if self.logarithmic:
+            return np.asarray(np.log(x / self.low) / np.log(self.high / self.low))
+        if not self.scale:
+            return np.asarray((x - self.low) / (self.high - self.low))
+        first, last = self._angles
+        return np.asarray((np.arctan(x / self.scale) - first) / (last - first))
 
     @property
     def _angles(self) -> FloatArray:

@@ -70,6 +70,27 @@ OBSERVABLES: tuple[str, ...] = ("vis2", "cp")
 COMPANIONS = (0, 1, 2)
 """Numbers of companions whose evidences can be compared."""
 
+SKY_MODELS: dict[str, str] = {
+    "star": "the star alone",
+    "companion": "a companion",
+    "two": "two companions",
+    "disc": "a Gaussian disc, inclined",
+    "uniform-disc": "a uniform disc, inclined",
+    "ring": "a ring smoothed by a Gaussian, inclined",
+    "crescent": "a ring whose brightness goes with azimuth, inclined",
+    "halo": "light that no baseline resolves",
+}
+"""Models of the sky whose evidences are compared, and what each adds to the star; several are
+joined by ``+``, as ring+companion."""
+
+DEFAULT_SKY_MODELS = ("star", "companion")
+
+CONFUSION_DRAWS = 40
+"""Data sets simulated of each model: a rate of confusion of 5 % is then known to 3.5 %."""
+
+MODEL_ODDS = 0.95
+"""Probability from which a model counts as the one that the data choose."""
+
 SEED = 1
 
 NOISE_PRIOR = (0.05, 3.0)

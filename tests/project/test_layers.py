@@ -34,6 +34,8 @@ LAYERS = [
     "detection",
     "posterior",
     "limits",
+    "comparison",
+    "imaging",
     "pipeline",
     "validation",
     "plots",

@@ -1,0 +1,362 @@
+"""The comparison of models of the sky: fits, noise, evidences, confusion, verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.result import SearchResult
+from amibayes.comparison.confusion import HOPELESS, QUICK, measure_confusion
+from amibayes.comparison.fit_models import ModelFit, fit_model
+from amibayes.comparison.hypotheses import (
+    MORE_GENERAL,
+    Hypothesis,
+    hypotheses,
+    prior_of,
+)
+from amibayes.comparison.integral import Effort, integrate
+from amibayes.comparison.unit_cube import CubeModel
+from amibayes.comparison.verdict import Confusion, ModelVerdict, choose
+from amibayes.data.observables import Observables
+from amibayes.likelihood.averaged_noise import averaged_noise
+from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.posterior.priors import Prior, PriorSetting
+from amibayes.posterior.sampler import Draws, draw_posterior
+from amibayes.support.options import CONFUSION_DRAWS, DEFAULT_SKY_MODELS, SAMPLERS
+from amibayes.units import FloatArray
+
+DRAWS_VALUES, MIN_DRAWS = 4_000_000, 1024
+"""Model values of the draws of an evidence, and their least number."""
+
+CONFUSION_VALUES, MIN_CONFUSION = 60_000, 20
+"""Points × data sets of a confusion matrix, and the least number of data sets: with 20 a share
+below 5 % can just be told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A model of the sky with its evidence and posterior.
+
+    Parameters
+    ----------
+    fit : ModelFit
+    draws : Draws
+        Of the posterior, with weights.
+    log_z, log_z_error : float
+    method : str
+    ndof : int
+    p_fit : float
+        Probability of a χ² as large as that of the best fit.
+    """
+
+    fit: ModelFit
+    draws: Draws
+    log_z: float
+    log_z_error: float
+    method: str
+    ndof: int
+    p_fit: float
+
+    @property
+    def name(self) -> str:
+        """Of the model."""
+        return self.fit.hypothesis.name
+
+    @property
+    def chi2(self) -> float:
+        """Of the best fit."""
+        return float(self.fit.chi2[0])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters."""
+        return self.fit.model.likelihood.parameters.names
+
+    @property
+    def theta(self) -> FloatArray:
+        """Parameters of the best fit."""
+        return self.fit.theta
+
+
+@dataclass(frozen=True, eq=False)
+class ModelComparison:
+    """Models of the sky compared on one data set with one noise.
+
+    Parameters
+    ----------
+    models : tuple of Compared
+        In the order they were asked for.
+    log_prior : (n_models,) float array
+        Logarithm of their prior probabilities, all alike.
+    noise : ExtraNoise
+        Beyond the stated errors, as the best of all models leaves it.
+    confusion : Confusion or None
+    verdict : ModelVerdict
+    """
+
+    models: tuple[Compared, ...]
+    log_prior: FloatArray
+    noise: ExtraNoise
+    confusion: Confusion | None
+    verdict: ModelVerdict
+
+    @property
+    def probability(self) -> FloatArray:
+        """Posterior probability of each model, (n_models,)."""
+        log = np.array([m.log_z for m in self.models]) + self.log_prior
+        return np.asarray(np.exp(log - logsumexp(log)))
+
+    @property
+    def best(self) -> Compared:
+        """The most probable model."""
+        return self.models[int(np.argmax(self.probability))]
+
+    def __repr__(self) -> str:
+        each = zip(self.models, self.probability, strict=True)
+        listed = ", ".join(f"{m.name} {p:.3g}" for m, p in each)
+        return f"<ModelComparison: {self.verdict.statement}; {listed}>"
+
+
+@dataclass(frozen=True)
+class NoiseSetting:
+    """How the noise of a search was made: what the comparison makes its own from.
+
+    Parameters
+    ----------
+    found : ExtraNoise
+        Of the search.
+    prior : NoisePrior, optional
+        None: the noise of the search stands as it is.
+    per_file : bool
+    """
+
+    found: ExtraNoise = field(default_factory=ExtraNoise)
+    prior: NoisePrior | None = None
+    per_file: bool = False
+
+
+def compare_sky_models(
+    result: SearchResult,
+    prior: Prior,
+    rng: np.random.Generator,
+    *,
+    models: Sequence[str] = DEFAULT_SKY_MODELS,
+    stated: Observables | None = None,
+    noise: NoiseSetting | None = None,
+    settings: Sequence[PriorSetting] = (),
+    method: str = "direct",
+    default_field: tuple[float, float] | None = None,
+    confusion_draws: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ModelComparison:
+    """Compare models of the sky by their evidences, and measure how often they are confused.
+
+    Parameters
+    ----------
+    result : SearchResult
+        Of a companion: its model of the star, its noise and its solutions are where every
+        model begins.
+    prior : Prior
+        Of companions and star.
+    rng : numpy.random.Generator
+    models : sequence of str
+        Of `amibayes.support.options.SKY_MODELS`, or several joined by ``+``.
+    stated : Observables, optional
+        The data with the stated errors; given with ``noise``, whose prior says how much more
+        noise is plausible: it is fitted at the best of all models, and averaged over.
+    noise : NoiseSetting, optional
+    settings : sequence of PriorSetting
+        Ranges of parameters of extended light.
+    method : {"direct", "nested"}
+        Importance sampling, or one of `amibayes.support.options.SAMPLERS`.
+    default_field : (inner, outer), optional
+        Separations that companions are in unless one farther out fits better than any model with
+        other light; given where the search went farther than that.
+    confusion_draws : int, optional
+        Data sets simulated of each model; 0 for none. By default `CONFUSION_DRAWS`, fewer where
+        data are many.
+    progress : callable, optional
+
+    Raises
+    ------
+    UsageError
+        Where a model is not known.
+    """
+    asked, streams = hypotheses(models), rng.spawn(4)
+    setting = noise or NoiseSetting()
+    modes = {"companion": np.array([m.theta for m in result.modes])}
+    fits = _fits(asked, result.likelihood, prior, settings, modes, streams[0])
+    found, likelihood, best = _best_noise(fits, result.likelihood, stated, setting)
+    narrow = default_field is not None and best.family != "point"
+    if narrow and default_field is not None:
+        # Companions were looked for far out because one inside does not explain the data; where
+        # other light does, that was not called for.
+        prior = replace(prior, inner_mas=default_field[0], outer_mas=default_field[1])
+    if likelihood is not result.likelihood or narrow:
+        known = {fit.hypothesis.name: fit.model.theta(fit.cube) for fit in fits}
+        fits = _fits(asked, likelihood, prior, settings, known, streams[3])
+    fits = _averaged(fits, stated, setting, found)
+    compared = _all_compared(fits, streams[1], method)
+    log_prior = np.full(len(fits), -np.log(len(fits)))
+    wanted = _n_confusion(result.likelihood) if confusion_draws is None else confusion_draws
+    confusion = None
+    if wanted and len(fits) > 1:
+        confusion = measure_confusion(
+            fits, wanted, streams[2], log_prior=log_prior, progress=progress
+        )
+    log_z = np.array([c.log_z for c in compared])
+    small = is_degenerate(compared[int(np.argmax(log_z))])
+    statement = choose(asked, log_z, log_prior, confusion, degenerate=small)
+    return ModelComparison(compared, log_prior, found, confusion, statement)
+
+
+def _n_confusion(likelihood: Likelihood) -> int:
+    wanted = CONFUSION_VALUES // max(len(likelihood.samples), 1)
+    return int(np.clip(wanted, MIN_CONFUSION, CONFUSION_DRAWS))
+
+
+def _fits(
+    asked: Sequence[Hypothesis],
+    base: Likelihood,
+    prior: Prior,
+    settings: Sequence[PriorSetting],
+    known: Mapping[str, FloatArray],
+    rng: np.random.Generator,
+) -> list[ModelFit]:
+    """Best fits of all models, simpler ones first, in the order that was asked for."""
+    star = single_likelihood(base).parameters.names
+    done: dict[str, ModelFit] = {}
+
+    def fitted(name: str) -> ModelFit:
+        if name not in done:
+            one = Hypothesis(name)
+            likelihood = one.likelihood(base)
+            model = CubeModel(one, likelihood, prior_of(likelihood, prior, star, settings))
+            parts = [fitted(simpler) for simpler in _simpler(one)]
+            done[name] = fit_model(model, parts, rng, known.get(name))
+        return done[name]
+
+    return [fitted(one.name) for one in asked]
+
+
+def _simpler(one: Hypothesis) -> list[str]:
+    """Names of the models with one source less, or with that source in less detail."""
+    parts = one.parts
+    if not parts:
+        return []
+    if parts == ("two",):
+        return ["companion"]
+    found = ["+".join(p for p in parts if p != left) or "star" for left in parts]
+    special = {general: p for p, general in MORE_GENERAL.items()}
+    for part in parts:
+        if part in special:
+            found.append("+".join(special.get(p, p) if p == part else p for p in parts))
+    return list(dict.fromkeys(found))
+
+
+def _best_noise(
+    fits: list[ModelFit], base: Likelihood, stated: Observables | None, setting: NoiseSetting
+) -> tuple[ExtraNoise, Likelihood, Hypothesis]:
+    """Fit the noise at the best fit of every model, and take that of the most likely pair.
+
+    Returns the noise, a likelihood with it (``base`` where that has it), and the model.
+    """
+    if stated is None or setting.prior is None:
+        best = min(fits, key=lambda fit: float(fit.chi2[0]))
+        return setting.found, base, best.hypothesis
+    clean = Likelihood(stated, base.model)
+    tried = []
+    for fit in fits:
+        likelihood = clean.with_model(fit.model.likelihood.model)
+        found = fit_noise(likelihood, fit.theta, per_file=setting.per_file, prior=setting.prior)
+        noisy = with_noise(likelihood, found)
+        tried.append((float(noisy.log_prob(fit.theta[None])[0]), noisy, found, fit.hypothesis))
+    _, noisy, found, one = max(tried, key=lambda t: t[0])
+    if found == setting.found:
+        return found, base, one
+    return found, base.with_noise(noisy.noise), one
+
+
+def _averaged(
+    fits: list[ModelFit], stated: Observables | None, setting: NoiseSetting, found: ExtraNoise
+) -> list[ModelFit]:
+    """Average the likelihood over the amount of noise, the same way for all models."""
+    if stated is None or setting.prior is None or setting.prior.vis2 <= 0.0:
+        return fits
+    noise = averaged_noise(
+        fits[0].model.likelihood.noise,
+        stated,
+        [(fit.model.likelihood, fit.theta) for fit in fits],
+        per_file=setting.per_file,
+        channels=found.channels,
+        prior=setting.prior,
+    )
+    return [
+        replace(
+            fit,
+            model=(model := replace(fit.model, likelihood=fit.model.likelihood.with_noise(noise))),
+            banks=tuple(replace(bank, model=model) for bank in fit.banks),
+        )
+        for fit in fits
+    ]
+
+
+def _all_compared(
+    fits: Sequence[ModelFit], rng: np.random.Generator, method: str
+) -> tuple[Compared, ...]:
+    """Evidences of all models, with fewer draws for those that are out of the question."""
+    children = rng.spawn(len(fits))
+    bound = np.array([largest_log_prob(fit) for fit in fits])
+    found: dict[int, Compared] = {}
+    for k in np.argsort(-bound, kind="stable").tolist():
+        best = max((c.log_z for c in found.values()), default=-np.inf)
+        found[k] = _compared(fits[k], children[k], method, hopeless=bound[k] < best - HOPELESS)
+    return tuple(found[k] for k in range(len(fits)))
+
+
+def largest_log_prob(fit: ModelFit) -> float:
+    """ln L of the best fit, which the evidence is below."""
+    data = fit.model.likelihood.observables.data
+    return float(fit.model.log_prob(fit.cube[:1], data)[0])
+
+
+def _compared(
+    fit: ModelFit, rng: np.random.Generator, method: str, *, hopeless: bool = False
+) -> Compared:
+    likelihood, model = fit.model.likelihood, fit.model
+    if method in SAMPLERS and model.n_dim and not hopeless:
+        draws, how = draw_posterior(likelihood, model.prior, rng, method), method
+    else:
+        n = int(np.clip(DRAWS_VALUES // len(likelihood.samples), MIN_DRAWS, Effort().modes))
+        effort = QUICK if hopeless else Effort(prior=2 * n, modes=n)
+        draws = integrate(
+            model, likelihood.observables.data, fit.cube, fit.chi2, rng, effort=effort
+        )
+        how = "importance"
+    ndof = likelihood.n_independent - model.n_dim
+    p_fit = chi2_survival(float(fit.chi2[0]), ndof, likelihood.degrees)
+    z, error = draws.diagnostics["log_z"], draws.diagnostics["log_z_error"]
+    return Compared(fit, draws, float(z), float(error), how, ndof, float(p_fit))
+
+
+def is_degenerate(model: Compared) -> bool:
+    """Whether what a model puts around the star is smaller than λ/2B_max."""
+    likelihood = model.fit.model.likelihood
+    limit = 0.5 * resolution_mas(likelihood)
+    sizes = [
+        float(np.hypot(*model.theta[likelihood.parameters.place(k + 1)]))
+        for k in range(likelihood.parameters.companions)
+    ]
+    sizes += [
+        float(model.theta[k])
+        for k, p in enumerate(likelihood.parameters)
+        if p.unit == "mas" and p.role == "nuisance" and p.name != "diameter_mas"
+    ]
+    return bool(sizes) and max(sizes) < limit

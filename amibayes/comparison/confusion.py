@@ -1,0 +1,140 @@
+"""How often the data would have one model taken for another, by simulation.
+
+Data sets are drawn from the best fit of each model with the noise of the data, and go through
+the same comparison as the data: fits of every model, evidences, choice. What is counted holds
+for these data, with their baselines, errors and correlations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from amibayes.comparison.fit_models import ModelFit, embedded
+from amibayes.comparison.fitting import least_squares
+from amibayes.comparison.integral import Effort, PriorDraws, integrate
+from amibayes.comparison.verdict import Confusion
+from amibayes.units import FloatArray
+
+RANDOM_STARTS, KNOWN_STARTS = 8, 4
+"""Starting points of each simulated data set beside those of the banks: random ones, and the best
+fits to the data themselves."""
+
+QUICK = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=2)
+"""ln Z of simulated data is then known to 0.02 to 0.1: less than what decides."""
+
+HOPELESS = 15.0
+"""A model whose largest ln L, which no evidence exceeds, is so far below another's evidence has
+odds below 1e-6: its own evidence is not measured, and that bound stands for it."""
+
+Progress = Callable[[int, int], None]
+
+
+def measure_confusion(
+    fits: Sequence[ModelFit],
+    n_draws: int,
+    rng: np.random.Generator,
+    *,
+    log_prior: FloatArray,
+    progress: Progress | None = None,
+) -> Confusion:
+    """Simulate data sets from the best fit of each model and compare the models on each.
+
+    Parameters
+    ----------
+    fits : sequence of ModelFit
+        Of the data; their noise is what data sets are drawn from and compared with.
+    n_draws : int
+        Data sets of each model.
+    rng : numpy.random.Generator
+    log_prior : (n_models,) float array
+    progress : callable, optional
+    """
+    prior = [
+        PriorDraws.of(f.model, QUICK.prior, child) if f.model.n_dim else None
+        for f, child in zip(fits, rng.spawn(len(fits)), strict=True)
+    ]
+    found = []
+    for k, (truth, child) in enumerate(zip(fits, rng.spawn(len(fits)), strict=True)):
+        noise = truth.model.likelihood.noise.draw(n_draws, child)
+        data = truth.model.predict(truth.cube[:1]) + noise
+        found.append(evidences(fits, data, child, prior))
+        if progress:
+            progress(k + 1, len(fits))
+    models = tuple(f.hypothesis for f in fits)
+    return Confusion(models, np.array(found), np.asarray(log_prior))
+
+
+def evidences(
+    fits: Sequence[ModelFit],
+    data: FloatArray,
+    rng: np.random.Generator,
+    prior: Sequence[PriorDraws | None],
+) -> FloatArray:
+    """ln Z of every model for data sets (n_data, n), (n, n_models)."""
+    tried: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for fit in fits:
+        tried[fit.hypothesis.name] = _fitted(fit, data, tried, fits, rng)
+    return np.array(
+        [
+            _evidences_of(fits, one, [(c[i], x[i]) for c, x in tried.values()], rng, prior)
+            for i, one in enumerate(data.T)
+        ]
+    )
+
+
+def _evidences_of(
+    fits: Sequence[ModelFit],
+    data: FloatArray,
+    tried: Sequence[tuple[FloatArray, FloatArray]],
+    rng: np.random.Generator,
+    prior: Sequence[PriorDraws | None],
+) -> FloatArray:
+    """ln Z (n_models,) of one data set, the models that fit best first."""
+    out = np.array([_bound(f, data, *t) for f, t in zip(fits, tried, strict=True)])
+    best = -np.inf
+    for k in np.argsort(-out, kind="stable"):
+        if out[k] < best - HOPELESS:
+            break
+        cube, chi2 = tried[k]
+        found = integrate(fits[k].model, data, cube, chi2, rng, prior=prior[k], effort=QUICK)
+        out[k] = found.diagnostics["log_z"]
+        best = max(best, out[k])
+    return out
+
+
+def _fitted(
+    fit: ModelFit,
+    data: FloatArray,
+    tried: Mapping[str, tuple[FloatArray, FloatArray]],
+    fits: Sequence[ModelFit],
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Fits (n, n_starts, n_dim) and χ² (n, n_starts) of data sets (n_data, n).
+
+    They begin where the banks of seeds say, at random, at the fits to the data themselves, and
+    where models that this one holds have their best fits.
+    """
+    model, n = fit.model, data.shape[1]
+    inner = [f for f in fits if f.hypothesis.name in tried and f.hypothesis.within(fit.hypothesis)]
+    seeds = []
+    for i, one in enumerate(data.T):
+        starts = [bank.seeds(one) for bank in fit.banks]
+        starts.append(rng.random((RANDOM_STARTS if model.n_dim else 0, model.n_dim)))
+        for part in inner:
+            cube, chi2 = tried[part.hypothesis.name]
+            starts.append(embedded(model, part.model, cube[i, int(np.argmin(chi2[i]))])[None])
+        starts.append(fit.cube[: KNOWN_STARTS if model.n_dim else 1])
+        seeds.append(np.concatenate(starts))
+    # The banks' seeds come first: of data sets with more of them the worst are left out.
+    most = min(len(s) for s in seeds)
+    every = np.concatenate([s[-most:] for s in seeds])
+    cube, chi2 = least_squares(model, every, np.repeat(data, most, axis=1))
+    return cube.reshape(n, most, -1), chi2.reshape(n, most)
+
+
+def _bound(fit: ModelFit, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> float:
+    """ln L of the best fit, which the evidence of a hopeless model is below."""
+    at = cube[[int(np.argmin(chi2))]]
+    return float(fit.model.log_prob(at, data)[0])

@@ -1,0 +1,116 @@
+"""A model on the unit cube of its prior, where the prior is uniform and evidence a mean."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from amibayes.comparison.hypotheses import Hypothesis, groups, periodic
+from amibayes.likelihood.likelihood import NEVER_ZERO, Likelihood
+from amibayes.posterior.priors import Prior
+from amibayes.units import BoolArray, FloatArray, IntArray
+
+STEP = 1e-5
+"""Step of the derivative of parameters by the cube: rounding and curvature below 1e-6."""
+
+BATCH_VALUES = 400_000
+"""Model values (points × parameter sets) that are worked on together: they stay in the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class CubeModel:
+    """A model of the sky with data, noise and prior; parameter sets are points of a cube.
+
+    Parameters
+    ----------
+    hypothesis : Hypothesis
+    likelihood : Likelihood
+    prior : Prior
+    """
+
+    hypothesis: Hypothesis
+    likelihood: Likelihood
+    prior: Prior
+
+    @property
+    def n_dim(self) -> int:
+        """Number of parameters."""
+        return len(self.likelihood.parameters)
+
+    @cached_property
+    def groups(self) -> list[tuple[IntArray, int]]:
+        """Columns of each source beside the star, and which is its flux."""
+        return groups(self.likelihood)
+
+    @cached_property
+    def turning(self) -> BoolArray:
+        """Which dimensions come back to where they began, (n_dim,)."""
+        found = np.zeros(self.n_dim, dtype=bool)
+        found[periodic(self.likelihood)] = True
+        return found
+
+    def inside(self, cube: FloatArray) -> FloatArray:
+        """Bring points (n, n_dim) back: angles by whole turns, the rest to the nearest edge."""
+        return np.where(self.turning, cube % 1.0, np.clip(cube, 0.0, 1.0))
+
+    def apart(self, cube: FloatArray, centre: FloatArray) -> FloatArray:
+        """Differences of points (…, n_dim), angles the short way round."""
+        change = cube - centre
+        return np.where(self.turning, change - np.rint(change), change)
+
+    def theta(self, cube: FloatArray) -> FloatArray:
+        """Parameter sets (n, n_dim)."""
+        return self.prior.from_cube(cube)
+
+    def cube(self, theta: FloatArray) -> FloatArray:
+        """Points (n, n_dim) of parameter sets."""
+        return self.prior.to_cube(np.atleast_2d(theta))
+
+    def predict(self, cube: FloatArray) -> FloatArray:
+        """Model of the data, (n_data, n)."""
+        pieces = [self.likelihood.predict(self.theta(part)) for part in self._batches(cube)]
+        return np.concatenate(pieces, axis=1)
+
+    def _batches(self, cube: FloatArray) -> list[FloatArray]:
+        n = 1 + len(cube) * len(self.likelihood.samples) // BATCH_VALUES
+        return np.array_split(cube, n)
+
+    def log_prob(self, cube: FloatArray, data: FloatArray) -> FloatArray:
+        """Log-likelihood (n,) of data (n_data,)."""
+        return self.log_prob_of(self.predict(cube), data)
+
+    def log_prob_of(self, predicted: FloatArray, data: FloatArray) -> FloatArray:
+        """Log-likelihood (n,) of data (n_data,) given what models predict (n_data, n)."""
+        return self.likelihood.noise.log_prob(self.difference(predicted, data[:, None]))
+
+    def difference(self, predicted: FloatArray, data: FloatArray) -> FloatArray:
+        """Data minus model, closure phases the short way round."""
+        return self.likelihood.wrapped(data - predicted)
+
+    def linear(self, cube: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What models predict (n_data, n), and whitened derivatives (n, n_independent, n_dim)."""
+        likelihood, samples = self.likelihood, self.likelihood.samples
+        value, slopes = likelihood.model.gradient(samples, self.theta(cube))
+        d, m, n = slopes.shape
+        by_phase = (slopes / (value + NEVER_ZERO)).imag.transpose(1, 0, 2).reshape(m, d * n)
+        by_power = 2.0 * (slopes * value.conj()).real.transpose(1, 0, 2).reshape(m, d * n)
+        parts = [samples.squares @ by_power, samples.legs @ by_phase]
+        predicted = np.concatenate(
+            [samples.squares @ np.abs(value) ** 2, samples.legs @ np.angle(value)]
+        )
+        white = likelihood.noise.whiten(np.concatenate(parts)).reshape(-1, d, n)
+        return predicted, np.einsum("kdn,nde->nke", white, self._stretch(cube), optimize=True)
+
+    def _stretch(self, cube: FloatArray) -> FloatArray:
+        """Derivatives of the parameters by the cube, (n, n_dim, n_dim)."""
+        n, d = cube.shape
+        low = np.repeat(cube[:, None], d, axis=1)
+        high = low.copy()
+        every = np.arange(d)
+        low[:, every, every] = np.maximum(low[:, every, every] - STEP, 0.0)
+        high[:, every, every] = np.minimum(high[:, every, every] + STEP, 1.0)
+        width = (high - low)[:, every, every]
+        ends = [self.theta(x.reshape(n * d, d)).reshape(n, d, d) for x in (low, high)]
+        return np.asarray(((ends[1] - ends[0]) / width[:, :, None]).transpose(0, 2, 1))
