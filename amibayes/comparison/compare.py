@@ -161,27 +161,24 @@ def compare_sky_models(
     Parameters
     ----------
     result : SearchResult
-        Of a companion: its model of the star, its noise and its solutions are where every
-        model begins.
+        Of a companion: every model begins with its star, noise and solutions.
     prior : Prior
         Of companions and star.
     rng : numpy.random.Generator
     models : sequence of str
         Of `amibayes.support.options.SKY_MODELS`, or several joined by ``+``.
     stated : Observables, optional
-        The data with the stated errors; given with ``noise``, whose prior says how much more
-        noise is plausible: it is fitted at the best of all models, and averaged over.
+        The data with the stated errors, to which noise is fitted at the best of all models.
     noise : NoiseSetting, optional
     settings : sequence of PriorSetting
         Ranges of parameters of extended light.
     method : {"direct", "nested"}
         Importance sampling, or one of `amibayes.support.options.SAMPLERS`.
     default_field : (inner, outer), optional
-        Separations that companions are in unless one farther out fits better than any model with
-        other light; given where the search went farther than that.
+        Where the search went farther than that: separations that companions are in, unless one
+        farther out fits better than any model with other light.
     confusion_draws : int, optional
-        Data sets simulated of each model; 0 for none. By default `CONFUSION_DRAWS`, fewer where
-        data are many.
+        Data sets simulated of each model, 0 for none; by default fewer where data are many.
     progress : callable, optional
 
     Raises
@@ -191,18 +188,9 @@ def compare_sky_models(
     """
     asked, streams = hypotheses(models), rng.spawn(4)
     setting = noise or NoiseSetting()
-    modes = {"companion": np.array([m.theta for m in result.modes])}
-    fits = _fits(asked, result.likelihood, prior, settings, modes, streams[0])
-    found, likelihood, best = _best_noise(fits, result.likelihood, stated, setting)
-    narrow = default_field is not None and best.family != "point"
-    if narrow and default_field is not None:
-        # Companions were looked for far out because one inside does not explain the data; where
-        # other light does, that was not called for.
-        prior = replace(prior, inner_mas=default_field[0], outer_mas=default_field[1])
-    if likelihood is not result.likelihood or narrow:
-        known = {fit.hypothesis.name: fit.model.theta(fit.cube) for fit in fits}
-        fits = _fits(asked, likelihood, prior, settings, known, streams[3])
-    fits = _averaged(fits, stated, setting, found)
+    fits, found = _best_fits(
+        asked, result, prior, stated, setting, settings, default_field, streams
+    )
     compared = _all_compared(fits, streams[1], method)
     log_prior = np.full(len(fits), -np.log(len(fits)))
     wanted = _n_confusion(result.likelihood) if confusion_draws is None else confusion_draws
@@ -215,6 +203,31 @@ def compare_sky_models(
     small = is_degenerate(compared[int(np.argmax(log_z))])
     statement = choose(asked, log_z, log_prior, confusion, degenerate=small)
     return ModelComparison(compared, log_prior, found, confusion, statement)
+
+
+def _best_fits(
+    asked: Sequence[Hypothesis],
+    result: SearchResult,
+    prior: Prior,
+    stated: Observables | None,
+    setting: NoiseSetting,
+    settings: Sequence[PriorSetting],
+    default_field: tuple[float, float] | None,
+    streams: Sequence[np.random.Generator],
+) -> tuple[list[ModelFit], ExtraNoise]:
+    """Best fits with the noise, and in the field, that the best of the models leaves."""
+    modes = {"companion": np.array([m.theta for m in result.modes])}
+    fits = _fits(asked, result.likelihood, prior, settings, modes, streams[0])
+    found, likelihood, best = _best_noise(fits, result.likelihood, stated, setting)
+    narrow = default_field is not None and best.family != "point"
+    if narrow and default_field is not None:
+        # Companions were looked for far out because one inside does not explain the data; where
+        # other light does, that was not called for.
+        prior = replace(prior, inner_mas=default_field[0], outer_mas=default_field[1])
+    if likelihood is not result.likelihood or narrow:
+        known = {fit.hypothesis.name: fit.model.theta(fit.cube) for fit in fits}
+        fits = _fits(asked, likelihood, prior, settings, known, streams[3])
+    return _averaged(fits, stated, setting, found), found
 
 
 def _n_confusion(likelihood: Likelihood) -> int:
