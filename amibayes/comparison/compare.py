@@ -156,7 +156,7 @@ def compare_sky_models(
     confusion_draws: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ModelComparison:
-    """Compare models of the sky by their evidences, and measure how often they are confused.
+    """Compare models of the sky by evidence, and measure how often they are confused.
 
     Parameters
     ----------
@@ -184,7 +184,6 @@ def compare_sky_models(
     Raises
     ------
     UsageError
-        Where a model is not known.
     """
     asked, streams = hypotheses(models), rng.spawn(4)
     setting = noise or NoiseSetting()
