@@ -16,6 +16,9 @@ from amibayes.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = ("--separations", "4", "--trials", "300", "--null-draws", "8000", "--separation", "60:400")
+# Runs of other processes are compared byte by byte, pictures and all.
+pytestmark = pytest.mark.usefixtures("full_pictures")
+
 FILES = ("limits.json", "limits.ecsv", "limits.png", "completeness.png")
 
 

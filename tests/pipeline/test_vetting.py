@@ -103,7 +103,7 @@ def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
 @pytest.mark.usefixtures("full_pictures")
 def test_legends_of_the_picture_cover_nothing_and_stay_on_the_page(rng) -> None:
     data = [calibrator(rng, name=f"some/long_name_of_calibrator_{k}.fits") for k in range(3)]
-    vetting = vet(data, separation_mas=(90.0, 180.0), null_draws=500)
+    vetting = vet(data, separation_mas=FIELD, null_draws=1500)
     figure = vetting_picture(vetting)
     figure.draw_without_rendering()
     assert len(figure.legends) == 2

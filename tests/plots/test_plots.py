@@ -34,7 +34,7 @@ from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, contrast_marks, limits_plot
 from amibayes.plots.corner_plot import corner_plot, interval_text, label_of
 from amibayes.plots.coverage import coverage_plot
-from amibayes.plots.fit import fit_plot
+from amibayes.plots.fit import _Kind, fit_plot
 from amibayes.plots.maps import (
     detection_map,
     false_alarm_map,
@@ -459,3 +459,13 @@ def test_round_contrasts_stand_at_their_magnitudes() -> None:
 def test_fainter_is_lower() -> None:
     bottom, top = limits_plot(SEPARATION, {"a": Curve(LIMIT)}).axes[0].get_ylim()
     assert bottom > top
+
+
+def test_residuals_of_angles_go_the_short_way_round() -> None:
+    nothing = np.zeros(4)
+    observed, model = np.array([179.0, -179.0, 10.0, 350.0]), np.array([-179.0, 179.0, 4.0, -8.0])
+    sigma = np.array([1.0, 2.0, 3.0, 4.0])
+    angles = _Kind("closure phase", "°", nothing, observed, sigma, nothing, nothing, 360.0)
+    np.testing.assert_allclose(angles.residual(model), [-2.0, 1.0, 2.0, -0.5])
+    plain = _Kind("V²", "", nothing, observed, sigma, nothing, nothing)
+    np.testing.assert_allclose(plain.residual(model), (observed - model) / sigma)

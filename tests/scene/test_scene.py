@@ -376,3 +376,20 @@ def test_skewed_pixels_keep_phases_and_places() -> None:
     upright = orientation_of_matrix(Orientation(0.3, 1).matrix)
     assert upright.skew == pytest.approx((1.0, 0.0, 0.0, 1.0), abs=1e-12)
     assert upright.parity == 1
+
+
+def test_parts_of_a_scene_add_up() -> None:
+    """Two points, a disc and a ring: the image of all is the sum of the image of each."""
+    parts: tuple[Component, ...] = (
+        Point(),
+        Point(0.3, 150 * MAS, -40 * MAS),
+        UniformDisc(0.4, 50 * MAS, -20 * MAS, 120 * MAS),
+        GaussianDisc(0.2, -90 * MAS, 60 * MAS, 80 * MAS),
+    )
+    options = {"n_pixels": 30, "centre_px": (0.3, -0.2), "reach_px": 0.1}
+    whole, *each = (
+        scene_image(Scene(some), niriss(), MONO, **options).values
+        for some in (parts, *((part,) for part in parts))
+    )
+    # Windows of the convolution differ with the width of what is convolved.
+    np.testing.assert_allclose(whole, sum(each), atol=1e-6 * whole.max())

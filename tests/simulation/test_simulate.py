@@ -431,3 +431,26 @@ def test_simulated_ramps_are_read_as_the_simulated_slopes(tmp_path: Path) -> Non
     off = ((ramps.images - slopes.images) / slopes.error)[both]
     # Dark, background and flat field are taken off the slopes only; weights differ a little.
     assert np.median(np.abs(off)) < 0.5
+
+
+def test_map_of_the_wavefront_is_that_of_its_file(tmp_path: Path) -> None:
+    """And the exposures are taken through it."""
+    opd_m = 30e-9 * np.random.default_rng(1).standard_normal((48, 48))
+    fits.PrimaryHDU(opd_m).writeto(tmp_path / "opd.fits")
+    text = SMALL.replace("[wavefront]", '[wavefront]\nmap = "opd.fits"\nmap_width_m = 6.6')
+    program = read_program(write(tmp_path, text))
+    assert program.shots
+    for shot in program.shots:
+        assert shot.errors.map is not None
+        np.testing.assert_array_equal(shot.errors.map.opd_m, opd_m)
+        assert shot.errors.map.width_m == 6.6
+    for _, shutter in program.shutters(1):
+        wavefront = shutter.observation.wavefront
+        assert wavefront is not None
+        assert wavefront.map is not None
+        np.testing.assert_array_equal(wavefront.map.opd_m, opd_m)
+    assert read_program(write(tmp_path)).shots[0].errors.map is None
+    for width in ("", "map_width_m = 0.0"):
+        bad = SMALL.replace("[wavefront]", f'[wavefront]\nmap = "opd.fits"\n{width}')
+        with pytest.raises(DataError, match="map_width_m"):
+            read_program(write(tmp_path, bad))
