@@ -23,6 +23,9 @@ EXAMPLES = """examples:
 
 SUMMARY = "extract.json"
 
+MIGRATION = "migration"
+"""Name of the picture of what changes along ramps, where there are some."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -121,7 +124,8 @@ def _names(stem: str, arguments: argparse.Namespace) -> list[str]:
     from amibayes.plots.extraction import PICTURES
 
     extra = [f"{stem}_integrations.oifits"] if arguments.per_integration else []
-    return [f"{stem}.oifits", *extra, *(f"{stem}_{name}.png" for name in PICTURES)]
+    pictures = (*PICTURES, MIGRATION)
+    return [f"{stem}.oifits", *extra, *(f"{stem}_{name}.png" for name in pictures)]
 
 
 def _write(
@@ -141,6 +145,10 @@ def _write(
         write_oifits(single, integrations(extraction), header=header, overwrite=True)
     for name, draw in PICTURES.items():
         save(draw(extraction), folder / f"{stem}_{name}.png")
+    if extraction.charge.fit is not None:
+        from amibayes.plots.charge_migration import migration_plot
+
+        save(migration_plot(extraction.charge.fit), folder / f"{stem}_{MIGRATION}.png")
     return {"path": str(path), **described(extraction)}
 
 

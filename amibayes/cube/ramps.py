@@ -19,7 +19,7 @@ import numpy as np
 from amibayes.cube.container import DO_NOT_USE, JUMP_DET, SATURATED, Cube
 from amibayes.cube.timing import GroupTiming
 from amibayes.support.fits_errors import reporting_damage
-from amibayes.units import BoolArray, FloatArray, IntArray
+from amibayes.units import BoolArray, FloatArray, IntArray, SingleArray
 
 GAIN_E_DN = 1.61
 """Electrons per DN of NIRISS (1.61 to 1.62)."""
@@ -43,7 +43,7 @@ class Differences:
         Those that may be used.
     """
 
-    values: FloatArray
+    values: SingleArray
     good: BoolArray
 
 
@@ -101,16 +101,19 @@ class RampFile:
     def differences(self, part: slice) -> Differences:
         """Differences of groups of the integrations of a slice."""
         with reporting_damage(self.template.source):
-            groups = np.asarray(self.hdus["SCI"].section[part], dtype=float)
+            # Single precision, as the files have: its rounding is far below the noise of a read.
+            groups = np.asarray(self.hdus["SCI"].section[part], dtype=np.float32)
             flags = self.hdus.get("GROUPDQ")
-            dq = None if flags is None else np.asarray(flags.section[part]).astype(np.int64)
+            dq = None if flags is None else np.asarray(flags.section[part])
         good = np.isfinite(groups)
-        cut = np.zeros(groups.shape, dtype=bool)
-        if dq is not None:
-            good &= (dq & (DO_NOT_USE | SATURATED)) == 0
-            cut = (dq & JUMP_DET) > 0
-        used = good[:, 1:] & good[:, :-1] & ~cut[:, 1:]
-        return Differences(np.where(used, np.diff(np.nan_to_num(groups), axis=1), 0.0), used)
+        steps = groups[:, 1:] - groups[:, :-1]
+        used = good[:, 1:] & good[:, :-1]
+        if dq is not None and dq.any():
+            good = (dq & (DO_NOT_USE | SATURATED)) == 0
+            used &= good[:, 1:] & good[:, :-1] & ((dq[:, 1:] & JUMP_DET) == 0)
+        if not used.all():
+            steps[~used] = 0.0
+        return Differences(steps, used)
 
     @cached_property
     def pixel_flags(self) -> Any:
@@ -130,10 +133,10 @@ class RampFile:
         found = self.differences(slice(0, min(self.n_integrations, SAMPLE)))
         difference, good = found.values, found.good
         count = np.maximum(good.sum(axis=(0, 1)), 1)
-        mean = difference.sum(axis=(0, 1)) / count
+        mean = difference.sum(axis=(0, 1), dtype=float) / count
         photons = np.maximum(mean, 0.0) / self.gain_e
         off = np.where(good, difference - mean, 0.0)
-        variance = (off**2).sum(axis=(0, 1)) / np.maximum(count - 1, 1)
+        variance = (off**2).sum(axis=(0, 1), dtype=float) / np.maximum(count - 1, 1)
         faint = mean <= np.median(mean)
         spare = variance - photons * float(np.diag(self.timing.photon_covariance).mean())
         read = 0.5 * float(np.median(spare[faint & (count > 1)]))
@@ -181,7 +184,9 @@ class SlopeWeights:
         good = found.good.reshape(n, m, -1)
         weight = self.weight.T
         total = np.broadcast_to(weight.sum(axis=0), (n, ny * nx)).copy()
-        slope = np.einsum("nmp,mp->np", found.values.reshape(n, m, -1), weight)
+        slope = np.zeros((n, ny * nx))
+        for k in range(m):
+            slope += found.values.reshape(n, m, -1)[:, k] * weight[k]
         time = np.broadcast_to(self.middle_s @ weight, (n, ny * nx)).copy()
         some = ~good.all(axis=1)
         if some.any():

@@ -8,8 +8,10 @@ change, B in the current F + B·t, is all that a fit of migration needs of an ex
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from amibayes.cube.container import NEVER_USED, flag_bits
@@ -23,6 +25,10 @@ CHUNK = 64
 
 BATCHES = 24
 """Means of so many parts of an exposure: their scatter owes nothing to a model of the noise."""
+
+SAMPLED = 128
+"""Integrations, evenly chosen, whose images tell what migration makes of them: they differ by
+the pointing, which changes that by percents, and its mean by a tenth of a percent then."""
 
 MIN_SHARE = 0.5
 """A difference, or a pixel, is left out where it is good in a smaller share of the ramps."""
@@ -52,6 +58,10 @@ class Curvature:
         Means of `change` over parts of the exposure; none with fewer than two integrations.
     gains : (len(KINDS), ny, nx) array
         Mean over integrations of what a coefficient of 1 per electron makes of the change.
+    departure : (n_differences, ny, nx) array
+        Mean current of each difference less `current`.
+    lag_s : (n_differences,) array
+        Time of each from ``time_s``.
     bend_chi2 : float
         χ² of what is left of the mean ramps beside a linear change.
     bend_dof : int
@@ -66,11 +76,13 @@ class Curvature:
     sigma: FloatArray
     batches: FloatArray
     gains: FloatArray
+    departure: FloatArray
+    lag_s: FloatArray
     bend_chi2: float
     bend_dof: int
 
     def __post_init__(self) -> None:
-        read_only(self, "current", "change", "sigma", "batches", "gains")
+        read_only(self, "current", "change", "sigma", "batches", "gains", "departure")
 
     @property
     def used(self) -> BoolArray:
@@ -100,6 +112,16 @@ class _Weights:
     sigma: FloatArray
     inverse: FloatArray
     lag_s: FloatArray
+
+    def applied(self, steps: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Current and change (n, ny, nx) of ramps whose differences are (n, k, ny, nx)."""
+        n, k, ny, nx = steps.shape
+        current, change = np.zeros((2, n, ny * nx))
+        flat = steps.reshape(n, k, -1)
+        for i in range(k):
+            current += flat[:, i] * self.matrix[0, i]
+            change += flat[:, i] * self.matrix[1, i]
+        return current.reshape(n, ny, nx), change.reshape(n, ny, nx)
 
 
 def _weights(kept: IntArray, photons: FloatArray, read: float, timing: GroupTiming) -> _Weights:
@@ -132,9 +154,11 @@ class _Sums:
         self, number: IntArray, current: FloatArray, change: FloatArray, whole: BoolArray
     ) -> None:
         """Add integrations of a running number: their currents, changes and whole ramps."""
-        batch = number % len(self.count)
-        np.add.at(self.count, batch, whole)
-        np.add.at(self.change, batch, np.where(whole, change, 0.0))
+        kept = change if whole.all() else np.where(whole, change, 0.0)
+        b = len(self.count)
+        for k, batch in enumerate(number[:b] % b):
+            self.count[batch] += np.count_nonzero(whole[k::b], axis=0)
+            self.change[batch] += kept[k::b].sum(axis=0)
         self.current += np.where(whole, current, 0.0).sum(axis=0)
 
 
@@ -153,18 +177,21 @@ def curvature_of(file: RampFile) -> Curvature | None:
     shape = photons.shape
     bad = np.broadcast_to(np.asarray(file.pixel_flags) & flag_bits(NEVER_USED), shape) > 0
     usual = filled(photons / file.timing.group_s, ~bad)
+    stride = -(-file.n_integrations // SAMPLED)
     sums = _Sums(shape, len(kept), min(BATCHES, file.n_integrations))
     for start in range(0, file.n_integrations, CHUNK):
         part = slice(start, min(start + CHUNK, file.n_integrations))
         found = file.differences(part)
         whole = found.good[:, kept].all(axis=1) & ~bad
         steps = found.values[:, kept] * (gain / file.timing.group_s)
-        flat = steps.reshape(*steps.shape[:2], -1)
-        current, change = np.einsum("nkp,ikp->inp", flat, weights.matrix).reshape(2, -1, *shape)
+        current, change = weights.applied(steps)
         sums.add(np.arange(part.start, part.stop), current, change, whole)
-        sums.ramp += np.where(whole[:, None], steps, 0.0).sum(axis=0)
-        light = np.where(whole, current, usual)
+        if not whole.all():
+            steps = np.where(whole[:, None], steps, 0.0)
+        sums.ramp += steps.sum(axis=0, dtype=float)
+        light = np.where(whole, current, usual)[-part.start % stride :: stride]
         sums.gains += gains(KINDS, light, light).sum(axis=1)
+        sums.n += len(light)
     return _averaged(sums, weights, file, bad)
 
 
@@ -190,7 +217,9 @@ def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) ->
         change,
         sigma,
         batches if len(batches) > 1 else batches[:0],
-        sums.gains / n,
+        sums.gains / sums.n,
+        sums.ramp / divisor - current,
+        weights.lag_s,
         float(chi2[used].sum()),
         int(used.sum()) * (len(weights.kept) - 2),
     )

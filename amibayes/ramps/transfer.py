@@ -51,8 +51,8 @@ def side_operator(n_pixels: int) -> FloatArray:
 def side_densities(current: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Density of a current (…, ny, nx) at the sides along x (…, ny, nx − 1) and y."""
     ny, nx = current.shape[-2:]
-    along_x = current @ side_operator(nx).T
-    along_y = side_operator(ny) @ current
+    along_x = current @ side_operator(nx).T.astype(current.dtype)
+    along_y = side_operator(ny).astype(current.dtype) @ current
     return np.asarray(along_x), np.asarray(along_y)
 
 
@@ -66,7 +66,7 @@ def gain(kind: str, charge: FloatArray, current: FloatArray) -> FloatArray:
     charge : (…, ny, nx) array
         Electrons in each pixel.
     current : (…, ny, nx) array
-        Electrons per second that light makes in each.
+        Electrons per second that light makes in each; single precision stays so.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def gain(kind: str, charge: FloatArray, current: FloatArray) -> FloatArray:
 def gains(kinds: Sequence[str], charge: FloatArray, current: FloatArray) -> FloatArray:
     """`gain` of several kinds, (len(kinds), …, ny, nx)."""
     density_x, density_y = side_densities(current)
-    out = np.empty((len(kinds), *charge.shape))
+    out = np.empty((len(kinds), *charge.shape), dtype=charge.dtype)
     for k, kind in enumerate(kinds):
         if kind == LINEARITY:
             out[k] = charge * current

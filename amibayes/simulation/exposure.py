@@ -26,6 +26,9 @@ MAX_INTEGRATIONS = 10000
 """More than this does not fit in one JWST exposure."""
 
 
+MAX_SIGMA = 4.0
+"""Frames that point farther than so many standard deviations are drawn in."""
+
 MAX_SIMULATED = 1_000_000
 """Integrations of the largest file that is simulated, a hundred full exposures."""
 
@@ -63,6 +66,8 @@ class Exposure:
         Side of the image.
     keep_ramps : bool
         Keep the reads as well.
+    frame_jitter_rad : float
+        Pointing error of each frame about that of its integration, rms per axis.
 
     Raises
     ------
@@ -76,6 +81,7 @@ class Exposure:
     dither_rad: float = 15.0 * MAS
     n_pixels: int = 80
     keep_ramps: bool = False
+    frame_jitter_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if self.n_groups < 2:
@@ -88,7 +94,7 @@ class Exposure:
         refuse_too_many(self.n_integrations)
         if self.n_pixels < 8:
             raise UsageError(f"n_pixels is {self.n_pixels}; it must be 8 or more")
-        for name in ("jitter_rad", "dither_rad"):
+        for name in ("jitter_rad", "dither_rad", "frame_jitter_rad"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"{name[:-4]} is {getattr(self, name):g}; it must be at least 0")
 
@@ -103,15 +109,18 @@ class Pointings:
         Offset (x, y) of the whole exposure.
     jitter_px : (n_int, 2) array
         Offsets about that.
+    frame_px : float
+        Rms of the offsets of single frames about those, per axis.
     """
 
     dither_px: FloatArray
     jitter_px: FloatArray
+    frame_px: float = 0.0
 
     @property
     def reach_px(self) -> float:
-        """Largest jitter along an axis."""
-        return float(np.abs(self.jitter_px).max())
+        """Largest jitter along an axis, that of frames included."""
+        return float(np.abs(self.jitter_px).max()) + MAX_SIGMA * self.frame_px
 
 
 def draw_pointings(exposure: Exposure, pixel_rad: float, seed: np.random.SeedSequence) -> Pointings:
@@ -120,6 +129,7 @@ def draw_pointings(exposure: Exposure, pixel_rad: float, seed: np.random.SeedSeq
     return Pointings(
         exposure.dither_rad / pixel_rad * of_dither.standard_normal(2),
         exposure.jitter_rad / pixel_rad * of_jitter.standard_normal((exposure.n_integrations, 2)),
+        exposure.frame_jitter_rad / pixel_rad,
     )
 
 
@@ -151,6 +161,8 @@ class Recorder:
         Electrons per second of the star.
     fit : SlopeFit
         Slopes from ramps.
+    frame_px : float
+        Rms of the pointing of single frames, per axis.
     """
 
     exposure: Exposure
@@ -159,15 +171,22 @@ class Recorder:
     image: ShiftedImage
     rate_e_s: float
     fit: SlopeFit
+    frame_px: float = 0.0
 
     def light(self, jitter_px: FloatArray) -> FloatArray:
-        """(n, ny, nx) electrons per second at some pointings (n, 2)."""
-        return np.maximum(self.rate_e_s * self.image.at(jitter_px), 0.0)
+        """(…, ny, nx) electrons per second at some pointings (…, 2)."""
+        images = self.image.at(jitter_px.reshape(-1, 2))
+        shape = (*jitter_px.shape[:-1], *images.shape[1:])
+        return np.maximum(self.rate_e_s * images, 0.0).reshape(shape)
 
     def __call__(self, piece: tuple[FloatArray, np.random.SeedSequence]) -> dict[str, Any]:
         """Simulate the integrations of some jitters (n, 2), in pixels, with a seed."""
         jitter, seed = piece
         rng = np.random.default_rng(seed)
+        if self.frame_px > 0.0:
+            shape = (self.exposure.n_groups, *jitter.shape)
+            moved = rng.spawn(1)[0].standard_normal(shape).clip(-MAX_SIGMA, MAX_SIGMA)
+            jitter = jitter + self.frame_px * moved
         ramps = read_ramps(self.light(jitter), self.detector, self.exposure.n_groups, rng)
         slopes = self.fit(ramps)
         result = {
@@ -204,7 +223,7 @@ def make_recorder(
             remedy="a fainter star or a narrower filter",
         )
     fit = SlopeFit(expected, detector, maps, exposure.n_groups)
-    return Recorder(exposure, detector, maps, image, rate_e_s, fit)
+    return Recorder(exposure, detector, maps, image, rate_e_s, fit, pointings.frame_px)
 
 
 def record(

@@ -268,6 +268,7 @@ class _Reader:
             dither_rad=_pointing(table, "dither_mas", 15.0),
             n_pixels=table.whole("n_pixels", 80, at_least=8, at_most=MAX_PIXELS),
             keep_ramps=table.flag("ramps", False) or self.overrides.ramps,
+            frame_jitter_rad=_pointing(table, "frame_jitter_mas", 0.0),
         )
 
     def _options(self, limit: float) -> PlanOptions:

@@ -81,6 +81,7 @@ def _truth(observation: Observation, pointings: Pointings, rate_e_s: float) -> d
         "DITHER_X": float(pointings.dither_px[0]) * pixel,
         "DITHER_Y": float(pointings.dither_px[1]) * pixel,
         "JITTER": observation.exposure.jitter_rad / MAS,
+        "JITTERFR": observation.exposure.frame_jitter_rad / MAS,
         "ZEROREAD": detector.zero_read,
         "RDNOISE": detector.read_noise_e,
         "FLATERR": detector.flat_error,
