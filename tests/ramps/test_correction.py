@@ -141,7 +141,7 @@ def visit(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("visit")
     paths = [folder / "bright_ramp.fits", folder / "faint_ramp.fits"]
     for k, path in enumerate(paths):
-        write_ramps(path, noisy_ramps(k, 16, 0.5**k))
+        write_ramps(path, noisy_ramps(k, 30, 0.5**k))
     return paths
 
 
