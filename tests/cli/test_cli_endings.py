@@ -23,7 +23,7 @@ from amibayes.support.atomic_files import output_folder, output_locks
 
 ROOT = Path(__file__).resolve().parents[2]
 TRUTH = [110.0, -75.0, 0.02]
-QUICK = ("--separation", "50:400", "--null-draws", "0", "--no-limits")
+QUICK = ("--separation", "80:200", "--null-draws", "0", "--no-limits")
 
 
 def start(
@@ -190,7 +190,7 @@ def begun(out: Path) -> None:
         time.sleep(0.05)
 
 
-LONG = ("--separation", "50:400", "--null-draws", "100000000", "--quiet")
+LONG = ("--separation", "80:200", "--null-draws", "100000000", "--quiet")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")

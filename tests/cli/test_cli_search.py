@@ -38,7 +38,7 @@ KEYS = {
 @pytest.mark.usefixtures("full_pictures")
 def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
-    words = (target, "--cal", *calibrators, "--out", out, "--separation", "50:400")
+    words = (target, "--cal", *calibrators, "--out", out, "--separation", "60:250")
     assert run("search", *words) == 0
     summary = capsys.readouterr().out.strip().split("\n")
     assert len(summary) <= 20
@@ -65,7 +65,7 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
     assert (out / "report.html").stat().st_size > 1e5
     again = tmp_path / "again"
     calibrated = out / "calibrated.oifits"
-    assert run("search", calibrated, "--out", again, "--separation", "50:400", "--null-draws", "0",
+    assert run("search", calibrated, "--out", again, "--separation", "60:250", "--null-draws", "0",
                "--no-posterior") == 0  # fmt: skip
     second = json.loads((again / "result.json").read_text())
     assert second["fit"]["chi2_binary"] == pytest.approx(fit["chi2_binary"], rel=1e-10)

@@ -160,7 +160,7 @@ def test_joint_bank_against_least_squares_at_its_own_derivatives(off_axis, nuisa
     model = BinaryModel(background="free") if nuisance else BinaryModel()
     likelihood = joint_likelihood(Likelihood(data, model), motion=True, fastest_mas_yr=40.0)
     single, _ = fit_single(likelihood)
-    bank = TemplateBank(likelihood, make_grid(100.0, 200.0, 25.0), single)
+    bank = TemplateBank(likelihood, make_grid(100.0, 200.0, 50.0), single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey, chi2 = bank.survey(residuals), (bank.project(residuals) ** 2).sum()
     rates, checked = trial_rates(likelihood), 0
@@ -504,8 +504,8 @@ def test_evidence_of_two_bands_against_a_sum_over_a_lattice(rng) -> None:
         result.likelihood, result.modes, result.modes, prior, np.random.default_rng(1)
     )
     sigma = np.sqrt(np.diag(result.theta_covariance))
-    ln_c = np.linspace(np.log(1e-3), np.log(0.1), 400)
-    axis = np.linspace(-6.0, 6.0, 41)
+    ln_c = np.linspace(np.log(1e-3), np.log(0.1), 250)
+    axis = np.linspace(-6.0, 6.0, 25)
     east, north = np.meshgrid(result.theta[0] + sigma[0] * axis, result.theta[1] + sigma[1] * axis)
     cell = sigma[0] * sigma[1] * (axis[1] - axis[0]) ** 2
     total = np.zeros(east.size)
@@ -513,11 +513,11 @@ def test_evidence_of_two_bands_against_a_sum_over_a_lattice(rng) -> None:
         likelihood = Likelihood(part)
         bright = np.exp(ln_c)
         theta = np.column_stack(
-            [np.repeat(east, 400), np.repeat(north, 400), np.tile(bright, east.size)]
+            [np.repeat(east, 250), np.repeat(north, 250), np.tile(bright, east.size)]
         )
         log_prob = np.concatenate([likelihood.log_prob(t) for t in np.array_split(theta, 20)])
         width = (ln_c[1] - ln_c[0]) / np.log(1.0 / 1e-5)
-        total += logsumexp(log_prob.reshape(-1, 400), axis=1) + np.log(width)
+        total += logsumexp(log_prob.reshape(-1, 250), axis=1) + np.log(width)
     area = np.pi * (FIELD[1] ** 2 - FIELD[0] ** 2)
     exact = logsumexp(total) + np.log(cell / area)
     assert error < 0.05

@@ -286,10 +286,10 @@ def _plug_in(found, p: int) -> float:
 @pytest.mark.parametrize("n_integrations", [20, 200])
 @pytest.mark.parametrize("name", ["even", "uneven"])
 def test_intervals_cover_at_few_integrations(name: str, n_integrations: int) -> None:
-    """150 trials: binomial chance 1e-4; the uneven one has an expectation that is wrong."""
+    """100 trials: binomial chance 1e-4; the uneven one has an expectation that is wrong."""
     rng = np.random.default_rng([8, n_integrations, name == "even"])
-    hits, _ = inside(EVEN if name == "even" else UNEVEN, n_integrations, 150, "shrunk", rng)
-    assert stats.binomtest(hits, 150, 0.68).pvalue > 1e-4, hits
+    hits, _ = inside(EVEN if name == "even" else UNEVEN, n_integrations, 100, "shrunk", rng)
+    assert stats.binomtest(hits, 100, 0.68).pvalue > 1e-4, hits
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from amibayes.report import result_json, summary
 from amibayes.report.words import measured
 from amibayes.support.atomic_files import to_json
 
-FAST = ("--separation", "60:400", "--no-posterior", "--no-limits", "--null-draws", "1000")
+FAST = ("--separation", "80:250", "--no-posterior", "--no-limits", "--null-draws", "1000")
 
 
 def found(paths: list[Path], cals: Sequence[Path] = (), **options: object) -> SearchReport:
@@ -34,7 +34,7 @@ def found(paths: list[Path], cals: Sequence[Path] = (), **options: object) -> Se
     return search_companion(
         [str(p) for p in paths],
         [str(p) for p in cals],
-        SearchOptions(separation_mas=(60.0, 400.0), **(quick | options)),  # type: ignore[arg-type]
+        SearchOptions(separation_mas=(80.0, 250.0), **(quick | options)),  # type: ignore[arg-type]
     )
 
 

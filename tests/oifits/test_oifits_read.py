@@ -491,7 +491,7 @@ def test_damaged_bytes_give_an_error_or_data(tmp_path: Path, data: st.DataObject
 
 
 @settings(
-    max_examples=30,
+    max_examples=12,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

@@ -151,7 +151,7 @@ def test_stations_without_positions_and_from_zero(rng: np.random.Generator, tmp_
 
 
 @settings(
-    max_examples=20,
+    max_examples=10,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

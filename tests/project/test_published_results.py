@@ -27,10 +27,10 @@ PUBLISHED = _script()
 CASES = [
     pytest.param(
         data,
-        marks=[pytest.mark.slow] if data.slow else [],
+        marks=[pytest.mark.slow] if data.slow or number > 1 else [],
         id=f"{data.name}: {data.model}".replace(" ", "_"),
     )
-    for data in PUBLISHED.DATA_SETS
+    for number, data in enumerate(PUBLISHED.DATA_SETS)
     if data.possible
 ]
 
