@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.grid import Grid, make_grid
-from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.optimise import fit_single, refine, starting_points
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.extra_noise import NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 from amibayes.units import MAS, FloatArray
 
@@ -90,6 +93,14 @@ def resolves_stars(likelihood: Likelihood) -> bool:
     return likelihood.observables.n_vis2 > 0 and bool(z * z / 4.0 > 0.01)
 
 
+def notices_disc(likelihood: Likelihood, diameter_mas: float) -> bool:
+    """Whether V² with the stated errors would tell a star's disc from a point by Δχ² 1."""
+    star = single_likelihood(likelihood.with_model(BinaryModel(1, diameter_mas)))
+    point = single_likelihood(likelihood.with_model(BinaryModel(1)))
+    change = star.predict(np.empty((1, 0))) - point.predict(np.empty((1, 0)))
+    return bool((likelihood.noise.whiten(change) ** 2).sum() > 1.0)
+
+
 def outermost(likelihood: Likelihood) -> float:
     """Separation, mas, at which the narrowest channel smears a companion out: R·λ/B_max."""
     data = likelihood.observables
@@ -97,12 +108,23 @@ def outermost(likelihood: Likelihood) -> float:
     return resolution_mas(likelihood) / max(float(np.concatenate(widths).min()), 1e-6)
 
 
-def choose_field(likelihood: Likelihood) -> tuple[tuple[float, float], float | None]:
+def choose_field(
+    likelihood: Likelihood, prior: NoisePrior | None = None
+) -> tuple[tuple[float, float], float | None]:
     """Choose the range of separations where none is asked for.
 
     `default_separation`, unless a coarse look as far as the channels allow, within
     `MAX_WORK`, shows something notably better outside: that is inside then. The look comes
-    before any noise is fitted to what a star alone leaves, which would hide a companion.
+    before any noise is fitted to what a star alone leaves, which would hide a companion; what it
+    shows has to hold with the noise that is fitted beside it, since errors that channels share
+    look like wide companions.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With the stated errors.
+    prior : NoisePrior, optional
+        Of extra noise.
 
     Returns
     -------
@@ -135,8 +157,35 @@ def choose_field(likelihood: Likelihood) -> tuple[tuple[float, float], float | N
     least = MODE_LIMIT * max(left / still.n_independent, 1.0)
     if beyond[best] < within.max() + max(least, NOTABLY_BETTER * within.max()):
         return (inner, outer), None
-    place = float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
-    return (inner, MARGIN * place), place
+    place = np.array([grid.east_mas[best], grid.north_mas[best]])
+    box = Box(inner, farthest, fringe)
+    if not _holds(still, make_grid(inner, outer, step), single, place, box, prior):
+        return (inner, outer), None
+    separation = float(np.hypot(*place))
+    return (inner, MARGIN * separation), separation
+
+
+def _holds(
+    likelihood: Likelihood,
+    within: Grid,
+    single: FloatArray,
+    place: FloatArray,
+    box: Box,
+    prior: NoisePrior | None,
+) -> bool:
+    """Whether a companion outside still fits notably better with the noise fitted beside it."""
+    bank = TemplateBank(likelihood, within, single)
+    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
+    tail = bank.matched_filter(residuals)(place)[0]
+    seed = starting_points(likelihood, place[None], tail[None], single, box)[0]
+    bright = likelihood.parameters.contrasts
+    seed[bright] = np.clip(seed[bright], *np.array(likelihood.parameters.bounds(bright)).T)
+    theta = np.array(refine(likelihood, seed, box, 0.0).theta)
+    stated = likelihood.expecting(theta)
+    noisy = with_noise(stated, fit_noise(stated, theta, prior=prior))
+    alone, chi2 = fit_single(noisy)
+    gain = chi2 - float(noisy.deviance(noisy.chi2(theta))[0])
+    return bool(gain > _gains(noisy, within, alone).max(initial=0.0) + MODE_LIMIT)
 
 
 def _affordable(likelihood: Likelihood, box: Box) -> tuple[Likelihood, float]:

@@ -13,7 +13,7 @@ from astropy.table import QTable
 from amibayes.companion_search.grid import Grid
 from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
 from amibayes.likelihood.chi2 import candid_n_sigma
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.student import Robustness, StudentNoise, SymmetricWhitening
 from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import YEAR_DAYS
@@ -114,6 +114,11 @@ class Mode:
         return self.companion.east_mas, self.companion.north_mas
 
 
+def is_opposite(mode: Mode, place: FloatArray) -> bool:
+    """Whether a mode is the mirror image of a place, mas."""
+    return bool(np.hypot(*np.add(mode.place, place)) < 1e-2)
+
+
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """What a search found.
@@ -140,6 +145,8 @@ class SearchResult:
     warnings : tuple of str
     robustness : Robustness, optional
         How a robust search treated the data; ``likelihood`` has outliers' errors stretched.
+    aliases : tuple of Mode
+        Those of ``modes`` that these baselines cannot tell from the first one.
     joint_gain : (n_grid,) float array, optional
         Gain in χ² at every position where bands have contrasts of their own or the companion
         moves; otherwise it follows from the two above.
@@ -161,6 +168,18 @@ class SearchResult:
     warnings: tuple[str, ...] = ()
     robustness: Robustness | None = None
     joint_gain: FloatArray | None = None
+    aliases: tuple[Mode, ...] = ()
+
+    @property
+    def unambiguous_mas(self) -> float | None:
+        """Separation within which no position has an alias; None where the first mode has none.
+
+        Half of the shortest step to one: the (u, v) coverage repeats the sky at such steps. The
+        opposite position, which closure phases tell, does not count.
+        """
+        here = np.array(self.modes[0].place)
+        steps = [np.subtract(m.place, here) for m in self.aliases if not is_opposite(m, here)]
+        return 0.5 * float(min(np.hypot(*s) for s in steps)) if steps else None
 
     @property
     def delta_chi2(self) -> float:
@@ -212,6 +231,15 @@ class SearchResult:
         if name in self.likelihood.parameters.names:
             return float(self.theta[self.likelihood.parameters.index(name)])
         return float(getattr(self.likelihood.model, name))
+
+    def star_alone(self) -> dict[str, tuple[float, float]]:
+        """Each free parameter of the fit without a companion: its value and error."""
+        alone = single_likelihood(self.likelihood)
+        if not len(self.single_theta):
+            return {}
+        errors = np.sqrt(np.diag(alone.errors(self.single_theta)))
+        both = zip(self.single_theta.tolist(), errors.tolist(), strict=True)
+        return dict(zip(alone.parameters.names, both, strict=True))
 
     def to_table(self) -> QTable:
         """Every distinct solution, best first, as an astropy table with units."""

@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.companion_search.field import default_separation, resolution_mas
 from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import fit_single, global_check
-from amibayes.companion_search.result import Mode, SearchResult, companions_of
+from amibayes.companion_search.result import Mode, SearchResult, companions_of, is_opposite
 from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.seeds import (
     MODE_LIMIT,
@@ -106,6 +106,7 @@ def search(
         bank_sigma=survey.sigma,
         global_check=check,
         warnings=_warnings(modes, aliases, found, check),
+        aliases=aliases,
         joint_gain=survey.gain if bank.joint else None,
     )
 
@@ -275,15 +276,17 @@ def _warnings(
             f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
         )
     if aliases:
-        opposite = [m for m in aliases if np.hypot(*np.add(m.place, modes[0].place)) < 1e-2]
-        far = [f"{m.companion.separation_mas:.0f}" for m in aliases if m not in opposite]
+        here = np.array(modes[0].place)
+        opposite = [m for m in aliases if is_opposite(m, here)]
+        repeated = [m for m in aliases if m not in opposite]
+        far = [f"{m.companion.separation_mas:.0f}" for m in repeated]
         if opposite:
             warnings.append("without closure phases a position cannot be told from its opposite")
         if far:
-            name = "alias" if len(far) == 1 else "aliases"
+            ends = 0.5 * min(np.hypot(*np.subtract(m.place, here)) for m in repeated)
             warnings.append(
-                f"these baselines cannot tell the position from its {name} at {', '.join(far)} "
-                "mas: the innermost is reported"
+                f"beyond {ends:.0f} mas the sky repeats itself for these baselines: "
+                f"{', '.join(far)} mas would fit as well; the innermost is reported"
             )
     rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
     if rivals:

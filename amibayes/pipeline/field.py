@@ -10,6 +10,7 @@ from amibayes.companion_search.field import (
     SURELY_NOT_NOISE,
     choose_field,
     look_inside,
+    notices_disc,
     resolution_mas,
 )
 from amibayes.companion_search.optimise import fit_single, refine, with_disc
@@ -21,7 +22,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.systematics import systematics_of
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.bands import reference_wavelength
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
@@ -65,19 +66,46 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     )
     field, warnings = options.separation_mas, list[str]()
     if field is None:
-        field, place = choose_field(likelihood)
+        field, place = choose_field(likelihood, noise_prior(likelihood.observables, options))
         if place is not None:
             warnings = [
                 f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
                 "default one, a companion fits better than anywhere inside"
             ]
     first = search(likelihood, field)
+    if options.diameter is None:
+        likelihood, first = _without_disc(likelihood, first)
     if options.companion_diameter is None and shows_disc(likelihood, first):
         first = _search_for_disc(likelihood, first)
     result, noise = _searched(first, options)
     if options.separation_mas:
         warnings = _beyond(result)
     return FieldSearch(result, noise, tuple(warnings))
+
+
+def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihood, SearchResult]:
+    """Leave the star's disc out where the data can neither notice nor need one.
+
+    Its prior then says more of it than the data do, and a direction left free for it would cost
+    contrasts and limits what no disc of a likely size can. A disc that fits better than its
+    prior holds against it stays, and so does one that explains the data without a companion.
+    """
+    if "diameter_mas" not in free.likelihood.parameters.names or notices_disc(
+        likelihood, LIKELY_DISC_MAS
+    ):
+        return likelihood, free
+    point = likelihood.with_model(replace(likelihood.model, diameter_mas=0.0))
+    found = search(point, (free.grid.inner_mas, free.grid.outer_mas))
+    names = single_likelihood(free.likelihood).parameters.names
+    alone = float(free.single_theta[names.index("diameter_mas")])
+    fits = (free.chi2_binary, free.nuisance("diameter_mas")), (free.chi2_single, alone)
+    # −2 ln of the half-Cauchy prior, and 1 for a fit that is better by a standard deviation.
+    least = min(chi2 + 2.0 * np.log1p(diameter**2) + 1.0 for chi2, diameter in fits)
+    return (likelihood, free) if found.chi2_binary > least else (point, found)
+
+
+LIKELY_DISC_MAS = 4.0
+"""Five of six stars are smaller by the prior, half-Cauchy with 1 mas."""
 
 
 def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:

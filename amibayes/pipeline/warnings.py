@@ -221,11 +221,13 @@ def search_warnings(
     excluded = [] if posterior is None else _of_prior(result, posterior.prior)
     found += excluded
     if posterior is not None and not excluded and len(posterior.mode_probability) > 1:
-        share = posterior.mode_probability[0]
+        # An alias is no rival: it lies where the field of one answer has ended.
+        rival = np.array([m not in result.aliases for m in result.modes])
+        share = posterior.mode_probability[0] / posterior.mode_probability[rival].sum()
         if share < 0.99 and len(modes_to_sample(result)) == 1:
             found.append(
                 f"the posterior is that of the reported position, whose probability among "
-                f"{len(posterior.mode_probability)} modes is {share:.2f} ({posterior.mode_method})"
+                f"{rival.sum()} modes is {share:.2f} ({posterior.mode_method})"
             )
     if posterior is not None and not posterior.converged:
         exact = "; posterior.integrated in result.json does not rest on the chain"

@@ -132,6 +132,10 @@ def _fit(result: SearchResult) -> Json:
         "chi2r_binary": result.chi2_binary / result.ndof,
         "ndof": result.ndof,
         **joint_fit_json(result),
+        "star_alone": {
+            name: {"value": value, "error": number(error)}
+            for name, (value, error) in result.star_alone().items()
+        },
         "errors": _errors(c, result),
     }
 
@@ -203,7 +207,8 @@ def _randomised(weight: Significance) -> Json | None:
 
 
 def _modes(report: SearchReport) -> list[Json]:
-    modes = [_mode(mode) for mode in report.result.modes]
+    aliases = report.result.aliases
+    modes = [_mode(mode) | {"alias": mode in aliases} for mode in report.result.modes]
     if report.posterior is not None:
         for mode, probability in zip(modes, report.posterior.mode_probability, strict=True):
             mode["probability"] = float(probability)

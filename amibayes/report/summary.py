@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from amibayes.companion_search.result import SearchResult
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.tails import MIN_PROBABILITY
 from amibayes.limits.limit import DetectionLimit
@@ -42,7 +41,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"detection   delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
-    lines += [*joint_lines(report), *_nuisance_lines(result)]
+    lines += [*joint_lines(report), *_nuisance_lines(report)]
     lines += _noise_lines(report)
     if report.posterior is not None:
         lines += _posterior_lines(report.posterior)
@@ -130,18 +129,22 @@ def _power(probability: float) -> str:
     return f"{probability:.0e}"
 
 
-def _nuisance_lines(result: SearchResult) -> list[str]:
-    lines = []
+def _nuisance_lines(report: SearchReport) -> list[str]:
+    """The star's own parameters: of the fit without a companion, where there is none."""
+    result, lines = report.result, []
     parameters = result.likelihood.parameters
-    for k in parameters.nuisance:
-        name = parameters[k].name
+    alone = report.verdict is not None and report.verdict.statement == "no companion"
+    star = {
+        parameters[k].name: (float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k])))
+        for k in parameters.nuisance
+    }
+    for name, (value, error) in (result.star_alone() if alone else star).items():
         label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
-        value, error = float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k]))
         if name == "diameter_mas" and value < UNRESOLVED * error:
             bound = value + UNRESOLVED * error
             shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
         else:
-            shown = f"{value:.4f} +/- {error:.4f}{unit}"
+            shown = f"{value:.4f} +/- {error:.4f}{unit}{' (star alone)' if alone else ''}"
         lines.append(row(label, shown))
     return lines
 
