@@ -145,24 +145,30 @@ def choose_field(
     if farthest <= outer:
         return (inner, outer), None
     step = fringe / COARSE_STEPS_PER_FRINGE
+    within, beyond = make_grid(inner, outer, step), make_grid(outer, farthest, step)
     single = fit_single(still)[0]
-    within = _gains(still, make_grid(inner, outer, step), single)
-    grid = make_grid(outer, farthest, step)
-    beyond = _gains(still, grid, single)
-    if not len(beyond) or not len(within):
-        return (inner, outer), None
-    best = int(beyond.argmax())
-    left = single_likelihood(still).chi2(single[None])[0] - beyond[best]
-    # Errors that are too small make the gains of noise too large in proportion.
-    least = MODE_LIMIT * max(left / still.n_independent, 1.0)
-    if beyond[best] < within.max() + max(least, NOTABLY_BETTER * within.max()):
-        return (inner, outer), None
-    place = np.array([grid.east_mas[best], grid.north_mas[best]])
+    place = _notable(still, within, beyond, single)
     box = Box(inner, farthest, fringe)
-    if not _holds(still, make_grid(inner, outer, step), single, place, box, prior):
+    if place is None or not _holds(still, within, single, place, box, prior):
         return (inner, outer), None
     separation = float(np.hypot(*place))
     return (inner, MARGIN * separation), separation
+
+
+def _notable(
+    likelihood: Likelihood, within: Grid, beyond: Grid, single: FloatArray
+) -> FloatArray | None:
+    """Place (2,), mas, outside the field that is notably better than all inside."""
+    inside, outside = (_gains(likelihood, grid, single) for grid in (within, beyond))
+    if not len(inside) or not len(outside):
+        return None
+    best = int(outside.argmax())
+    left = single_likelihood(likelihood).chi2(single[None])[0] - outside[best]
+    # Errors that are too small make the gains of noise too large in proportion.
+    least = MODE_LIMIT * max(left / likelihood.n_independent, 1.0)
+    if outside[best] < inside.max() + max(least, NOTABLY_BETTER * inside.max()):
+        return None
+    return np.array([beyond.east_mas[best], beyond.north_mas[best]])
 
 
 def _holds(
