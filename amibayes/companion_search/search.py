@@ -59,7 +59,6 @@ def search(
     Parameters
     ----------
     likelihood : Likelihood
-        With a model of one companion.
     separation_mas : (inner, outer), optional
         Annulus that is searched; by default `default_separation`.
     known : (n, n_dim) float array, optional
