@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.errors import UsageError
-from amibayes.support.options import COMPANIONS, EXTRACTION_METHODS, OBSERVABLES, SEED
+from amibayes.support.options import (
+    COMPANIONS,
+    EXTRACTION_METHODS,
+    OBSERVABLES,
+    SEED,
+    SKY_MODELS,
+)
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
@@ -355,6 +361,18 @@ def companion_counts(text: str) -> tuple[int, ...]:
     if not set(counts) <= {str(n) for n in COMPANIONS} or len(set(counts)) != len(counts):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list out of 0,1,2")
     return tuple(sorted(int(c) for c in counts))
+
+
+def sky_models(text: str) -> tuple[str, ...]:
+    """Parse ``star,companion,ring``: models of the sky, once each."""
+    names = tuple(text.split(","))
+    unknown = [n for n in names if not set(n.split("+")) <= set(SKY_MODELS)]
+    if unknown or len(set(names)) != len(names):
+        listed = ",".join(SKY_MODELS)
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no list out of {listed}, or of some joined as ring+companion"
+        )
+    return names
 
 
 def prior_setting(text: str) -> PriorSetting:

@@ -132,7 +132,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
 
 def _names(options: LimitsOptions) -> list[str]:
     """List the files of a run."""
-    from amibayes.plots.pictures import limits_picture_names
+    from amibayes.plots.contrast_curve import limits_picture_names
 
     return [RESULT, TABLE, *limits_picture_names(options.criterion)]
 
@@ -185,7 +185,7 @@ def _measure(
 
 
 def _write(report: LimitsReport, content: object, folder: Path) -> None:
-    from amibayes.plots.pictures import save_limits_pictures
+    from amibayes.plots.contrast_curve import save_limits_pictures
     from amibayes.report import write_limits_table
     from amibayes.support.atomic_files import write_json
 

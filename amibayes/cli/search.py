@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
-from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS
+from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS, SKY_MODELS
 
 if TYPE_CHECKING:
     from amibayes.parallel import Journals
@@ -21,6 +21,7 @@ EXAMPLES = """examples:
   amibayes search target.oifits --cal cal*.oifits
   amibayes search epoch1.oifits epoch2.oifits --separation 50:400 --observables cp
   amibayes search pionier.oifits --diameter free --separation 1:50 --out axcir
+  amibayes search target.oifits --models star,companion,ring,crescent
   amibayes search --batch targets.ecsv --workers 4
 """
 
@@ -75,6 +76,14 @@ def _add_comparison(group: argparse._ArgumentGroup) -> None:
         metavar="0,1,2",
         help="numbers of companions whose evidences are compared; 2 searches for a second one and "
         "fits both (default: 0,1 with the posterior)",
+    )
+    group.add_argument(
+        "--models",
+        type=common.sky_models,
+        metavar="LIST",
+        help="models of the sky that are compared, with the confusion matrix of the data: out of "
+        f"{', '.join(SKY_MODELS)}, or some joined as ring+companion (default: star,companion, "
+        "without the confusion matrix)",
     )
     group.add_argument(
         "--evidence-method",
@@ -168,6 +177,7 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
         posterior=not arguments.no_posterior,
         limits=not arguments.no_limits,
         companions=arguments.companions,
+        models=arguments.models,
         bootstrap=arguments.bootstrap,
         evidence_method=arguments.evidence_method,
         prior=tuple(arguments.prior),

@@ -124,6 +124,12 @@ def hypotheses(names: Iterable[str]) -> tuple[Hypothesis, ...]:
     return found
 
 
+def extended_names(models: Iterable[str]) -> set[str]:
+    """Names of the parameters of extended light in some models, without their unit."""
+    parts = [EXTENDED[p] for one in hypotheses(models) for p in one.surroundings]
+    return {p.name.removesuffix("_mas") for part in parts for p in part.parameters}
+
+
 def prior_of(
     likelihood: Likelihood, base: Prior, star: Sequence[str], settings: Iterable[PriorSetting] = ()
 ) -> Prior:

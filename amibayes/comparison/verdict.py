@@ -177,7 +177,9 @@ def choose(
         if not choice.made(share):
             continue
         p, rival = _confused(choice, log, confusion)
-        if p > MAX_CONFUSION:
+        # With few draws p is never smaller: then one of them has to look as much like it.
+        least = 1.0 / (1.0 + (confusion.n_draws if confusion else 0))
+        if p > max(MAX_CONFUSION, least):
             refused = f"{p:.0%} of the data sets simulated with {rival} look as much like {name}"
             continue
         because = _because(name, choice, models, share, p, rival)

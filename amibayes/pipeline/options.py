@@ -99,6 +99,9 @@ class SearchOptions:
     companions : tuple of int, optional
         Numbers of companions (0, 1, 2) whose evidences are compared; by default 0 and 1
         where the posterior is sampled.
+    models : tuple of str, optional
+        Models of the sky that are compared (`amibayes.support.options.SKY_MODELS`), with the
+        confusion matrix of the data; None for the evidence of companions alone.
     evidence_method : {"direct", "laplace", "nested"}
         See `amibayes.posterior.evidence`.
     prior : tuple of PriorSetting
@@ -142,6 +145,7 @@ class SearchOptions:
     posterior: bool = True
     limits: bool = True
     companions: tuple[int, ...] | None = None
+    models: tuple[str, ...] | None = None
     evidence_method: str = EVIDENCE_METHODS[0]
     prior: tuple[PriorSetting, ...] = ()
     seed: int = SEED

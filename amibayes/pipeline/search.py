@@ -22,6 +22,7 @@ from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
+from amibayes.pipeline.models import compare_stage, extended_settings
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
@@ -90,8 +91,11 @@ def search_companion(
         tests = _tested(ready, found, options, rng, run)
         limits = _limits(found, tests, options, rng["limits"], run)
         posterior = _inferred(ready, found, options, rng, run, (chain, resume))
+        prior = _prior(found.result, options)
+        models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
     return replace(
         _report(options, ready, found, tests, limits, posterior),
+        models=models,
         targets=tuple(str(p) for p in targets),
         calibrators=tuple(str(p) for p in calibrators),
         timing_s=run.seconds,
@@ -101,7 +105,8 @@ def search_companion(
 def _streams(seed: int) -> Streams:
     """Independent random numbers for every stage that draws some."""
     first = ("significance", "posterior", "limits", "calibration", "evidence", "second")
-    stages = (*first, "verdict", "bootstrap")  # new ones at the end: the others keep their numbers
+    # New ones at the end: the others keep their numbers.
+    stages = (*first, "verdict", "bootstrap", "models")
     seeds = np.random.SeedSequence(seed).spawn(len(stages))
     return {s: np.random.default_rng(k) for s, k in zip(stages, seeds, strict=True)}
 
@@ -284,7 +289,8 @@ def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference)
 def _prior(result: SearchResult, options: SearchOptions) -> Prior:
     likelihood = result.likelihood
     prior = default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas)
-    return edit_prior(prior, options.prior, single_likelihood(likelihood).parameters.names)
+    settings, _ = extended_settings(options)
+    return edit_prior(prior, settings, single_likelihood(likelihood).parameters.names)
 
 
 def _counts(options: SearchOptions) -> tuple[int, ...]:

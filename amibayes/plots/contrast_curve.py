@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,8 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import Companion
+from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
+from amibayes.pipeline.limits import NAMES, LimitsReport
 from amibayes.plots.style import (
     BLACK,
     DASHES,
@@ -21,9 +25,10 @@ from amibayes.plots.style import (
     SERIES,
     VERMILLION,
     new_figure,
+    save,
     styled,
 )
-from amibayes.units import BoolArray, FloatArray
+from amibayes.units import BoolArray, FloatArray, contrast_to_delta_mag
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,3 +238,57 @@ def _contrast_text(delta_mag: float, _: object) -> str:
         return mantissa
     power = f"10$^{{{int(exponent)}}}$"
     return power if mantissa == "1" else f"{mantissa}×{power}"
+
+
+def completeness_picture(limits: Limit) -> Figure:
+    """Draw the completeness map of a limit by injection."""
+    cells = limits.cells()
+    assert cells is not None
+    magnitude, share = np.array(cells["delta_mag"]), np.array(cells["completeness"])
+    low, high = float(magnitude.min()), float(magnitude.max())
+    regular = np.linspace(low, high, 60)
+    fraction = np.array(
+        [
+            np.interp(regular, mag, s, left=np.nan, right=np.nan)
+            for mag, s in zip(magnitude[:, ::-1], share[:, ::-1], strict=True)
+        ]
+    )
+    return completeness_map(
+        limits.separation_mas,
+        regular,
+        fraction,
+        c50=limits.columns()["delta_mag_50"],
+        c95=limits.delta_mag,
+    )
+
+
+def limits_picture_names(method: str) -> list[str]:
+    """List the files that `save_limits_pictures` will write."""
+    return ["limits.png", "completeness.png"] if method == "injection" else ["limits.png"]
+
+
+def save_limits_pictures(report: LimitsReport, folder: Path) -> None:
+    """Draw the curves of all limits, and the completeness map of the main one."""
+    save(limits_picture(report), folder / "limits.png")
+    if report.main.limit.cells() is not None:
+        save(completeness_picture(report.main.limit), folder / "completeness.png")
+
+
+def limits_picture(report: LimitsReport) -> Figure:
+    """Draw all limits in one picture, with their spread over the position angle."""
+    curves = {}
+    for measured in report.limits:
+        limit = measured.limit
+        low, _, high = contrast_to_delta_mag(limit.spread).T
+        curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
+            limit.delta_mag, low, high, limit.by_detection
+        )
+    tested, main = report.main.significance, report.main.result
+    found = main.companion if tested is not None and tested.detected else None
+    return limits_plot(
+        report.main.limit.separation_mas,
+        curves,
+        found,
+        fringe_mas=resolution_mas(main.likelihood),
+        masses=report.options.masses,
+    )

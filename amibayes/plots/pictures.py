@@ -6,19 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.residuals_by_file import file_residuals
-from amibayes.limits.limit import Limit
-from amibayes.pipeline.limits import NAMES, LimitsReport
+from amibayes.comparison.compare import ModelComparison
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.plots.by_file import file_residuals_plot
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
-from amibayes.plots.contrast_curve import Curve, completeness_map, limits_plot
+from amibayes.plots.contrast_curve import Curve, completeness_picture, limits_plot
 from amibayes.plots.corner_plot import corner_plot
 from amibayes.plots.coverage import coverage_plot
 from amibayes.plots.fit import fit_plot
@@ -29,6 +27,13 @@ from amibayes.plots.maps import (
     probability_maps,
     save_maps_fits,
     sky_map,
+)
+from amibayes.plots.models import (
+    model_corner,
+    model_images,
+    model_odds,
+    model_residuals,
+    model_visibilities,
 )
 from amibayes.plots.null_plot import null_plot
 from amibayes.plots.residual_corr import correlation_plot
@@ -50,7 +55,7 @@ class Stages:
         Whether several files are fitted together.
     calibrated : bool
         Whether calibrators were given.
-    significance, posterior, limits : bool
+    significance, posterior, limits, models : bool
         Whether these stages are run.
     """
 
@@ -59,13 +64,16 @@ class Stages:
     significance: bool = False
     posterior: bool = False
     limits: bool = False
+    models: bool = False
 
     @classmethod
     def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Stages:
         """Those of a run that has yet to begin."""
         tested = options.null_draws != 0
         limits = options.limits and tested
-        return cls(several, calibrated, tested, options.posterior, limits)
+        return cls(
+            several, calibrated, tested, options.posterior, limits, options.models is not None
+        )
 
     @classmethod
     def of(cls, report: SearchReport) -> Stages:
@@ -76,6 +84,7 @@ class Stages:
             report.significance is not None,
             report.posterior is not None,
             report.limits is not None,
+            report.models is not None,
         )
 
 
@@ -221,9 +230,14 @@ def _limits(report: SearchReport) -> Figure:
     return limits_plot(limits.separation_mas, curves, found, fringe_mas=fringe)
 
 
-def _completeness(report: SearchReport) -> Figure:
-    assert report.limits is not None
-    return completeness_picture(report.limits)
+def _of_models(draw: Callable[[ModelComparison], Figure]) -> Callable[[SearchReport], Figure]:
+    """Draw the comparison of models of a report."""
+
+    def drawn(report: SearchReport) -> Figure:
+        assert report.models is not None
+        return draw(report.models)
+
+    return drawn
 
 
 PICTURES = (
@@ -331,62 +345,51 @@ PICTURES = (
         "Share of injected companions that the search recovers, for each separation and "
         "magnitude difference.",
         "limits",
-        _completeness,
+        lambda report: completeness_picture(report.limits),  # type: ignore[arg-type]
         lambda run: run.limits,
+    ),
+    Picture(
+        "models_images",
+        "Models of the sky",
+        "The best fit of each model without its star, on one scale, north up and east left, "
+        "with the beam in the lower left corner.",
+        "models",
+        _of_models(model_images),
+        lambda run: run.models,
+    ),
+    Picture(
+        "models_odds",
+        "Odds and confusion",
+        "Evidence of each model below that of the most probable one, and what data simulated "
+        "from each model are taken for.",
+        "models",
+        _of_models(model_odds),
+        lambda run: run.models,
+    ),
+    Picture(
+        "models_visibilities",
+        "Data and models",
+        "Squared visibilities against the position angle of the baseline, and closure phases, "
+        "with the best fit of each model.",
+        "models",
+        _of_models(model_visibilities),
+        lambda run: run.models,
+    ),
+    Picture(
+        "models_residuals",
+        "Residuals of each model",
+        "What the best fit of each model leaves, in units of the errors.",
+        "models",
+        _of_models(model_residuals),
+        lambda run: run.models,
+    ),
+    Picture(
+        "models_corner",
+        "Posterior of the most probable model",
+        "Marginal distributions of its parameters, one by one and in pairs; fluxes as logarithms.",
+        "models",
+        _of_models(model_corner),
+        lambda run: run.models,
     ),
 )
 """The pictures of a search, in the order of the report: a new one is one more line here."""
-
-
-def completeness_picture(limits: Limit) -> Figure:
-    """Draw the completeness map of a limit by injection."""
-    cells = limits.cells()
-    assert cells is not None
-    magnitude, share = np.array(cells["delta_mag"]), np.array(cells["completeness"])
-    low, high = float(magnitude.min()), float(magnitude.max())
-    regular = np.linspace(low, high, 60)
-    fraction = np.array(
-        [
-            np.interp(regular, mag, s, left=np.nan, right=np.nan)
-            for mag, s in zip(magnitude[:, ::-1], share[:, ::-1], strict=True)
-        ]
-    )
-    return completeness_map(
-        limits.separation_mas,
-        regular,
-        fraction,
-        c50=limits.columns()["delta_mag_50"],
-        c95=limits.delta_mag,
-    )
-
-
-def limits_picture_names(method: str) -> list[str]:
-    """List the files that `save_limits_pictures` will write."""
-    return ["limits.png", "completeness.png"] if method == "injection" else ["limits.png"]
-
-
-def save_limits_pictures(report: LimitsReport, folder: Path) -> None:
-    """Draw the curves of all limits, and the completeness map of the main one."""
-    save(limits_picture(report), folder / "limits.png")
-    if report.main.limit.cells() is not None:
-        save(completeness_picture(report.main.limit), folder / "completeness.png")
-
-
-def limits_picture(report: LimitsReport) -> Figure:
-    """Draw all limits in one picture, with their spread over the position angle."""
-    curves = {}
-    for measured in report.limits:
-        limit = measured.limit
-        low, _, high = contrast_to_delta_mag(limit.spread).T
-        curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
-            limit.delta_mag, low, high, limit.by_detection
-        )
-    tested, main = report.main.significance, report.main.result
-    found = main.companion if tested is not None and tested.detected else None
-    return limits_plot(
-        report.main.limit.separation_mas,
-        curves,
-        found,
-        fringe_mas=resolution_mas(main.likelihood),
-        masses=report.options.masses,
-    )

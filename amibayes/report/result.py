@@ -32,6 +32,7 @@ from amibayes.report.common import (
 )
 from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
 from amibayes.report.limits import limits_json
+from amibayes.report.models import models_json
 from amibayes.units import contrast_to_delta_mag
 
 QUANTITIES = (
@@ -77,6 +78,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "evidence": None
         if report.evidence is None
         else evidence_json(report.evidence, report.second_significance),
+        **models_json(report.models, report.evidence),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
     } | ({"residuals": residuals_json(report)} if is_joint(report) else {})

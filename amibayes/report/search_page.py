@@ -11,6 +11,7 @@ from typing import Any
 
 from amibayes.plots.pictures import PICTURES
 from amibayes.report import fit_sections
+from amibayes.report.models import models_section
 from amibayes.report.noise_section import noise
 from amibayes.report.page import (
     Column,
@@ -219,6 +220,7 @@ SECTIONS: dict[str, Callable[[Json], Section | None]] = {
     "significance": fit_sections.significance,
     "posterior": fit_sections.posterior,
     "evidence": fit_sections.evidence,
+    "models": models_section,
     "limits": fit_sections.limits,
 }
 """The sections of the report in their order, by the name that `Picture.section` gives.

@@ -13,6 +13,7 @@ from amibayes.pipeline.report_types import SearchReport
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
+from amibayes.report.models import models_lines
 from amibayes.report.result import upper_limit
 from amibayes.support.terminal import row, with_warnings
 
@@ -49,6 +50,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     if report.evidence is not None:
         lines += _evidence_lines(report.evidence)
         lines += _second_lines(report, report.evidence)
+    lines += models_lines(report.models)
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")

@@ -28,7 +28,7 @@ from amibayes.report import result_json
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = [p for p in sorted(DOCS.rglob("*.md")) if not p.relative_to(DOCS).parts[0].startswith("_")]
-FREE_FORM = {"convergence", "prior", "timing_s"}
+FREE_FORM = {"convergence", "prior", "timing_s", "parameters", "confusion"}
 """Objects of result.json whose keys are parameters of the model, or stages."""
 
 

@@ -1,0 +1,70 @@
+"""The stage that compares models of the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from amibayes.companion_search.field import default_separation
+from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
+from amibayes.comparison.hypotheses import extended_names
+from amibayes.data.observables import Observables
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.pipeline.field import FieldSearch, noise_prior
+from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.run import Run
+from amibayes.posterior.priors import Prior, PriorSetting
+from amibayes.support.options import SAMPLERS
+
+
+def compare_stage(
+    observables: Observables,
+    found: FieldSearch,
+    prior: Prior,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    run: Run,
+) -> ModelComparison | None:
+    """Compare the models that were asked for; None where none were.
+
+    Residuals of Student's t distribution keep the noise that the robust search has.
+    """
+    if options.models is None:
+        return None
+    used = observables.only(options.observables)
+    fitted = options.extra_noise and not options.robust
+    noise = NoiseSetting(
+        found.noise,
+        noise_prior(used, options) if fitted else None,
+        per_file=options.file_noise is not False,
+    )
+    method = options.evidence_method if options.evidence_method in SAMPLERS else "direct"
+    with run.stage("models"):
+        return compare_sky_models(
+            found.result,
+            prior,
+            rng,
+            models=options.models,
+            stated=used if fitted else None,
+            noise=noise,
+            settings=extended_settings(options)[1],
+            method=method,
+            default_field=_default_field(found, options),
+            progress=run.progress,
+        )
+
+
+def _default_field(found: FieldSearch, options: SearchOptions) -> tuple[float, float] | None:
+    """The default field, where the search went past it by itself."""
+    if options.separation_mas is not None:
+        return None
+    inner, outer = default_separation(Likelihood(found.result.likelihood.observables))
+    return (inner, outer) if found.result.grid.outer_mas > 1.01 * outer else None
+
+
+def extended_settings(
+    options: SearchOptions,
+) -> tuple[tuple[PriorSetting, ...], tuple[PriorSetting, ...]]:
+    """Split settings of priors into those of companions and star, and of extended light."""
+    names = extended_names(options.models or ())
+    mine = tuple(s for s in options.prior if s.name.removesuffix("_mas") in names)
+    return tuple(s for s in options.prior if s not in mine), mine
