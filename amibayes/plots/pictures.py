@@ -13,13 +13,12 @@ from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.comparison.compare import ModelComparison
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
-from amibayes.plots.by_file import file_residuals_plot
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_picture, limits_plot
 from amibayes.plots.corner_plot import corner_plot
 from amibayes.plots.coverage import coverage_plot
-from amibayes.plots.fit import fit_plot
+from amibayes.plots.fit import file_residuals_plot, fit_plot
 from amibayes.plots.maps import (
     detection_map,
     false_alarm_map,
