@@ -11,6 +11,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.units import FloatArray
 
 NIRISS_HOLES = np.array(
     [
@@ -71,3 +72,10 @@ def error_of(capsys: pytest.CaptureFixture[str]) -> str:
     assert len(lines) == 1, captured.err
     assert lines[0].startswith("amibayes")
     return lines[0]
+
+
+def numerical_gradient(likelihood: Likelihood, theta: FloatArray, step: FloatArray) -> FloatArray:
+    """Gradient of the log-likelihood by central differences of a step (n_dim,)."""
+    shifted = theta + np.vstack([np.diag(step), -np.diag(step)])
+    plus, minus = np.split(likelihood.log_prob(shifted), 2)
+    return np.asarray((plus - minus) / (2 * step))

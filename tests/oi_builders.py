@@ -32,6 +32,18 @@ def table(name: str, columns: dict[str, tuple[str, Any, str]], **keywords: Any) 
     return hdu
 
 
+def keywords(array: str, date: str) -> dict[str, dict[str, Any]]:
+    """Keywords of the tables of a file of version 1."""
+    common = {"OI_REVN": 1, "DATE_OBS": date, "ARRNAME": array, "INSNAME": "I"}
+    return {
+        "OI_TARGET": {"OI_REVN": 1},
+        "OI_ARRAY": {"OI_REVN": 1, "ARRNAME": array, "FRAME": "SKY"},
+        "OI_WAVELENGTH": {"OI_REVN": 1, "INSNAME": "I"},
+        "OI_VIS2": dict(common),
+        "OI_T3": dict(common),
+    }
+
+
 class HandMade:
     """A version 1 file of 4 stations, 3 channels and one exposure, to be changed at will.
 
@@ -92,14 +104,7 @@ class HandMade:
                 "FLAG": ("3L", np.zeros((4, 3), bool), ""),
             },
         }
-        common = {"OI_REVN": 1, "DATE_OBS": "2014-12-09", "ARRNAME": "X", "INSNAME": "I"}
-        self.keywords: dict[str, dict[str, Any]] = {
-            "OI_TARGET": {"OI_REVN": 1},
-            "OI_ARRAY": {"OI_REVN": 1, "ARRNAME": "X", "FRAME": "SKY"},
-            "OI_WAVELENGTH": {"OI_REVN": 1, "INSNAME": "I"},
-            "OI_VIS2": dict(common),
-            "OI_T3": dict(common),
-        }
+        self.keywords = keywords("X", "2014-12-09")
         self.more: list[Any] = []
 
     @staticmethod
@@ -224,14 +229,7 @@ class MaskFile:
                 "FLAG": (flag, np.zeros((n_triples * n_exposures, n_channels), bool), ""),
             },
         }
-        common = {"OI_REVN": 1, "DATE_OBS": "2017-05-17", "ARRNAME": "SAM", "INSNAME": "I"}
-        self.keywords: dict[str, dict[str, Any]] = {
-            "OI_TARGET": {"OI_REVN": 1},
-            "OI_ARRAY": {"OI_REVN": 1, "ARRNAME": "SAM", "FRAME": "SKY"},
-            "OI_WAVELENGTH": {"OI_REVN": 1, "INSNAME": "I"},
-            "OI_VIS2": dict(common),
-            "OI_T3": dict(common),
-        }
+        self.keywords = keywords("SAM", "2017-05-17")
         self.more: list[Any] = []
 
     put = HandMade.put

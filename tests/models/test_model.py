@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers import NIRISS_HOLES, niriss, simulated
+from helpers import NIRISS_HOLES, niriss, numerical_gradient, simulated
 
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
@@ -90,10 +90,7 @@ def test_gradient_against_finite_differences(model, theta, rng) -> None:
     likelihood = Likelihood(data, model)
     theta = np.array(theta)
     _, gradient = likelihood.log_prob_and_gradient(theta[None])
-    step = 1e-5 * np.maximum(np.abs(theta), 0.01)
-    shifted = theta + np.vstack([np.diag(step), -np.diag(step)])
-    plus, minus = np.split(likelihood.log_prob(shifted), 2)
-    numerical = (plus - minus) / (2 * step)
+    numerical = numerical_gradient(likelihood, theta, 1e-5 * np.maximum(np.abs(theta), 0.01))
     np.testing.assert_allclose(
         gradient[0], numerical, rtol=2e-5, atol=1e-5 * np.abs(numerical).max()
     )
