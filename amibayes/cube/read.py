@@ -232,9 +232,11 @@ def _companions(hdus: Any, science: Any, source: str) -> dict[str, Any]:
     for hdu in hdus:
         if hdu.name not in ("ERR", "DQ") or hdu.name in found:
             continue
-        if not hdu.is_image or hdu.shape != science.shape:
+        # An extension of no known kind, as a damaged file has them, has no shape.
+        shape = getattr(hdu, "shape", "of no image")
+        if not hdu.is_image or shape != science.shape:
             raise DataError(
-                f"{hdu.name} has the shape {hdu.shape}, the images {science.shape}", source=source
+                f"{hdu.name} has the shape {shape}, the images {science.shape}", source=source
             )
         found[hdu.name] = hdu
     return found
@@ -316,8 +318,10 @@ def _usual_pixel_scale(instrument: str, filter: str, source: str) -> float:
 
 def _mid_times(hdus: Any, n: int, header: dict[str, Any], source: str) -> FloatArray | None:
     table = next((hdu for hdu in hdus if hdu.name == "INT_TIMES"), None)
-    if table is None or table.is_image or "int_mid_MJD_UTC" not in table.columns.names:
+    names = getattr(getattr(table, "columns", None), "names", ())  # an image has none
+    if "int_mid_MJD_UTC" not in names:
         return None
+    assert table is not None
     times = np.asarray(table.data["int_mid_MJD_UTC"], dtype=float)
     if len(times) == n:
         return times

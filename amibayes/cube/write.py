@@ -53,7 +53,7 @@ COMMENTS = {
     "DITHER_X": "[mas] true dither along x",
     "DITHER_Y": "[mas] true dither along y",
     "JITTER": "[mas] rms per axis",
-    "JITTERFR": "[mas] rms per axis of frames about the integration",
+    "JITTERFR": "[mas] rms per axis of frames in an integration",
     "ZEROREAD": "the read after the reset is kept",
     "RDNOISE": "[electron] CDS read noise",
     "FLATERR": "rms relative error of the flat",
