@@ -16,6 +16,7 @@ from amibayes.errors import UsageError
 from amibayes.support.options import PEAK_LIMIT_E, PLAN_SEPARATION_MAS, RampPreset, choices
 
 if TYPE_CHECKING:
+    from amibayes.pipeline.migration_plan import MigrationExpectation
     from amibayes.pipeline.planning import ContrastCurve, Expectation, Plan
 
 EPILOG = """examples:
@@ -124,10 +125,33 @@ def as_json(plan: Plan, expected: Expectation, magnitude: float | None) -> dict[
         "sigma_closure_phase_deg": float(np.degrees(expected.closure_phase_rad)),
         "sigma_closure_phase_photons_deg": float(np.degrees(expected.closure_phase_photons_rad)),
         "sigma_vis2": expected.vis2,
+        "charge_migration": None if expected.migration is None else _migration(expected.migration),
         "contrast_curve": _curve(expected.curve),
         "closure_phase_curve": _curve(expected.closure_curve),
         "warnings": list(plan.warnings),
     }
+
+
+def _migration(found: MigrationExpectation) -> dict[str, float | int | None]:
+    return {
+        "vis2_bias": found.left_in,
+        "vis2_bias_slopes": found.slopes,
+        "vis2_bias_ramps": found.ramps,
+        "error_per_e": found.error_per_e,
+        "best_groups": found.best_groups,
+    }
+
+
+def _migration_line(found: MigrationExpectation | None) -> list[str]:
+    """Bias that calibrators of half the brightness do not share."""
+    if found is None:
+        return []
+    ramps = "too few groups to fit" if found.ramps is None else f"{found.ramps:.2g} from ramps"
+    return [
+        f"migration       bias of V² {found.left_in:.2g} left in, {found.slopes:.2g} from slopes, "
+        f"{ramps} (calibrators of half the brightness); slopes cost least with "
+        f"{found.best_groups} groups"
+    ]
 
 
 def _curve(curve: ContrastCurve) -> dict[str, list[float]]:
@@ -163,6 +187,7 @@ def summary(plan: Plan, expected: Expectation) -> list[str]:
         f"closure phase   {degrees[0]:.4f} deg (photons alone, √1.5·N_holes/√N: "
         f"{degrees[1]:.4f} deg)",
         f"V²              {expected.vis2:.2g}",
+        *_migration_line(expected.migration),
         row("separation (mas)", curve.separation_mas),
         row("3σ, V² + closure phase (mag)", curve.delta_mag),
         row("3σ, closure phase (mag)", closures.delta_mag),

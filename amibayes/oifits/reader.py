@@ -22,6 +22,7 @@ from amibayes.oifits.setups import (
     targets_of,
     wavelength_table,
 )
+from amibayes.oifits.shared import SHARED
 from amibayes.oifits.stated import Column, Content, stated_covariance
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance
@@ -56,7 +57,7 @@ def observables_of(
     unused = tuple(
         f"{t.name or 'unnamed'} {t.extver} is not used"
         for t in oifits.unused
-        if t.name not in (RESPONSE, SCATTER)
+        if t.name not in (RESPONSE, SCATTER, SHARED)
     )
     trailing = (f"{oifits.trailing_bytes} bytes after the last table",)
     return Observables(
@@ -70,6 +71,7 @@ def observables_of(
         + (trailing if oifits.trailing_bytes else ()),
         stated.freedom,
         stated.scatter,
+        stated.shared,
     )
 
 

@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from amibayes.data.covariance import Covariance, DiagonalCovariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import CovarianceKind, Measurements
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import DataError
 from amibayes.oifits.columns import same
 from amibayes.oifits.correlations import (
@@ -25,6 +26,7 @@ from amibayes.oifits.correlations import (
     oi_corr_pairs,
 )
 from amibayes.oifits.scatter import scatter_of
+from amibayes.oifits.shared import shared_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -69,7 +71,7 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class FileCovariance:
-    """A covariance, its kind, what an estimated one rests on, and notes."""
+    """A covariance, its kind, what it rests on, notes, and what of it other files share."""
 
     covariance: Covariance
     kind: CovarianceKind
@@ -77,6 +79,7 @@ class FileCovariance:
     freedom: Freedom | None
     notes: tuple[str, ...]
     scatter: csr_array | None = None
+    shared: SharedErrors | None = None
 
 
 def stated_covariance(
@@ -113,8 +116,9 @@ def stated_covariance(
     freedom = _freedom(tables)
     index = np.concatenate([c.correlation_index for c in content.both])[~flag]
     scatter = None if freedom is None else scatter_of(oifits, tables, index, variance[~flag])
+    shared = shared_of(oifits, tables, index, variance[~flag])
     return FileCovariance(
-        covariance, written or kind, _integrations(tables), freedom, notes, scatter
+        covariance, written or kind, _integrations(tables), freedom, notes, scatter, shared
     )
 
 

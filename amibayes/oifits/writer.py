@@ -27,6 +27,7 @@ from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements
 from amibayes.oifits.off_axis import response_tables
 from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.scatter import scatter_table
+from amibayes.oifits.shared import shared_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
 from amibayes.support.atomic_files import atomic_path
@@ -81,14 +82,23 @@ def to_hdus(observables: Observables, header: Mapping[str, HeaderValue]) -> fits
     tables += [_data_table(observables, layout, grid, correlated) for grid in grids]
     if correlated:
         tables.append(_correlation_table(observables, grids))
-    if observables.scatter is not None:
-        variance, index = observables.covariance.variance, _correlation_index(observables, grids)
-        tables.append(scatter_table(observables.scatter, variance, index, CORRNAME))
+    if correlated:
+        tables += _own_tables(observables, _correlation_index(observables, grids))
     tables += response_tables(layout, observables.setups)
     seen: dict[str, int] = {}
     for table in tables:
         seen[table.name] = table.header["EXTVER"] = seen.get(table.name, 0) + 1
     return fits.HDUList([_primary(observables, layout, header), *tables])
+
+
+def _own_tables(observables: Observables, index: IntArray) -> list[fits.BinTableHDU]:
+    """What OI_CORR does not tell of a covariance, by the places ``index`` of the data in it."""
+    variance, tables = observables.covariance.variance, []
+    if observables.scatter is not None:
+        tables.append(scatter_table(observables.scatter, variance, index, CORRNAME))
+    if observables.shared is not None and observables.shared.names:
+        tables.append(shared_table(observables.shared, variance, index, CORRNAME))
+    return tables
 
 
 def _table(name: str, columns: Mapping[str, Any], extra: Mapping[str, Any], n_channels: int) -> Any:

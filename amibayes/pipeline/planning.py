@@ -23,6 +23,7 @@ from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.optics import fringe_basis
+from amibayes.pipeline.migration_plan import MigrationExpectation, expect_migration
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels
 from amibayes.simulation.slopes import electron_variance, slope_weights
@@ -73,6 +74,8 @@ class Expectation:
         From V² and closure phases with their joint covariance.
     closure_curve : ContrastCurve
         From closure phases alone.
+    migration : MigrationExpectation, optional
+        Bias by charge that passes between pixels.
     """
 
     closure_phase_rad: float
@@ -80,6 +83,7 @@ class Expectation:
     closure_phase_photons_rad: float
     curve: ContrastCurve
     closure_curve: ContrastCurve
+    migration: MigrationExpectation | None = None
 
 
 def expect(
@@ -107,7 +111,8 @@ def expect(
     UsageError
         Where the light is too faint for closure phases.
     """
-    observables = expected_observables(plan, detector or PRESETS["paper"])
+    detector = detector or PRESETS["paper"]
+    observables = expected_observables(plan, detector)
     sigma_vis2, sigma_closure = observables.errors
     if np.median(sigma_closure) > MAX_UNCERTAIN_RAD:
         raise UsageError(
@@ -122,6 +127,7 @@ def expect(
         float(photons),
         contrast_curve(observables, separation_mas),
         contrast_curve(observables.only(("cp",)), separation_mas),
+        expect_migration(plan, detector, float(np.median(sigma_vis2))),
     )
 
 

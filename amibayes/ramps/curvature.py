@@ -195,6 +195,41 @@ def curvature_of(file: RampFile) -> Curvature | None:
     return _averaged(sums, weights, file, bad)
 
 
+def expected_curvature(
+    light_e_s: FloatArray,
+    read_variance_e2: float,
+    frame_s: float,
+    n_groups: int,
+    n_integrations: int,
+    first_s: float = 0.0,
+) -> Curvature | None:
+    """What ramps without migration would say, noise left out of all but its errors.
+
+    Parameters
+    ----------
+    light_e_s : (ny, nx) array
+    read_variance_e2 : float
+        Of one read.
+    frame_s, first_s : float
+        From a read to the next, and from the reset to the first.
+    n_groups, n_integrations : int
+    """
+    timing = GroupTiming(n_groups, frame_s, frame_s, first_s=first_s)
+    m = timing.n_differences
+    if m < 3:
+        return None
+    photons = np.maximum(light_e_s * frame_s, 1e-6)
+    weights = _weights(np.arange(m), photons, read_variance_e2, timing)
+    sigma = weights.sigma.reshape(light_e_s.shape) / np.sqrt(n_integrations)
+    nothing = np.zeros((m, *light_e_s.shape))
+    moved = gains(KINDS, light_e_s, light_e_s)
+    time = float(timing.middle_s.mean())
+    return Curvature(
+        "expected", n_integrations, m, time, light_e_s, nothing[0], sigma, nothing[:0], moved,
+        nothing, weights.lag_s, 0.0, 0,
+    )  # fmt: skip
+
+
 def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) -> Curvature:
     n, count = file.n_integrations, sums.count.sum(axis=0)
     lost = bad | (count < MIN_SHARE * n)

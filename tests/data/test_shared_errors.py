@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from helpers import niriss
 from amibayes.calibration import calibrate
 from amibayes.data.observables import Observables, join
 from amibayes.data.shared_errors import SharedErrors
+from amibayes.oifits import read_oifits, write_oifits
 from amibayes.units import FloatArray
 
 
@@ -87,6 +89,19 @@ def test_calibrated_covariance_is_that_of_draws() -> None:
     ).observables
     expected = bare.covariance.dense() + 0.25 * shared.changes @ shared.changes.T
     np.testing.assert_allclose(np.diag(found.covariance.dense()), np.diag(expected), rtol=0.05)
+
+
+def test_files_keep_them(tmp_path: Path) -> None:
+    found = replace(sharing(3), covariance_kind="given")
+    write_oifits(tmp_path / "a.oifits", found)
+    again = read_oifits(tmp_path / "a.oifits")
+    assert found.shared is not None
+    assert again.shared is not None
+    assert again.shared.names == found.shared.names
+    np.testing.assert_allclose(again.shared.changes, found.shared.changes, rtol=1e-9, atol=1e-15)
+    own, expected = (o.without_shared_errors().covariance.dense() for o in (again, found))
+    np.testing.assert_allclose(own, expected, atol=1e-7 * np.abs(expected).max())
+    assert not [note for note in again.notes if "not used" in note]
 
 
 def _moved(observables: Observables, seed: int) -> Observables:

@@ -1,0 +1,84 @@
+"""The table that keeps the errors that data have in common with those of other files.
+
+It is no part of the standard; programs that do not know it pass over it. The covariance of
+OI_CORR holds these errors: what the table adds is that they are the same in other files.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+
+from amibayes.data.shared_errors import SharedErrors
+from amibayes.oifits.tables import OIFits, OITable
+from amibayes.units import FloatArray, IntArray
+
+SHARED = "AMIBAYES_SHARED"
+
+
+def shared_table(
+    shared: SharedErrors, variance: FloatArray, index: IntArray, corrname: str
+) -> fits.BinTableHDU:
+    """Lay the changes out, one row for each error and datum.
+
+    Parameters
+    ----------
+    shared : SharedErrors
+    variance : (n,) float array
+        By whose root they are divided: what is written has no unit.
+    index : (n,) int array
+        Place of each datum in OI_CORR.
+    corrname : str
+        That OI_CORR.
+    """
+    n = len(shared.names)
+    share = shared.changes / np.sqrt(variance)[:, None]
+    width = max(len(name) for name in shared.names)
+    built = [
+        fits.Column("NAME", f"{width}A", array=np.repeat(np.array(shared.names), len(index))),
+        fits.Column("INDX", "J", array=np.tile(index, n)),
+        fits.Column("CHANGE", "D", array=share.T.ravel()),
+    ]
+    table = fits.BinTableHDU.from_columns(built, name=SHARED)
+    table.header["CORRNAME"] = corrname
+    for line in (
+        "Changes of the data, in units of their errors, for one standard deviation of",
+        "errors that data of other files have too, under the same name.",
+    ):
+        table.header["COMMENT"] = line
+    return table
+
+
+def shared_of(
+    oifits: OIFits, tables: list[OITable], index: IntArray, variance: FloatArray
+) -> SharedErrors | None:
+    """Shared errors that a file holds for its unflagged data; None where it holds none.
+
+    Parameters
+    ----------
+    oifits : OIFits
+    tables : list of OITable
+        The OI_CORR in use.
+    index : (n,) int array
+        Place of each datum in it; 0 where it has none.
+    variance : (n,) float array
+    """
+    found = [t for t in oifits.tables if t.name == SHARED]
+    if len(tables) != 1 or len(found) != 1 or not (index > 0).all() or not len(found[0]):
+        return None
+    columns: Any = found[0].columns
+    if found[0].keyword("CORRNAME") != tables[0].keyword("CORRNAME"):
+        return None
+    place = np.full(max(int(columns["INDX"].max()), int(index.max())) + 1, -1)
+    place[index] = np.arange(len(index))
+    row = place[columns["INDX"]]
+    label = [str(name).strip() for name in columns["NAME"]]
+    names = tuple(dict.fromkeys(label))
+    changes = np.zeros((len(index), len(names)))
+    value = columns["CHANGE"]
+    used = (row >= 0) & np.isfinite(value)
+    column = np.array([names.index(name) for name in label])
+    changes[row[used], column[used]] = value[used] * np.sqrt(variance)[row[used]]
+    return SharedErrors(names, changes)

@@ -1,0 +1,134 @@
+"""What charge migration will do to an exposure: bias of V², and the groups that cost least.
+
+The bias that matters is what calibrators do not share: it is stated for calibrators of half the
+target's brightness, read with the same groups.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from amibayes.extraction.preparation import SMOOTH_FLOOR
+from amibayes.instrument import ChargeMigration
+from amibayes.optics import fringe_basis
+from amibayes.ramps.curvature import expected_curvature
+from amibayes.ramps.fit import fit_migration
+from amibayes.ramps.transfer import SIDES, gains
+from amibayes.simulation import Detector
+from amibayes.simulation.budget import Plan, star_channels
+from amibayes.units import FloatArray
+
+CALIBRATOR = 0.5
+"""Brightness of the calibrators that the bias is stated for, in units of the target's."""
+
+MAX_TRIED = 12
+"""Numbers of groups that are compared."""
+
+
+@dataclass(frozen=True)
+class MigrationExpectation:
+    """Rms over the baselines of the bias of V², calibrators of half the brightness.
+
+    Parameters
+    ----------
+    left_in : float
+        With migration left in.
+    slopes : float
+        Taken out of slopes with the instrument's value: what its error leaves, 1σ.
+    ramps : float, optional
+        Fitted to the ramps of this exposure alone; None with too few groups.
+    error_per_e : float, optional
+        Of the coefficient that these ramps would give.
+    best_groups : int
+        Groups with the smallest sum of squares of noise and of ``slopes``, in the same time
+        on the clock.
+    """
+
+    left_in: float
+    slopes: float
+    ramps: float | None
+    error_per_e: float | None
+    best_groups: int
+
+
+def expect_migration(
+    plan: Plan, detector: Detector, vis2_error: float
+) -> MigrationExpectation | None:
+    """Predict the bias; None where the instrument's file knows nothing of migration.
+
+    Parameters
+    ----------
+    plan : Plan
+    detector : Detector
+    vis2_error : float
+        Of the whole exposure, by photon and read noise.
+    """
+    known = plan.instrument.charge_migration
+    if known is None:
+        return None
+    per_e = float(np.sqrt((vis2_change(plan, detector) ** 2).mean())) * (1.0 - CALIBRATOR)
+    error = coefficient_error(plan, detector)
+    return MigrationExpectation(
+        known.per_e * per_e,
+        known.error * per_e,
+        None if error is None else error * per_e,
+        error,
+        best_groups(plan, known, per_e, vis2_error),
+    )
+
+
+def light_of(plan: Plan) -> FloatArray:
+    """Electrons per second (ny, nx) of the star in every pixel."""
+    basis = fringe_basis(plan.instrument, star_channels(plan.instrument))
+    image = np.asarray(basis.image())
+    side = round(float(np.sqrt(image.size)))
+    return np.asarray(plan.count_rate_e_s * image.reshape(side, side))
+
+
+def vis2_change(plan: Plan, detector: Detector) -> FloatArray:
+    """Change of V² (n_baselines,) that a coefficient of 1 per electron makes of a point source."""
+    basis = fringe_basis(plan.instrument, star_channels(plan.instrument))
+    light = light_of(plan)
+    reads = detector.n_reads(plan.n_groups)
+    middle = 0.5 * plan.options.frame_time_s * (reads + 1 - 2 * detector.zero_read)
+    moved = gains(SIDES, middle * light, light).sum(axis=0).ravel()
+    columns = np.column_stack([plan.count_rate_e_s * basis.matrix, np.ones(light.size)])
+    # As in the extraction's own fit, the envelope has the weights, not its fringes: these would
+    # halve the bias, as migration is strongest where fringes are bright.
+    envelope = np.asarray(basis.matrix[:, 0])
+    weight = 1.0 / (envelope + SMOOTH_FLOOR * envelope.max())
+    scale = np.sqrt((columns**2 * weight[:, None]).sum(axis=0))
+    normal = (columns / scale).T @ (columns / scale * weight[:, None])
+    found = np.linalg.solve(normal, (columns / scale).T @ (weight * moved)) / scale
+    n = (len(found) - 2) // 2
+    return np.asarray(2.0 * (found[1 : 1 + n] - found[0]))
+
+
+def coefficient_error(plan: Plan, detector: Detector) -> float | None:
+    """Error per electron that the ramps of this exposure leave; None with too few groups."""
+    timed = replace(detector, frame_time_s=plan.options.frame_time_s)
+    reads = timed.n_reads(plan.n_groups)
+    expected = expected_curvature(
+        light_of(plan),
+        timed.single_read_noise_e**2,
+        timed.frame_time_s,
+        reads,
+        plan.n_integrations,
+        first_s=0.0 if timed.zero_read else timed.frame_time_s,
+    )
+    return None if expected is None else fit_migration([expected]).migration.mean[1]
+
+
+def best_groups(plan: Plan, known: ChargeMigration, per_e: float, noise: float) -> int:
+    """Groups with the smallest sum of squares of noise and of what an unknown value leaves.
+
+    Noise goes with the photons that the same time on the clock collects, of which a reset takes
+    a frame from each ramp; the bias with the charge, hence with the groups.
+    """
+    n = plan.n_groups
+    tried = np.unique(np.geomspace(2, n, MAX_TRIED).round().astype(int)) if n > 2 else np.array([n])
+    share = (tried / (tried + 1.0)) / (n / (n + 1.0))
+    cost = noise**2 / share + (known.error * per_e * tried / n) ** 2
+    return int(tried[cost.argmin()])
