@@ -13,7 +13,7 @@ from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import Rows, channel_count, read_rows
-from amibayes.oifits.scatter import SCATTER
+from amibayes.oifits.scatter import SCATTER, SHARED
 from amibayes.oifits.setups import (
     DATA_TABLES,
     Target,
@@ -22,7 +22,6 @@ from amibayes.oifits.setups import (
     targets_of,
     wavelength_table,
 )
-from amibayes.oifits.shared import SHARED
 from amibayes.oifits.stated import Column, Content, stated_covariance
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance

@@ -1,6 +1,7 @@
-"""The table that keeps the covariance as the measured scatter alone has it.
+"""Tables that keep what OI_CORR does not tell of a covariance.
 
-It is no part of the standard; programs that do not know it pass over it.
+That by the measured scatter alone, and the errors in it that data of other files have too.
+They are no part of the standard; programs that do not know them pass over them.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import numpy as np
 from astropy.io import fits
 from scipy.sparse import coo_array, csr_array, triu
 
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray, IntArray
 
-SCATTER = "AMIBAYES_SCATTER"
+SCATTER, SHARED = "AMIBAYES_SCATTER", "AMIBAYES_SHARED"
 
 
 def scatter_table(
@@ -77,3 +79,69 @@ def scatter_of(
     value = columns["SCATTER"][used] * sigma[row] * sigma[column]
     half = coo_array((value, (row, column)), shape=(len(index), len(index)))
     return csr_array(half + half.T - coo_array((half.diagonal(), (range(len(index)),) * 2)))
+
+
+def shared_table(
+    shared: SharedErrors, variance: FloatArray, index: IntArray, corrname: str
+) -> fits.BinTableHDU:
+    """Lay the changes out, one row for each error and datum.
+
+    Parameters
+    ----------
+    shared : SharedErrors
+    variance : (n,) float array
+        By whose root they are divided: what is written has no unit.
+    index : (n,) int array
+        Place of each datum in OI_CORR.
+    corrname : str
+        That OI_CORR.
+    """
+    n = len(shared.names)
+    share = shared.changes / np.sqrt(variance)[:, None]
+    width = max(len(name) for name in shared.names)
+    built = [
+        fits.Column("NAME", f"{width}A", array=np.repeat(np.array(shared.names), len(index))),
+        fits.Column("INDX", "J", array=np.tile(index, n)),
+        fits.Column("CHANGE", "D", array=share.T.ravel()),
+    ]
+    table = fits.BinTableHDU.from_columns(built, name=SHARED)
+    table.header["CORRNAME"] = corrname
+    for line in (
+        "Changes of the data, in units of their errors, for one standard deviation of",
+        "errors that data of other files have too, under the same name.",
+    ):
+        table.header["COMMENT"] = line
+    return table
+
+
+def shared_of(
+    oifits: OIFits, tables: list[OITable], index: IntArray, variance: FloatArray
+) -> SharedErrors | None:
+    """Shared errors that a file holds for its unflagged data; None where it holds none.
+
+    Parameters
+    ----------
+    oifits : OIFits
+    tables : list of OITable
+        The OI_CORR in use.
+    index : (n,) int array
+        Place of each datum in it; 0 where it has none.
+    variance : (n,) float array
+    """
+    found = [t for t in oifits.tables if t.name == SHARED]
+    if len(tables) != 1 or len(found) != 1 or not (index > 0).all() or not len(found[0]):
+        return None
+    columns: Any = found[0].columns
+    if found[0].keyword("CORRNAME") != tables[0].keyword("CORRNAME"):
+        return None
+    place = np.full(max(int(columns["INDX"].max()), int(index.max())) + 1, -1)
+    place[index] = np.arange(len(index))
+    row = place[columns["INDX"]]
+    label = [str(name).strip() for name in columns["NAME"]]
+    names = tuple(dict.fromkeys(label))
+    changes = np.zeros((len(index), len(names)))
+    value = columns["CHANGE"]
+    used = (row >= 0) & np.isfinite(value)
+    column = np.array([names.index(name) for name in label])
+    changes[row[used], column[used]] = value[used] * np.sqrt(variance)[row[used]]
+    return SharedErrors(names, changes)

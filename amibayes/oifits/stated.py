@@ -25,8 +25,7 @@ from amibayes.oifits.correlations import (
     joined,
     oi_corr_pairs,
 )
-from amibayes.oifits.scatter import scatter_of
-from amibayes.oifits.shared import shared_of
+from amibayes.oifits.scatter import scatter_of, shared_of
 from amibayes.oifits.tables import OWN_KEY, OIFits, OITable
 from amibayes.support.options import ClosureCovariance
 from amibayes.units import BoolArray, FloatArray, IntArray

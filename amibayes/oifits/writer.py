@@ -26,8 +26,7 @@ from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of, printable
 from amibayes.oifits.off_axis import response_tables
 from amibayes.oifits.rows import T3, VIS2, Kind
-from amibayes.oifits.scatter import scatter_table
-from amibayes.oifits.shared import shared_table
+from amibayes.oifits.scatter import scatter_table, shared_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
 from amibayes.support.atomic_files import atomic_path
