@@ -72,7 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.support.atomic_files import output_folder, write_json
     from amibayes.units import MAS
 
-    instrument = load_instrument(arguments.instrument, arguments.filter)
+    drawn = load_instrument(arguments.instrument, arguments.filter)
+    instrument = drawn if arguments.preset == "paper" else drawn.as_built()
     plan = make_plan(
         instrument,
         magnitude=arguments.mag,

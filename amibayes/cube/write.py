@@ -20,6 +20,9 @@ DAY_S = 86400.0
 SHIFT_KEYWORDS = ("BNDSHFTX", "BNDSHFTY")
 """Displacement of pixels' sides by charge in simulated images, pixels per electron."""
 
+MAP_KEYWORDS = ("MASK_XX", "MASK_XY", "MASK_YX", "MASK_YY")
+"""Affine map of the mask in simulated images, by rows; none where it is the drawing."""
+
 COMMENTS = {
     "TELESCOP": "telescope",
     "INSTRUME": "instrument",
@@ -58,6 +61,7 @@ COMMENTS = {
     "RDNOISE": "[electron] CDS read noise",
     "FLATERR": "rms relative error of the flat",
     **dict.fromkeys(SHIFT_KEYWORDS, "[pixel/electron] shift of sides by charge, true"),
+    **dict.fromkeys(MAP_KEYWORDS, "from the mask's drawing to the mask, true"),
     "N_SRC": "sources, see the table SCENE",
 }
 

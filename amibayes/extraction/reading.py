@@ -184,7 +184,8 @@ def _pipeline_response(setup: Setup) -> OffAxisResponse | None:
     if setup.station_xyz_m is None:
         return None
     try:
-        instrument = load_instrument(str(header.get("INSTRUME")), str(header.get("FILTER")))
+        drawn = load_instrument(str(header.get("INSTRUME")), str(header.get("FILTER")))
+        instrument = drawn.as_built()  # as the pipeline's model of the fringes is
         orientation = orientation_of(header, setup.source)
     except (UsageError, DataError):
         return None

@@ -191,6 +191,14 @@ class Instrument:
         """Return the same instrument behind another mask."""
         return replace(self, mask=mask)
 
+    def as_built(self) -> Instrument:
+        """Return it with the mask where the telescope's images show it: mapped by `distortion`.
+
+        The distortion that is left is none: what is mapped once is not mapped again.
+        """
+        left = replace(self.distortion, matrix=np.eye(2))
+        return replace(self, mask=self.mask.mapped(self.distortion.matrix), distortion=left)
+
 
 @dataclass(frozen=True, eq=False)
 class _FlatInFrequency:

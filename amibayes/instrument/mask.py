@@ -143,6 +143,11 @@ class Mask:
         a = np.asarray(matrix, dtype=float)
         return replace(self, holes_m=self.holes_m @ a.T, hole_map=a @ self.hole_map)
 
+    @property
+    def is_mapped(self) -> bool:
+        """Whether the holes are under a map."""
+        return not np.array_equal(self.hole_map, np.eye(2))
+
     def redundant_pairs(self, tolerance_m: float | None = None) -> IntArray:
         """Pairs of baselines that are the same within a tolerance, up to their sign.
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from amibayes.errors import UsageError
 from amibayes.instrument import Bandpass, Channels, Instrument
 from amibayes.optics import psf
@@ -177,7 +179,7 @@ def make_plan(
     Parameters
     ----------
     instrument : Instrument
-        Mask, filter and pixel scale.
+        Mask, filter and pixel scale; `Instrument.as_built` for the telescope's own.
     magnitude, count_rate_e_s : float
         One of them: Vega magnitude in the filter, or electrons per second.
     photons, time_s : float
@@ -304,8 +306,9 @@ def peak_fractions(instrument: Instrument) -> Peaks:
     )
     known = instrument.planning
     scale = 1.0 if known is None else (known.hole_m / instrument.mask.size_m) ** 2
-    # the top of |Σ_k A_k|² / (λ² Σ_k A_k)
-    top = instrument.mask.area_m2 * scale / instrument.bandpass.pivot_m**2
+    # the top of |Σ_k A_k|² / (λ² Σ_k A_k), of holes as they are drawn
+    drawn = instrument.mask.area_m2 / abs(float(np.linalg.det(instrument.mask.hole_map)))
+    top = drawn * scale / instrument.bandpass.pivot_m**2
     return Peaks(top * instrument.pixel_scale_rad**2, middle, corner)
 
 

@@ -250,6 +250,8 @@ def blank_cube(shutter: PreparedExposure) -> Cube:
         orientation=observation.orientation,
         error=empty,
         integration_time_s=exposure.n_groups * observation.detector.frame_time_s,
+        # Only where pixels are known can another mask be told from other pixels.
+        pixels_known=observation.instrument.mask.is_mapped,
         header=exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s),
     )
 

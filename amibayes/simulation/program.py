@@ -39,6 +39,9 @@ MAX_PIXELS = 2048
 BETWEEN_S = 300.0
 """Time from the end of an exposure to the start of the next."""
 
+MASK_MAPS = ("drawn", "as built")
+"""The mask of the instrument's drawing, or under its affine map (`Instrument.as_built`)."""
+
 SCENE_TABLES = ("name", "star", "companion", "disc", "gaussian", "ring", "image")
 
 
@@ -191,12 +194,16 @@ class _Reader:
         self.instrument_name = instrument.text("name", "niriss")
         named = instrument.text("filter", _star_filter(top))
         self.filter = overrides.filter or named
+        self.preset = self.detector_table.text("preset", "paper")
+        # The paper's mask is perfect; what is realistic has the telescope's.
+        usual = MASK_MAPS[self.preset != "paper"]
+        mask_map = instrument.text("mask_map", usual, choices=MASK_MAPS)
         instrument.refuse_unknown()
         beside = Path(top.source).parent / self.instrument_name
         source = str(beside) if beside.is_file() else self.instrument_name
         self.source = source
-        self.instrument = self._loaded()
-        self.preset = self.detector_table.text("preset", "paper")
+        drawn = self._loaded()
+        self.instrument = drawn if mask_map == "drawn" else drawn.as_built()
         self.detector = _detector(self.detector_table, self.preset)
         self.errors = _errors(self.wavefront_table, self.preset)
 

@@ -9,7 +9,7 @@ from astropy.io import fits
 from astropy.time import Time
 
 from amibayes import __version__
-from amibayes.cube.write import SHIFT_KEYWORDS
+from amibayes.cube.write import MAP_KEYWORDS, SHIFT_KEYWORDS
 from amibayes.instrument import instrument_names
 from amibayes.units import MAS
 
@@ -89,6 +89,9 @@ def _truth(observation: Observation, pointings: Pointings, rate_e_s: float) -> d
         SHIFT_KEYWORDS[1]: detector.boundary_shift_y,
         "N_SRC": len(scene.components),
     }
+    mask = observation.instrument.mask
+    if mask.is_mapped:
+        header |= dict(zip(MAP_KEYWORDS, mask.hole_map.ravel().tolist(), strict=True))
     if scene.magnitude is not None:
         header["MAG"] = scene.magnitude
         header["MAGFILT"] = scene.magnitude_filter or observation.instrument.bandpass.name
