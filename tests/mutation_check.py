@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ast
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -50,7 +51,8 @@ SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
     ast.BitOr: ast.BitAnd,
 }
 SECONDS = 300
-"""Longest run of the nearest tests; a mutant that takes longer counts as noticed."""
+"""Longest run of the nearest tests, in time of a processor, which does not depend on what else the
+machine does; a mutant that takes longer counts as noticed."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,20 @@ def passes(folder: Path, tests: list[str]) -> bool:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     try:
         done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, timeout=SECONDS
+            command,
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            timeout=20 * SECONDS,  # for those that wait and do not work
+            preexec_fn=_limited,
         )
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0
+
+
+def _limited() -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
 
 
 def survives(mutant: Mutant, folders: SimpleQueue[Path]) -> bool:
@@ -174,10 +185,10 @@ def main() -> int:
                 chosen, pool.map(lambda m: survives(m, folders), chosen), strict=True
             ):
                 survivors += alive
-                if alive:
-                    text = mutant.path.read_text(encoding="utf-8").split("\n")[mutant.line - 1]
-                    where = f"{mutant.path.relative_to(ROOT)}:{mutant.line}"
-                    print(f"survives  {where}  {text.strip()}", flush=True)
+                text = mutant.path.read_text(encoding="utf-8").split("\n")[mutant.line - 1]
+                where = f"{mutant.path.relative_to(ROOT)}:{mutant.line} ({mutant.number})"
+                outcome = "survives" if alive else "noticed "
+                print(f"{outcome}  {where}  {text.strip()}", flush=True)
     print(f"{len(chosen) - survivors} of {len(chosen)} mutants noticed")
     return 0
 
