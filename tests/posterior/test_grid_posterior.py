@@ -92,6 +92,10 @@ def test_strong_companion_has_the_gaussian_of_its_fisher_matrix() -> None:
         median, low, high = grid.interval(name, 0.6827)
         assert median == pytest.approx(mode[k], abs=0.05 * sigma[k])
         assert 0.5 * (high - low) == pytest.approx(sigma[k], rel=0.05)
+    median, low, high = grid.interval("delta_mag", 0.6827)
+    in_magnitudes = 2.5 / np.log(10.0) * sigma[2] / mode[2]
+    assert median == pytest.approx(-2.5 * np.log10(mode[2]), abs=0.05 * in_magnitudes)
+    assert 0.5 * (high - low) == pytest.approx(in_magnitudes, rel=0.05)
 
 
 def test_data_that_say_nothing_leave_the_prior() -> None:
