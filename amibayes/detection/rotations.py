@@ -15,7 +15,7 @@ import numpy as np
 
 from amibayes.companion_search.scan import RunningMaximum, best_positive
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.detection.treatments import KnownErrors, Searched
+from amibayes.detection.treatments import ErrorTreatment, KnownErrors, Searched
 from amibayes.likelihood.rotation_null import RotationNull
 from amibayes.units import FloatArray, SingleArray
 
@@ -24,7 +24,7 @@ MIN_REMAINING_VARIANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Rotations:
+class Rotations(ErrorTreatment):
     """The covariance rests on integrations: null sets are other rotations of them.
 
     Parameters

@@ -69,16 +69,24 @@ class ErrorTreatment(Protocol):
         signal : (n_data, n) float array, optional
             What is in the data beside noise, whitened.
         """
-        ...
+        noise = self.noise_of(normals)
+        return self.search(bank, noise if signal is None else noise + signal)
+
+    def noise_of(self, normals: FloatArray) -> FloatArray:
+        """Noise of whitened data sets (n_data, n) out of unit normals: these as they are."""
+        return normals
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
-        """Make the same with the noise of other whitened residuals (n_data,)."""
-        ...
+        """Make the same with the noise of other whitened residuals (n_data,).
+
+        Nothing is taken from them where the noise is known, or was fitted with the search.
+        """
+        return self
 
     @property
     def null_rests_on_residuals(self) -> bool:
         """Whether null draws have another distribution where the residuals are others."""
-        ...
+        return False
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of a faint companion's contrast at places (n, 2), mas, under its noise, (n,)."""
@@ -86,10 +94,8 @@ class ErrorTreatment(Protocol):
 
 
 @dataclass(frozen=True)
-class KnownErrors:
+class KnownErrors(ErrorTreatment):
     """The covariance is what is stated, or was fitted."""
-
-    null_rests_on_residuals = False
 
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets; see `ErrorTreatment`."""
@@ -102,27 +108,13 @@ class KnownErrors:
         data = bank.project(white)
         return bank.survey(data).gain, float(data @ data)
 
-    def search_simulated(
-        self,
-        bank: TemplateBank,
-        normals: FloatArray,
-        rng: np.random.Generator,
-        signal: FloatArray | None = None,
-    ) -> Searched:
-        """Search simulated data sets; see `ErrorTreatment`."""
-        return self.search(bank, normals if signal is None else normals + signal)
-
-    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
-        """Nothing is taken from the residuals."""
-        return self
-
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""
         return bank.scan_at(np.zeros(bank.n_data), *places.T)[1]
 
 
 @dataclass(frozen=True, eq=False)
-class FreeScale:
+class FreeScale(ErrorTreatment):
     """Every group of data scatters by its own amount, which each data set tells by itself.
 
     Parameters
@@ -196,16 +188,9 @@ class FreeScale:
         rows = weight[self.groups.label] * data
         return bank.project(rows), weight, (rows * data).sum(axis=0)
 
-    def search_simulated(
-        self,
-        bank: TemplateBank,
-        normals: FloatArray,
-        rng: np.random.Generator,
-        signal: FloatArray | None = None,
-    ) -> Searched:
-        """Search data sets whose noise scatters as the data do; see `ErrorTreatment`."""
-        noise = normals * self.scale[:, None]
-        return self.search(bank, noise if signal is None else noise + signal)
+    def noise_of(self, normals: FloatArray) -> FloatArray:
+        """Noise that scatters as the data do."""
+        return normals * self.scale[:, None]
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
         """Measure the scatter in other residuals."""
@@ -228,7 +213,7 @@ PLACES_AT_ONCE = 512
 
 
 @dataclass(frozen=True, eq=False)
-class StudentScores:
+class StudentScores(ErrorTreatment):
     """Residuals follow Student's t: each is bounded, so that no outlier can dominate.
 
     What goes through the bank are the scores of `amibayes.likelihood.student.scores`, divided
@@ -240,7 +225,6 @@ class StudentScores:
     """
 
     whitening: SymmetricWhitening
-    null_rests_on_residuals = False
 
     def _scores(self, bank: TemplateBank, white: FloatArray) -> FloatArray:
         return scores(self.whitening, bank.project(white))
@@ -252,20 +236,6 @@ class StudentScores:
     def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere; see `ErrorTreatment`."""
         return KnownErrors().field(bank, self._scores(bank, white[:, None])[:, 0])
-
-    def search_simulated(
-        self,
-        bank: TemplateBank,
-        normals: FloatArray,
-        rng: np.random.Generator,
-        signal: FloatArray | None = None,
-    ) -> Searched:
-        """Search simulated data sets; see `ErrorTreatment`."""
-        return self.search(bank, normals if signal is None else normals + signal)
-
-    def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
-        """Nothing is taken from the residuals: their scale was fitted with the search."""
-        return self
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""
