@@ -21,7 +21,7 @@ RANDOM_STARTS, KNOWN_STARTS = 8, 4
 """Starting points of each simulated data set beside those of the banks: random ones, and the best
 fits to the data themselves."""
 
-QUICK = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=2)
+QUICK = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=3)
 """ln Z of simulated data is then known to 0.02 to 0.1: less than what decides."""
 
 HOPELESS = 15.0

@@ -29,6 +29,9 @@ MODE_LIMIT = 30.0
 LEAST_SHARE = 0.02
 """Every t distribution keeps so much of the draws."""
 
+ENOUGH, LEAST_POWER = 12.0, 0.02
+"""Draws that count in a fit of the mixture, in each dimension, and the least power of weights."""
+
 GOOD_ERROR, REPEATS = 0.15, 3
 """Error of ln Z below which no more draws are made: odds change by 3 at ln Z 1; and how often the
 draws may be doubled for it."""
@@ -56,7 +59,7 @@ class Effort:
     modes: int = 4096
     repeats: int = REPEATS
     centres: int = 12
-    rounds: int = 3
+    rounds: int = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +120,7 @@ class Mixture:
 
     def adapted(self, cube: FloatArray, log_weight: FloatArray) -> Mixture:
         """Fit to weighted draws, by one step of expectation and maximisation."""
-        weight = np.exp(log_weight - log_weight.max())
-        weight /= weight.sum()
+        weight = _tempered(log_weight, ENOUGH * self.model.n_dim)
         parts = self.log_parts(cube)
         belongs = np.exp(parts - log_sum(parts)) * weight
         share = belongs.sum(axis=1)
@@ -134,6 +136,22 @@ class Mixture:
             scatter[k] = _cholesky(1.2 * spread)
         share = np.maximum(share / share.sum(), LEAST_SHARE)
         return Mixture(self.model, centre, scatter, share / share.sum())
+
+
+def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+    """Weights that sum to 1, raised to the power at which enough draws count.
+
+    A mixture that is too narrow gives a few draws nearly all of the weight; fitted to these it
+    would become narrower still.
+    """
+    power, weight = 1.0, np.zeros(0)
+    while power > LEAST_POWER:
+        weight = np.exp(power * (log_weight - log_weight.max()))
+        weight /= weight.sum()
+        if 1.0 / (weight**2).sum() >= least:
+            break
+        power *= 0.7
+    return weight
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:

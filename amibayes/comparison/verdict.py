@@ -26,7 +26,8 @@ class Choice:
 
     A model that holds the group and more (a companion beside the ring) is no rival of it while it
     is less probable: light too faint to be seen is as probable as none. What remains has to
-    reach `MODEL_ODDS`. The star alone, which every model holds, is chosen from one half on.
+    reach `MODEL_ODDS`. The star alone, which every model holds, is chosen where it is the most
+    probable of them.
 
     Parameters
     ----------
@@ -57,8 +58,10 @@ class Choice:
 
     def made(self, probability: FloatArray) -> Any:
         """Whether it is chosen, (…), given probabilities (…, n_models)."""
-        mine, more = (probability[..., g].sum(axis=-1) for g in (self.group, self.holders))
-        return (mine + more >= MODEL_ODDS) & (mine >= more)
+        mine = probability[..., self.group].sum(axis=-1)
+        more = probability[..., self.holders]
+        enough = mine + more.sum(axis=-1) >= MODEL_ODDS
+        return enough & (mine >= more.max(axis=-1, initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)

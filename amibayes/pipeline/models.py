@@ -53,6 +53,31 @@ def compare_stage(
         )
 
 
+def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:
+    """Warn of what makes the comparison less than it seems."""
+    if found is None:
+        return ()
+    warnings = []
+    around = any(m.fit.hypothesis.surroundings for m in found.models)
+    if around and found.best.fit.model.likelihood.samples.off_axis is not None:
+        warnings.append(
+            "these images were extracted with a response that falls off the axis: it is known for "
+            "companions, while discs and rings are taken as seen without it (2 % at 150 mas, 10 % "
+            "at 300 mas)"
+        )
+    if found.best.p_fit < REJECTED:
+        warnings.append(
+            f"the most probable model of the sky, {found.best.name}, does not fit: chi2 is "
+            f"{found.best.chi2:.4g} for {found.best.ndof} degrees of freedom; odds between models "
+            "that do not fit mean little"
+        )
+    return tuple(warnings)
+
+
+REJECTED = 1e-3
+"""Probability of a χ² below which a model does not fit."""
+
+
 def _default_field(found: FieldSearch, options: SearchOptions) -> tuple[float, float] | None:
     """The default field, where the search went past it by itself."""
     if options.separation_mas is not None:

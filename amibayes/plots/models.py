@@ -61,7 +61,10 @@ def model_images(found: ModelComparison) -> Figure:
     """
     beam = 0.5 * resolution_mas(found.models[0].fit.model.likelihood)
     sources = [sources_of(m) for m in found.models]
-    reach = max([beam * 3.0, *(1.2 * _extent(*s) for s in sources)])
+    shares = found.probability
+    # The scale is that of models that count; what lies outside of it is told in words.
+    extents = np.array([_extent(*s) for s in sources])
+    reach = max(3.0 * beam, 1.3 * float(extents[shares > 0.01].max(initial=0.0)))
     grid = np.linspace(-reach, reach, PIXELS)
     images = [_blurred(grid, *s, beam) for s in sources]
     brightest = max(float(i.max()) for i in images) or 1.0
@@ -71,9 +74,9 @@ def model_images(found: ModelComparison) -> Figure:
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for ax in axes.ravel()[len(images) :]:
         ax.axis("off")
-    shares = found.probability
     scale = PowerNorm(0.5, 0.0, brightest)
-    for ax, model, image, share in zip(axes.ravel(), found.models, images, shares, strict=False):
+    each = zip(axes.ravel(), found.models, images, shares, extents, strict=False)
+    for ax, model, image, share, extent in each:
         drawn = ax.imshow(
             image,
             origin="lower",
@@ -84,6 +87,9 @@ def model_images(found: ModelComparison) -> Figure:
         drawn_over = {"color": "white", "mec": BLACK, "ms": 10, "ls": ""}
         # imshow puts the first column at the left: east is there.
         ax.plot(0.0, 0.0, "*", **drawn_over)
+        if extent > 1.2 * reach:
+            far = f"light out to {extent:.0f} mas"
+            ax.text(0.5, 0.9, far, color="white", ha="center", transform=ax.transAxes)
         ax.add_patch(Circle((0.8 * reach, -0.8 * reach), 0.5 * beam, fill=False, ec="white"))
         ax.set_title(f"{model.name}: {_percent(share)}\nχ² {model.chi2:.4g}, {model.ndof} dof")
     for ax in axes[-1]:
