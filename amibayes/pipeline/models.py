@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from amibayes.companion_search.field import default_separation
@@ -11,6 +13,7 @@ from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Run
 from amibayes.posterior.priors import Prior, PriorSetting
 from amibayes.support.options import SAMPLERS
@@ -51,6 +54,12 @@ def compare_stage(
             default_field=_default_field(found, options),
             progress=run.progress,
         )
+
+
+def with_models(report: SearchReport, found: ModelComparison | None) -> SearchReport:
+    """Put a comparison of models, and what is to be warned of, in a report."""
+    warnings = (*report.warnings, *models_warnings(found))
+    return replace(report, models=found, warnings=warnings)
 
 
 def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
-from amibayes.pipeline.models import compare_stage, extended_settings, models_warnings
+from amibayes.pipeline.models import compare_stage, extended_settings, with_models
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
@@ -95,9 +95,7 @@ def search_companion(
         models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
     report = _report(options, ready, found, tests, limits, posterior)
     return replace(
-        report,
-        models=models,
-        warnings=(*report.warnings, *models_warnings(models)),
+        with_models(report, models),
         targets=tuple(str(p) for p in targets),
         calibrators=tuple(str(p) for p in calibrators),
         timing_s=run.seconds,
