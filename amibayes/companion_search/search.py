@@ -122,8 +122,9 @@ def _refuse_underdetermined(likelihood: Likelihood) -> None:
 
 def _grid(likelihood: Likelihood, box: Box) -> Grid:
     """Positions of the field, as many per fringe as can be afforded."""
-    patches = np.pi * (box.outer_mas**2 - box.inner_mas**2) / box.fringe_mas**2
     with np.errstate(all="ignore"):  # a damaged baseline may be of any length
+        edges = np.array([box.inner_mas, box.outer_mas]) / box.fringe_mas
+        patches = np.pi * (edges[1] ** 2 - edges[0] ** 2)
         steps = np.sqrt(AFFORDABLE_WORK / likelihood.n_independent / patches)
     step = box.fringe_mas / float(np.clip(np.nan_to_num(steps), MIN_STEPS, MAX_STEPS))
     finest = step / rates_per_axis(likelihood)
