@@ -220,7 +220,27 @@ def residual_share(path: str) -> str:
     return f", whose fits leave {100.0 * share:.1f} % of the image"
 
 
+def _has_kernel_phases(contents: Contents) -> bool:
+    return "KP-DATA" in contents.names
+
+
+def _kernel_phases(
+    paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
+) -> list[Observables]:
+    """Refuse KPFITS (Kammerer et al. 2022), whose images would be taken for those of a mask."""
+    contents = contents_of(paths[0])
+    shapes = dict(zip(contents.names, contents.shapes, strict=True))
+    size = (shapes.get("KER-MAT") or ("?", "?"))[:2]
+    raise DataError(
+        f"holds kernel phases (KPFITS): {size[0]} sums over {size[1]} baselines each, where "
+        "amibayes takes V² and phases of three baselines that close",
+        source=paths[0],
+        remedy="give the images of a mask (calints) or OIFITS; fouriever fits kernel phases",
+    )
+
+
 FORMATS: tuple[InputFormat, ...] = (
+    InputFormat("kernel phases (KPFITS)", _has_kernel_phases, _kernel_phases),
     InputFormat("JWST stage-3 product", _is_product, _products),
     InputFormat("fitted images", _is_fitted_image, _fitted_images),
     InputFormat("image cube", _is_cube, _extracted),
