@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from amibayes.errors import DataError
-from amibayes.instrument import header_rules
+from amibayes.instrument import HeaderRules
 from amibayes.scene.orientation import Orientation, orientation_of_matrix
 from amibayes.units import DEGREE, MAS, FloatArray
 
@@ -49,20 +49,41 @@ def text(header: Header, key: str) -> str | None:
     return value or None
 
 
-def check_mask(header: Header, source: str) -> None:
+SPECTRAL = ("WAVE", "AWAV", "FREQ", "LAMBDA", "WAVELENGTH")
+"""CTYPE3 of cubes whose third axis is the wavelength."""
+
+
+def check_mask(header: Header, rules: HeaderRules, source: str) -> None:
     """Refuse images of a known instrument that were not taken through its mask.
 
     Raises
     ------
     DataError
-        Naming the pupil element.
+        Naming the pupil element; also where the images are one of each wavelength.
     """
-    rules = header_rules(text(header, "INSTRUME") or "")
     found = text(header, rules.mask_keyword) if rules.mask_keyword else None
     if found is not None and rules.mask_value.upper() not in found.upper():
         raise DataError(
             f"was not taken through the mask ({rules.mask_keyword} is {found})", source=source
         )
+    axis = (text(header, "CTYPE3") or "").upper()
+    if axis in SPECTRAL:
+        raise DataError(
+            f"holds an image of each wavelength (CTYPE3 is {axis}), not of each integration",
+            source=source,
+            remedy="give one slice of every exposure, with --instrument of a TOML with its "
+            "wavelengths",
+        )
+
+
+def upright_notes(header: Header, rules: HeaderRules, source: str) -> tuple[str, ...]:
+    """Say where north is taken as up in images of an instrument that turns with the sky."""
+    if rules.upright or wcs_matrix(header, source) is not None or "ROLL_REF" in header:
+        return ()
+    return (
+        f"{source}: its header does not say how the sky lies on the detector: taken as north up, "
+        "east left; give --position-angle",
+    )
 
 
 DISAGREE_RAD = 0.1 * DEGREE

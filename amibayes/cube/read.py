@@ -19,7 +19,13 @@ from amibayes.cube.container import NEVER_USED, Cube
 from amibayes.cube.ramps import RampFile
 from amibayes.cube.timing import timing_of
 from amibayes.errors import DataError
-from amibayes.instrument import instrument_names, load_instrument
+from amibayes.instrument import (
+    HeaderRules,
+    header_rules,
+    instrument_names,
+    load_instrument,
+    recognised,
+)
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import DEGREE, FloatArray
 
@@ -144,7 +150,6 @@ def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile | Ramp
     chosen = {"SCI": science} | _companions(hdus, science, source)
     _check_complete(hdus, source)
     header = _merged(hdus, science)
-    keys.check_mask(header, source)
     template = _template(header, science, given, source, _comments(hdus, science))
     n = science.shape[0] if len(science.shape) == 3 else 1
     return CubeFile(template, n, chosen, _mid_times(hdus, n, header, source))
@@ -161,7 +166,6 @@ def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> R
     _check_complete(hdus, source)
     n, groups, *shape = science.shape
     header = _merged(hdus, science)
-    keys.check_mask(header, source)
     step = keys.number(header, "TGROUP", source) or keys.number(header, "TFRAME", source)
     if groups < 2 or step is None or not step > 0.0:
         fault = f"has {groups} group in a ramp" if groups < 2 else "does not say TGROUP"
@@ -283,12 +287,17 @@ def _template(
     comments: dict[str, str],
 ) -> Cube:
     angle = given["position_angle_deg"]
+    if given["instrument"]:
+        stated, rules = given["instrument"], header_rules(given["instrument"])
+    else:
+        stated, rules = recognised(header, source)
+    keys.check_mask(header, rules, source)
     orientation = keys.orientation_of(header, source)
     if angle is not None:
         orientation = replace(orientation, position_angle_rad=angle * DEGREE)
     scale = given["pixel_scale_rad"] or keys.pixel_scale_of(header, source, comments)
-    instrument = given["instrument"] or keys.text(header, "INSTRUME")
-    filter_ = given["filter"] or keys.text(header, "FILTER")
+    instrument = stated or None
+    filter_ = given["filter"] or rules.filter_of(header, source)
     for value, option in ((instrument, "instrument"), (filter_, "filter")):
         if value is None:
             raise DataError(f"does not say its {option}", source=source, remedy=f"give --{option}")
@@ -304,9 +313,17 @@ def _template(
         header=MappingProxyType(header),
         source=source,
         bad_flags=given["bad_flags"],
-        notes=keys.orientation_notes(header, source, comments) if angle is None else (),
+        notes=() if angle is not None else _notes(header, rules, source, comments),
         pixels_known=given["pixel_scale_rad"] is not None or keys.knows_pixels(header, source),
     )
+
+
+def _notes(
+    header: dict[str, Any], rules: HeaderRules, source: str, comments: dict[str, str]
+) -> tuple[str, ...]:
+    """What is doubtful about how the image lies on the sky."""
+    upright = keys.upright_notes(header, rules, source)
+    return upright + keys.orientation_notes(header, source, comments)
 
 
 def _usual_pixel_scale(instrument: str, filter: str, source: str) -> float:

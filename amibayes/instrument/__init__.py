@@ -4,13 +4,14 @@ from amibayes.instrument.bandpass import Bandpass, Channels
 from amibayes.instrument.catalogue import (
     ChargeMigration,
     Distortion,
-    HeaderRules,
     Instrument,
     Planning,
     header_rules,
     instrument_names,
     load_instrument,
+    recognised,
 )
+from amibayes.instrument.header_rules import HeaderRules
 from amibayes.instrument.mask import Mask
 
 __all__ = [
@@ -25,4 +26,5 @@ __all__ = [
     "header_rules",
     "instrument_names",
     "load_instrument",
+    "recognised",
 ]

@@ -15,6 +15,7 @@ from astropy import constants
 
 from amibayes.errors import DataError, UsageError
 from amibayes.instrument.bandpass import Bandpass
+from amibayes.instrument.header_rules import HeaderRules, rules_of
 from amibayes.instrument.mask import SHAPES, Mask
 from amibayes.scene.spectrum import Spectrum
 from amibayes.support.toml import Section, read_toml
@@ -26,24 +27,6 @@ MAX_DISTORTION = 0.2
 """A mask whose area is changed by more belongs into another file."""
 
 _PLANCK = float(constants.h.value)
-
-
-@dataclass(frozen=True)
-class HeaderRules:
-    """What headers of an instrument's images hold beside the common keywords.
-
-    Parameters
-    ----------
-    mask_keyword, mask_value : str
-        Images were taken through the mask where the keyword holds the value; nothing is
-        checked where either is empty.
-    simulated : mapping
-        Keywords that simulated images get.
-    """
-
-    mask_keyword: str = ""
-    mask_value: str = ""
-    simulated: Mapping[str, str | float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +198,49 @@ def instrument_names() -> list[str]:
     return sorted(path.stem for path in _own_folder().glob("*.toml"))
 
 
+def recognised(header: Mapping[str, Any], source: str) -> tuple[str, HeaderRules]:
+    """Find the instrument of a header among those of the package, by the rules of their files.
+
+    Returns
+    -------
+    str
+        INSTRUME as it is, or the name of the file where INSTRUME alone does not name it;
+        empty where there is none.
+    HeaderRules
+        None in particular where the package does not know the instrument.
+
+    Raises
+    ------
+    DataError
+        Where an arm or a mask of a known instrument is another one.
+    """
+    stated = str(header.get("INSTRUME") or "").strip()
+    for name, rules in _all_rules().items():
+        if rules.describes(header, name):
+            return stated if stated.lower() == name else name.upper(), rules
+    for name, rules in _all_rules().items():
+        if rules.shares_instrume(header, name):
+            key = rules.arm_keyword
+            raise DataError(
+                f"is of {stated} with {key} {header.get(key)}, which is not known",
+                source=source,
+                remedy="give --instrument",
+            )
+    return stated, HeaderRules()
+
+
+@lru_cache(maxsize=1)
+def _all_rules() -> dict[str, HeaderRules]:
+    """Rules of the package's own instruments, by the names of their files."""
+    return {name: header_rules(name) for name in instrument_names()}
+
+
 def header_rules(name: str) -> HeaderRules:
-    """Rules for headers that name an instrument; none where the package does not know it."""
-    if name.lower() not in instrument_names():
+    """Rules of an instrument by name or file; none where the package does not know it."""
+    if name.lower() not in instrument_names() and not name.endswith(".toml"):
         return HeaderRules()
     top = read_toml(_path(name))
-    return _header(top.section("header")) if "header" in top else HeaderRules()
+    return rules_of(top.section("header")) if "header" in top else HeaderRules()
 
 
 def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
@@ -229,8 +249,9 @@ def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
     Parameters
     ----------
     name : str or path
-        ``"niriss"``, ``"sphere"``, ``"gpi"``, ``"visir"``, or the path of a TOML file
-        (the files in ``amibayes/instrument/data`` are examples).
+        ``"niriss"``, ``"sphere"``, ``"sphere_ifs"``, ``"gpi"``, ``"visir"``, ``"vampires"``,
+        ``"vampires_sam7"``, or the path of a TOML file (the files in
+        ``amibayes/instrument/data`` are examples).
     filter : str, optional
         Name of the filter; may be left out where the instrument has only one.
 
@@ -256,7 +277,7 @@ def _loaded(path: Path, filter: str | None) -> Instrument:
         bandpass=_bandpass(chosen, filters.section(chosen)),
         pixel_scale_rad=top.number("pixel_scale_mas", above=0.0) * MAS,
         n_pixels=int(top.number("n_pixels", 80, at_least=2)),
-        header=_header(top.section("header")) if "header" in top else HeaderRules(),
+        header=rules_of(top.section("header")) if "header" in top else HeaderRules(),
         planning=_planning(top.section("planning")) if "planning" in top else None,
         distortion=_distortion(top.section("distortion")) if "distortion" in top else Distortion(),
         charge_migration=_migration(top),
@@ -296,17 +317,6 @@ def _choose(filters: Section, wanted: str | None) -> str:
         what = "needs a filter" if wanted is None else f"has no filter '{wanted}'"
         raise UsageError(what, source=filters.source, remedy=f"choose from {', '.join(names)}")
     return match[0]
-
-
-def _header(section: Section) -> HeaderRules:
-    simulated = section.section("simulated") if "simulated" in section else None
-    found = HeaderRules(
-        section.text("mask_keyword", ""),
-        section.text("mask_value", ""),
-        MappingProxyType({} if simulated is None else simulated.scalars()),
-    )
-    section.refuse_unknown(("source", "note"))
-    return found
 
 
 def _distortion(section: Section) -> Distortion:

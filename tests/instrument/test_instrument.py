@@ -69,9 +69,8 @@ def test_the_wide_filter_is_near_the_published_pivot() -> None:
     assert niriss("F277W").bandpass.pivot_m * 1e6 == pytest.approx(2.770, abs=0.008)
 
 
-@pytest.mark.parametrize("name", ["gpi", "niriss", "sphere", "visir"])
+@pytest.mark.parametrize("name", instrument_names())
 def test_every_mask_is_non_redundant(name: str) -> None:
-    assert name in instrument_names()
     text = (DATA / f"{name}.toml").read_text(encoding="utf-8")
     filters = [line[9:-1] for line in text.splitlines() if line.startswith("[filters.")]
     for entry in filters:
