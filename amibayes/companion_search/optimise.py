@@ -7,12 +7,16 @@ from dataclasses import dataclass
 
 import nlopt
 import numpy as np
+from scipy.stats import qmc
 
 from amibayes.companion_search.result import Mode, mode_of
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.units import FloatArray, IntArray
+
+SPREAD_STARTS, BEST_STARTS = 2048, 8
+"""Points of a fit of extended light, and how many of the best ones are fitted to the end."""
 
 Objective = Callable[[FloatArray, FloatArray], float]
 
@@ -84,6 +88,12 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
         ladder = lower + part * width
         start = ladder[np.argmin(without.chi2(ladder))]
         fits.append(_minimise(objective, start, scale, bounds))
+    if likelihood.model.surroundings:
+        # Extended light has several parameters, and its flux is mostly small.
+        even = qmc.Sobol(len(bounds), rng=np.random.default_rng(0)).random(SPREAD_STARTS)
+        spread = lower + even**2 * width
+        best = np.argsort(without.chi2(spread), kind="stable")[:BEST_STARTS]
+        fits += [_minimise(objective, spread[k], scale, bounds) for k in best]
     return min(fits, key=lambda fit: fit[1])
 
 

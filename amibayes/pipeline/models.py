@@ -8,7 +8,8 @@ import numpy as np
 
 from amibayes.companion_search.field import default_separation
 from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
-from amibayes.comparison.hypotheses import extended_names
+from amibayes.comparison.hypotheses import FAMILIES, extended_names
+from amibayes.comparison.limits import LimitsBeside, limits_beside, symmetric
 from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
@@ -56,10 +57,39 @@ def compare_stage(
         )
 
 
-def with_models(report: SearchReport, found: ModelComparison | None) -> SearchReport:
+def limits_stage(
+    models: ModelComparison | None,
+    found: FieldSearch,
+    options: SearchOptions,
+    rng: np.random.Generator,
+    run: Run,
+) -> LimitsBeside | None:
+    """Measure detection limits beside the most probable disc or ring, where it is stated."""
+    if models is None or not options.limits or not options.null_draws:
+        return None
+    stated = models.verdict.statement in (models.best.name, FAMILIES["extended"])
+    if not stated or not symmetric(models.best):
+        return None
+    grid = found.result.grid
+    field = _default_field(found, options) or (grid.inner_mas, grid.outer_mas)
+    with run.stage("limits beside the disc"):
+        return limits_beside(
+            models,
+            found.result.likelihood,
+            field,
+            rng,
+            alpha=options.alpha,
+            null_draws=options.null_draws,
+            executor=run.executor,
+        )
+
+
+def with_models(
+    report: SearchReport, found: ModelComparison | None, beside: LimitsBeside | None
+) -> SearchReport:
     """Put a comparison of models, and what is to be warned of, in a report."""
     warnings = (*report.warnings, *models_warnings(found))
-    return replace(report, models=found, warnings=warnings)
+    return replace(report, models=found, limits_beside=beside, warnings=warnings)
 
 
 def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:

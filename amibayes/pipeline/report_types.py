@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.comparison.compare import ModelComparison
+from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
@@ -48,6 +49,7 @@ class SearchReport:
     consistency: tuple[Consistency, ...] = ()
     bootstrap: Bootstrap | None = None
     models: ModelComparison | None = None
+    limits_beside: LimitsBeside | None = None
     charge_migration: CubeMigration | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
 

@@ -22,7 +22,12 @@ from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
-from amibayes.pipeline.models import compare_stage, extended_settings, with_models
+from amibayes.pipeline.models import (
+    compare_stage,
+    extended_settings,
+    limits_stage,
+    with_models,
+)
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
@@ -93,9 +98,10 @@ def search_companion(
         posterior = _inferred(ready, found, options, rng, run, (chain, resume))
         prior = _prior(found.result, options)
         models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
+        beside = limits_stage(models, found, options, rng["models"], run)
     report = _report(options, ready, found, tests, limits, posterior)
     return replace(
-        with_models(report, models),
+        with_models(report, models, beside),
         targets=tuple(str(p) for p in targets),
         calibrators=tuple(str(p) for p in calibrators),
         timing_s=run.seconds,

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
+import numpy as np
+
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import Compared, ModelComparison
+from amibayes.comparison.limits import LimitsBeside
 from amibayes.comparison.summary import intervals
 from amibayes.models.parameters import Parameter
 from amibayes.posterior.evidence import Evidence
@@ -140,10 +143,25 @@ def models_section(content: Json) -> Section | None:
         )
     if verdict["degenerate"]:
         text.append(degenerate_text(verdict))
+    text += _beside_text(content.get("limits_beside"))
     tables = [_odds(models), *_parameters(models)]
     if content["confusion"] is not None:
         tables.insert(1, _confusion_table(models, content["confusion"]))
     return Section("Companion or disc", tuple(text), tables=tuple(tables))
+
+
+def _beside_text(limits: Json | None) -> list[str]:
+    """What companions would be seen beside the disc."""
+    reached = [] if limits is None else [m for m in limits["delta_mag"] if m is not None]
+    if limits is None or not reached:
+        return []
+    inner, outer = limits["separation_mas"][0], limits["separation_mas"][-1]
+    return [
+        f"With the {limits['model']} in the model and its parameters free, companions up to "
+        f"{fixed(min(reached), 1)} to {fixed(max(reached), 1)} mag fainter than the star would be "
+        f"found {100.0 * limits['completeness']:.0f} % of the time at {plain(inner)} to "
+        f"{plain(outer)} mas."
+    ]
 
 
 def headline(verdict: Json) -> str:
@@ -215,7 +233,7 @@ MENTIONED = 0.01
 """Probability below which a model's parameters are left to ``result.json``."""
 
 
-def models_lines(found: ModelComparison | None) -> list[str]:
+def models_lines(found: ModelComparison | None, beside: LimitsBeside | None = None) -> list[str]:
     """What the summary says."""
     if found is None:
         return []
@@ -228,6 +246,15 @@ def models_lines(found: ModelComparison | None) -> list[str]:
     ]
     if found.confusion is not None:
         lines.append(row("confusion", _confusion_line(found)))
+    if beside is not None:
+        depth = beside.limit.delta_mag
+        lines.append(
+            row(
+                "limits",
+                f"beside the {beside.model}: delta mag {np.nanmin(depth):.2f} to "
+                f"{np.nanmax(depth):.2f} ({beside.limit.completeness:.0%} recovered)",
+            )
+        )
     if verdict.degenerate:
         lines.append(row("", "smaller than lambda/2B: size and flux are degenerate"))
     return lines

@@ -10,6 +10,7 @@ import numpy as np
 from amibayes import __version__
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
+from amibayes.comparison.limits import LimitsBeside
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
@@ -79,6 +80,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         if report.evidence is None
         else evidence_json(report.evidence, report.second_significance),
         **models_json(report.models, report.evidence),
+        "limits_beside": _limits_beside(report.limits_beside),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
     } | ({"residuals": residuals_json(report)} if is_joint(report) else {})
@@ -342,6 +344,10 @@ def _two(two: TwoCompanions, second: Significance | None) -> Json:
             for c in two.companions
         ],
     }
+
+
+def _limits_beside(found: LimitsBeside | None) -> Json | None:
+    return None if found is None else {"model": found.model, **limits_json(found.limit)}
 
 
 def _limits(report: SearchReport) -> Json | None:

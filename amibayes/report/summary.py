@@ -50,7 +50,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     if report.evidence is not None:
         lines += _evidence_lines(report.evidence)
         lines += _second_lines(report, report.evidence)
-    lines += models_lines(report.models)
+    lines += models_lines(report.models, report.limits_beside)
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")

@@ -1,0 +1,77 @@
+"""Limits of companions beside a disc."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+
+from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.search import search
+from amibayes.comparison.compare import compare_sky_models
+from amibayes.comparison.hypotheses import Hypothesis
+from amibayes.comparison.limits import limits_beside
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.binary import BinaryModel
+from amibayes.posterior.priors import Prior
+
+FIELD = (94.0, 300.0)
+DISC = [0.03, 220.0, 0.6, 30.0]
+
+
+def with_disc(companion: float) -> Likelihood:
+    model = BinaryModel(1, surroundings=Hypothesis("disc").model(BinaryModel()).surroundings)
+    theta = [120.0, -60.0, companion, *DISC]
+    return Likelihood(simulated(niriss(), theta, np.random.default_rng(1), model))
+
+
+def test_single_fit_finds_the_disc() -> None:
+    base = with_disc(0.0)
+    around = Hypothesis("disc").model(base.model)
+    theta, chi2 = fit_single(base.with_model(replace(around, companions=1)))
+    np.testing.assert_allclose(theta[:2], DISC[:2], rtol=0.2)
+    assert chi2 < 36.0 + 5.0 * np.sqrt(72.0)
+
+
+def test_a_companion_beside_a_disc_is_found_where_it_is() -> None:
+    base = with_disc(0.01)
+    around = replace(Hypothesis("disc").model(base.model), companions=1)
+    found = search(base.with_model(around), FIELD)
+    assert found.companion.east_mas == pytest.approx(
+        120.0, abs=5.0 * found.companion.east_error_mas
+    )
+    assert found.companion.contrast == pytest.approx(0.01, abs=5.0 * found.companion.contrast_error)
+
+
+@pytest.mark.slow
+def test_limit_beside_a_disc() -> None:
+    """It is no deeper than that of the same data with the disc known."""
+    base = with_disc(0.0)
+    found = compare_sky_models(
+        search(base, FIELD),
+        Prior(*FIELD, contrast_min=1e-4),
+        np.random.default_rng(2),
+        models=["star", "companion", "disc"],
+        confusion_draws=0,
+    )
+    beside = limits_beside(
+        found, base, FIELD, np.random.default_rng(3), alpha=0.01, null_draws=2000
+    )
+    assert beside.model == "disc"
+    star = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    alone = limits_beside_nothing(star)
+    assert np.nanmedian(beside.limit.delta_mag) < np.nanmedian(alone) + 0.1
+    assert np.nanmedian(beside.limit.delta_mag) > np.nanmedian(alone) - 1.5
+
+
+def limits_beside_nothing(star) -> np.ndarray:
+    from amibayes.detection.false_alarm import significance
+    from amibayes.detection.statistic import statistic_of
+    from amibayes.limits.completeness import detection_limit
+
+    result = search(Likelihood(star), FIELD)
+    rng = np.random.default_rng(4)
+    tested = significance(statistic_of(result, stated_errors=True), 2000, rng, 0.01)
+    return detection_limit(result, tested, rng).delta_mag
