@@ -37,6 +37,10 @@ def setting():
     return result, test, weight, limit
 
 
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def found_by_a_full_search(theta: list[float], rng, threshold: float) -> bool:
     """Fresh data, a new search of them, its best statistic and the position it reports."""
     again = search(Likelihood(simulated(niriss(), theta, rng)), (50.0, 400.0))
@@ -94,9 +98,14 @@ def test_completeness_of_fresh_simulations_through_the_job(n: int, tmp_path) -> 
 
     Each is simulated in the space of the data, read by nothing of the limits, searched as
     `search_companion` does (extra noise and all), weighed by the statistic without scale, and
-    located by the position that it reports. 4.5 sigma of count and fit together.
+    located by the position that it reports. 4.5 sigma of count and fit together. A limit is that
+    of data which scatter as those that it was measured in: these do so as the errors say.
     """
-    write_oifits(tmp_path / "t.oifits", simulated(niriss(), [0.0] * 3, np.random.default_rng(1)))
+    sheet = simulated(niriss(), [0.0] * 3, np.random.default_rng(15))
+    scatter = Likelihood(sheet).residuals([0.0] * 3)[:, 0]
+    assert rms(scatter[:21]) == pytest.approx(1.0, abs=0.02)
+    assert rms(scatter[21:]) == pytest.approx(1.0, abs=0.02)
+    write_oifits(tmp_path / "t.oifits", sheet)
     asked = SearchOptions(separation_mas=(50.0, 400.0), null_draws=100_000)
     options = LimitsOptions(asked, observables=("vis2", "cp"), n_separations=8)
     limit = measure_limits([tmp_path / "t.oifits"], options=options).main.limit
@@ -114,7 +123,7 @@ def test_completeness_of_fresh_simulations_through_the_job(n: int, tmp_path) -> 
             c = result.companion
             found += bool(seen and np.hypot(c.east_mas - east, c.north_mas - north) < 94.0)
         slope = 7.0 * expected * (1.0 - expected)
-        spread = np.hypot(np.sqrt(n * expected * (1 - expected)), n * slope * error)
+        spread = np.hypot(np.sqrt(n * expected * (1 - expected)), n * slope * np.hypot(error, 0.02))
         assert abs(found - n * expected) < 4.5 * spread
 
 
