@@ -16,6 +16,7 @@ from amibayes.instrument import load_instrument
 from amibayes.optics import scene_image
 from amibayes.ramps.curvature import Curvature, curvature_of
 from amibayes.ramps.fit import MigrationFit, fit_migration
+from amibayes.ramps.transfer import KINDS, gains
 from amibayes.scene.sources import Scene
 from amibayes.simulation.detector import Detector
 from amibayes.simulation.ramps import read_ramps
@@ -140,7 +141,9 @@ def test_linearity_is_told_from_migration() -> None:
     bent = replace(
         SILENT, boundary_shift_x=0.0, boundary_shift_y=0.0, nonlinearity=0.02, linearity_error=0.1
     )
-    found = fit_migration([measured(1, 8, 8, bent)]).migration
+    plain = measured(1, 8, 8, bent)
+    # As of ten thousand times as many integrations, beside which the prior says nothing.
+    found = fit_migration([replace(plain, sigma=plain.sigma / 100.0)]).migration
     per_e = dict(zip(found.kinds, found.value, strict=True))
     # q (1 − ε q) undone with 1.1 ε: the current is off by 2 · 0.1 ε per electron.
     assert per_e["linearity"] == pytest.approx(2.0 * 0.1 * 0.02 / 72000.0, rel=0.05)
@@ -184,3 +187,31 @@ def test_fields_of_a_fit_are_plain_numbers() -> None:
     assert content["source"] == "fit"
     assert content["coefficients"]["x"]["error_per_e"] > 0.0
     assert SimpleNamespace(**content).n_exposures == 1
+
+
+def test_further_kinds_are_fitted_where_the_ramps_ask_for_them() -> None:
+    plain = measured(11, 8, 8, SILENT)
+    kinds = ("x", "y", "diagonal")
+    pattern = gains(kinds, plain.current, plain.current)
+    sigma = plain.sigma / 100.0  # as of many more integrations
+    rng = np.random.default_rng(2)
+    noise = np.where(plain.used, sigma, 0.0) * rng.standard_normal(sigma.shape)
+    true = np.array([TRUE, TRUE, 0.2 * TRUE])
+    exposure = replace(
+        plain,
+        time_s=0.0,
+        change=np.tensordot(true, pattern, axes=1) + noise,
+        sigma=sigma,
+        batches=plain.batches[:0],
+        gains=gains(KINDS, plain.current, plain.current),
+    )
+    found = fit_migration([exposure]).migration
+    assert found.kinds == ("x", "y", "linearity", "diagonal")
+    off = (found.value - [TRUE, TRUE, 0.0, 0.2 * TRUE]) / found.error
+    assert np.abs(off).max() < 4.5
+
+
+def test_capacitance_between_pixels_hardly_matters() -> None:
+    coupled = replace(SILENT, interpixel_capacitance=0.006)
+    found = fit_migration([measured(3, 8, 8, coupled)]).migration
+    np.testing.assert_allclose(found.value[:2], TRUE, rtol=0.01)
