@@ -178,9 +178,19 @@ def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> R
         parts |= {name: there[0]} if there else {}
     template = _template(header, science, given, source, _comments(hdus, science))
     unit = "electron/s" if "electron" in template.unit.lower() else "DN/s"
-    template = replace(template, unit=unit)
+    template = replace(template, unit=unit, notes=template.notes + _cut_ramps(header, source))
     timing = timing_of(header, groups, step)
     return RampFile(template, n, parts, _mid_times(hdus, n, header, source), timing)
+
+
+def _cut_ramps(header: dict[str, Any], source: str) -> tuple[str, ...]:
+    """Say where jwst has flagged the groups that tell of charge migration."""
+    if keys.text(header, "S_CHGMIG") != "COMPLETE":
+        return ()
+    return (
+        f"{source}: jwst's charge_migration step has flagged the last groups of bright pixels "
+        "(S_CHGMIG), which hence tell less of it; run calwebb_detector1 without that step",
+    )
 
 
 @contextmanager

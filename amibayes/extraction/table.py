@@ -70,11 +70,12 @@ def observables_of(
 
 
 def target_of(template: Cube) -> str:
-    """Name of the star as the header has it; empty where it has none."""
-    header = template.header
-    return str(
-        header.get("TARGNAME") or header.get("TARGPROP") or header.get("OBJECT") or ""
-    ).strip()
+    """Name of the star as the header has it; empty where it has none.
+
+    The archive calls a star that no catalogue was asked for UNKNOWN; the observer's name follows.
+    """
+    names = (str(template.header.get(k) or "").strip() for k in ("TARGNAME", "TARGPROP", "OBJECT"))
+    return next((name for name in names if name and name.upper() != "UNKNOWN"), "")
 
 
 def _setup(view: View, template: Cube, holes: FloatArray, response: OffAxisResponse) -> Setup:

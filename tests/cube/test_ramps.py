@@ -95,3 +95,11 @@ def test_ramps_without_slopes_are_refused(tmp_path: Path, rng: np.random.Generat
     wrong = ramp_file(tmp_path / "c.fits", rng, hdus=lambda found: {"PIXELDQ": np.zeros((3, 3))})
     with pytest.raises(DataError, match="PIXELDQ has the shape"):
         read_cube(wrong)
+
+
+@pytest.mark.parametrize("state", ["COMPLETE", "SKIPPED"])
+def test_ramps_that_the_charge_migration_step_has_cut_are_told(
+    state: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    cube = read_cube(ramp_file(tmp_path / "a_ramp.fits", rng, S_CHGMIG=state))
+    assert any("charge_migration step" in note for note in cube.notes) == (state == "COMPLETE")

@@ -18,6 +18,7 @@ from amibayes.cube import Cube, write_cube
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.reading import read_observations
+from amibayes.extraction.table import target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import visit_maps
 from amibayes.instrument import load_instrument
@@ -162,6 +163,12 @@ def test_dithers_and_segments_are_one_exposure(star: FloatArray, tmp_path: Path)
     assert [f.n_integrations for f in found] == [16, 8]
     assert all(str(p) in found[0].source for p in paths[:2])
     assert len(extract_all(paths)) == 2
+
+
+def test_a_star_that_the_archive_does_not_know_goes_by_the_observers_name() -> None:
+    blank = cube(np.ones((8, 8)) / 64.0, 1, name="UNKNOWN")
+    named = replace(blank, header={"TARGNAME": "UNKNOWN", "TARGPROP": "AB-DOR"})
+    assert (target_of(blank), target_of(named)) == ("", "AB-DOR")
 
 
 def test_times_are_those_of_the_exposure_where_integrations_have_none(star: FloatArray) -> None:

@@ -31,6 +31,11 @@ class Given:
     columns: frozenset[str] = frozenset()
 
     @property
+    def is_ramp(self) -> bool:
+        """Whether it is ramps, whose slopes may be in another file."""
+        return str(self.header.get("FILENAME") or self.path).endswith("_ramp.fits")
+
+    @property
     def is_product(self) -> bool:
         """Whether it is a stage-3 product."""
         return is_product_header(self.header, self.names)
@@ -42,7 +47,7 @@ class Given:
 
 
 def refuse_twice(files: Sequence[Given]) -> None:
-    """Refuse a product together with another file of its exposure.
+    """Refuse a product, or ramps, together with another file of their exposure.
 
     Raises
     ------
@@ -52,13 +57,15 @@ def refuse_twice(files: Sequence[Given]) -> None:
     for k, one in enumerate(files):
         exposure = exposure_of(one.header)
         for other in files[k + 1 :]:
-            if not (one.is_product or other.is_product) or exposure is None:
+            # Images of one exposure may be segments of it; ramps beside slopes are none.
+            images = not (one.is_product or other.is_product)
+            if exposure is None or (images and one.is_ramp == other.is_ramp):
                 continue
             if exposure_of(other.header) == exposure:
                 raise UsageError(
                     f"is of the same exposure as {one.path}",
                     source=other.path,
-                    remedy="give one of them: the images, else amimulti-oi, else ami-oi",
+                    remedy="give one of them: the ramps or images, else amimulti-oi, else ami-oi",
                 )
 
 
