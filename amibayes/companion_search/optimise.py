@@ -71,8 +71,11 @@ FINEST_STEP = 0.0025
 """Scale of a star's parameters in their fit, as a part of their ranges."""
 
 
-def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
-    """Best fit without a companion: its parameters (n_nuisance,) and deviance."""
+def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple[FloatArray, float]:
+    """Best fit without a companion: its parameters (n_nuisance,) and deviance.
+
+    A ``known`` fit of nearly the same problem, (n_nuisance,), is one of the starting points.
+    """
     without = single_likelihood(likelihood)
     bounds = np.array(without.parameters.bounds(without.parameters.nuisance)).reshape(-1, 2)
     if not len(bounds):
@@ -88,6 +91,8 @@ def fit_single(likelihood: Likelihood) -> tuple[FloatArray, float]:
         ladder = lower + part * width
         start = ladder[np.argmin(without.chi2(ladder))]
         fits.append(_minimise(objective, start, scale, bounds))
+    if known is not None:
+        fits.append(_minimise(objective, known, scale, bounds))
     if likelihood.model.surroundings:
         # Extended light has several parameters, and its flux is mostly small.
         even = qmc.Sobol(len(bounds), rng=np.random.default_rng(0)).random(SPREAD_STARTS)

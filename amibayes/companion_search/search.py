@@ -53,6 +53,7 @@ def search(
     separation_mas: tuple[float, float] | None = None,
     *,
     known: FloatArray | None = None,
+    single: FloatArray | None = None,
 ) -> SearchResult:
     """Find the companion that explains the data best.
 
@@ -64,6 +65,8 @@ def search(
     known : (n, n_dim) float array, optional
         Solutions of nearly the same problem. Fits begin from them too, and the field is not
         gone through for bright companions again.
+    single : (n_nuisance,) float array, optional
+        A fit without a companion to begin from too.
 
     Returns
     -------
@@ -80,7 +83,7 @@ def search(
     inner, outer = separation_mas or default_separation(likelihood)
     box = Box(inner, outer, resolution_mas(likelihood))
     grid = _grid(likelihood, box)
-    single, deviance_single = fit_single(likelihood)
+    single, deviance_single = fit_single(likelihood, single)
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)

@@ -87,7 +87,7 @@ def limits_beside(
     noise = getattr(fit.noise, "fit", fit.noise)
     around = replace(best.fit.hypothesis.model(base.model), companions=1)
     likelihood = base.with_noise(noise).with_model(around)
-    result = search(likelihood, separation_mas)
+    result = search(likelihood, separation_mas, single=best.theta)
     streams = rng.spawn(2)
     tested = significance(
         statistic_of(result, stated_errors=True), null_draws, streams[0], alpha, executor=executor

@@ -97,32 +97,30 @@ class Confusion:
         log = self.log_z + self.log_prior
         return np.asarray(np.exp(log - logsumexp(log, axis=-1, keepdims=True)))
 
-    def taken_for(self, *, families: bool = False) -> tuple[tuple[str, ...], FloatArray]:
-        """Share of the data sets of each model that are taken for each, and undecided last.
-
-        Parameters
-        ----------
-        families : bool
-            Whether models of one kind count as one.
+    def taken_for(self) -> tuple[tuple[str, ...], FloatArray]:
+        """Share of the data sets of each model that are taken for each, or for a kind of models.
 
         Returns
         -------
         names : tuple of str
-            Of the columns.
+            Of the columns: models, kinds of several models, undecided.
         share : (n_models, n_columns) float array
         """
-        kinds = _kinds(self.models)
-        groups = list(kinds.values()) if families else [np.array([k]) for k in self._every]
-        names = tuple(FAMILIES[k] for k in kinds) if families else self.names
-        found = [Choice.of(self.models, group).made(self.probability) for group in groups]
-        sure = np.stack(found, axis=-1)
-        undecided = ~sure.any(axis=-1, keepdims=True)
-        share = np.concatenate([sure, undecided], axis=-1).mean(axis=1)
-        return (*names, UNDECIDED), np.asarray(share)
+        groups = candidates(self.models)
+        found = np.stack(
+            [Choice.of(self.models, g).made(self.probability) for _, g in groups], axis=-1
+        )
+        # A kind is stated only where none of its models is.
+        first = np.where(found.any(axis=-1), found.argmax(axis=-1), len(groups))
+        share = (first[..., None] == np.arange(len(groups) + 1)).mean(axis=1)
+        return (*(name for name, _ in groups), UNDECIDED), np.asarray(share)
 
-    @property
-    def _every(self) -> range:
-        return range(len(self.models))
+
+def candidates(models: Sequence[Hypothesis]) -> list[tuple[str, IntArray]]:
+    """What a verdict may state: every model, then every kind that several of them are of."""
+    single = [(one.name, np.array([k])) for k, one in enumerate(models)]
+    kinds = _kinds(models).items()
+    return single + [(FAMILIES[k], g) for k, g in kinds if 1 < len(g) < len(models)]
 
 
 @dataclass(frozen=True)
@@ -171,11 +169,11 @@ def choose(
     """
     log = np.asarray(log_z) + np.asarray(log_prior)
     share = np.exp(log - logsumexp(log))
-    kinds = _kinds(models)
-    tried = [(models[k].name, np.array([k])) for k in np.argsort(-share, kind="stable")]
-    tried += [(FAMILIES[k], g) for k, g in kinds.items() if 1 < len(g) < len(models)]
-    refused = f"the most probable model, {tried[0][0]}, has a probability of {share.max():.2f}"
-    for name, group in tried:
+    best = int(np.argmax(share))
+    refused = (
+        f"the most probable model, {models[best].name}, has a probability of {share.max():.2f}"
+    )
+    for name, group in candidates(models):
         choice = Choice.of(models, group)
         if not choice.made(share):
             continue
@@ -187,7 +185,7 @@ def choose(
             continue
         because = _because(name, choice, models, share, p, rival)
         return ModelVerdict(name, because, float(share[group].sum()), p, degenerate)
-    p = _confused(Choice.of(models, tried[0][1]), log, confusion)[0]
+    p = _confused(Choice.of(models, np.array([best])), log, confusion)[0]
     return ModelVerdict(UNDECIDED, refused, float(share.max()), p, degenerate)
 
 

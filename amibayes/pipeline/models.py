@@ -17,7 +17,7 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Run
 from amibayes.posterior.priors import Prior, PriorSetting
-from amibayes.support.options import SAMPLERS
+from amibayes.support.options import NULL_DRAWS, SAMPLERS
 
 
 def compare_stage(
@@ -65,7 +65,7 @@ def limits_stage(
     run: Run,
 ) -> LimitsBeside | None:
     """Measure detection limits beside the most probable disc or ring, where it is stated."""
-    if models is None or not options.limits or not options.null_draws:
+    if models is None or not options.limits or options.null_draws == 0:
         return None
     stated = models.verdict.statement in (models.best.name, FAMILIES["extended"])
     if not stated or not symmetric(models.best):
@@ -79,7 +79,7 @@ def limits_stage(
             field,
             rng,
             alpha=options.alpha,
-            null_draws=options.null_draws,
+            null_draws=options.null_draws or NULL_DRAWS,
             executor=run.executor,
         )
 

@@ -201,10 +201,10 @@ def _odds(models: list[Json]) -> Table:
 
 def _confusion_table(models: list[Json], confusion: Json) -> Table:
     names = [m["model"] for m in models]
-    columns = (Column("Simulated", "text"), *(Column(f"→ {n}") for n in (*names, "undecided")))
+    goals = list(dict.fromkeys(key.partition(" taken for ")[2] for key in confusion))
+    columns = (Column("Simulated", "text"), *(Column(f"→ {n}") for n in goals))
     rows = tuple(
-        (name, *(chance(confusion[f"{name} taken for {n}"]) for n in (*names, "undecided")))
-        for name in names
+        (name, *(chance(confusion[f"{name} taken for {n}"]) for n in goals)) for name in names
     )
     return Table("What data simulated from each model are taken for", columns, rows)
 

@@ -45,6 +45,14 @@ def test_a_companion_beside_a_disc_is_found_where_it_is() -> None:
     assert found.companion.contrast == pytest.approx(0.01, abs=5.0 * found.companion.contrast_error)
 
 
+def test_a_known_fit_is_a_starting_point() -> None:
+    """With the star's disc free as well the search keeps the fit that the comparison found."""
+    base = with_disc(0.0).with_model(BinaryModel(1, "free"))
+    around = replace(Hypothesis("disc").model(base.model), companions=1)
+    found = search(base.with_model(around), FIELD, single=np.array([0.0, *DISC]))
+    assert found.chi2_single < 36.0 + 5.0 * np.sqrt(72.0)
+
+
 @pytest.mark.slow
 def test_limit_beside_a_disc() -> None:
     """It is no deeper than that of the same data with the disc known."""
