@@ -63,14 +63,9 @@ def search(
     separation_mas : (inner, outer), optional
         Annulus that is searched; by default `default_separation`.
     known : (n, n_dim) float array, optional
-        Solutions of nearly the same problem. Fits begin from them too, and the field is not
-        gone through for bright companions again.
+        Solutions of nearly the same problem, where fits begin in place of bright companions.
     single : (n_nuisance,) float array, optional
         A fit without a companion to begin from too.
-
-    Returns
-    -------
-    SearchResult
 
     Raises
     ------
