@@ -97,8 +97,9 @@ def test_estimates_scatter_by_their_errors(true: float) -> None:
 def test_bias_and_pulls(n_groups: int) -> None:
     n = 100
     fits = [fit_migration([measured(1000 + k, 20, n_groups, MOVING)]) for k in range(n)]
+    # Those of the sides: linearity has a prior, and scatters by less than its error.
     off = np.array(
-        [pulls(f, np.array([TRUE, TRUE, *[0.0] * (len(f.migration.value) - 2)]))[:3] for f in fits]
+        [pulls(f, np.array([TRUE, TRUE, *[0.0] * (len(f.migration.value) - 2)]))[:2] for f in fits]
     )
     assert np.abs(off.mean(axis=0)).max() < 4.2 / np.sqrt(n)
     np.testing.assert_allclose(off.std(axis=0), 1.0, atol=4.2 / np.sqrt(2 * n))
