@@ -292,11 +292,20 @@ def test_intervals_cover_at_few_integrations(name: str, n_integrations: int) -> 
     assert stats.binomtest(hits, 100, 0.68).pvalue > 1e-4, hits
 
 
+SHORT = "a wrong expectation and fewer integrations than data: 54 % are covered, not 68 %"
+
+
 @pytest.mark.parametrize(
     "n", [pytest.param(600, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.release)]
 )
-@pytest.mark.parametrize("n_integrations", [20, 50, 200])
-@pytest.mark.parametrize("name", ["even", "uneven"])
+@pytest.mark.parametrize(
+    ("name", "n_integrations"),
+    [
+        *(("even", n) for n in (20, 50, 200)),
+        *(("uneven", n) for n in (50, 200)),
+        pytest.param("uneven", 20, marks=pytest.mark.xfail(strict=True, reason=SHORT)),
+    ],
+)
 def test_intervals_cover_in_many_trials(name: str, n_integrations: int, n: int) -> None:
     """Within the Monte Carlo error (1 %); a wrong expectation may cost 3 % beside it."""
     rng = np.random.default_rng([9, n_integrations, name == "even"])
