@@ -101,6 +101,9 @@ class Measurements:
         The same numbers as a fit has them. What is proportional to them (a gain that channels
         share) must not be made proportional to the measured ones, whose noise it would follow:
         fits would then be drawn towards zero (Peelle's puzzle).
+    coherent_slope : (n,) float array, optional
+        Change of the numbers by an error of 1 in the complex visibility of each point, as a root
+        mean square: 2|V| of V², √Σ 1/|V|² (radians) of closure phases, V as a fit has it.
     """
 
     value: FloatArray
@@ -116,6 +119,7 @@ class Measurements:
     channel: IntArray
     flag: BoolArray
     expected: FloatArray | None = None
+    coherent_slope: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.value)
@@ -392,8 +396,7 @@ def join(parts: Sequence[Observables]) -> Observables:
 
 def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurements:
     names = [f.name for f in fields(parts[0])]
-    if any(p.expected is None for p in parts):
-        names.remove("expected")
+    names = [name for name in names if all(getattr(p, name) is not None for p in parts)]
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
     return Measurements(**columns)

@@ -183,7 +183,9 @@ def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> Float
         here = layout.source == layout.names.index(floor.source)
         gain = np.where(layout.vis2, floor.vis2, floor.closure_phase_rad) * layout.unit
         coherent = floor.visibility * layout.amplitude
-        out[here] = (gain**2 + coherent**2)[here]
+        # Closure phases of bright fringes have their floor from the same coherent errors.
+        both = np.where(layout.vis2, gain**2 + coherent**2, np.maximum(gain, coherent) ** 2)
+        out[here] = both[here]
     return out
 
 

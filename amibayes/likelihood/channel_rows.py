@@ -35,7 +35,8 @@ class ChannelLayout:
     unit : (rank,) float array
         Root mean square of that shape in its group, before: V² (or a radian) in errors.
     amplitude : (rank,) float array
-        Root mean square of 2|V| in errors of V², in the group; 0 of closure phases.
+        Root mean square in the group of the change by a coherent error of the visibility, in
+        errors.
     vis2 : (rank,) bool array
         Rows of V².
     source : (rank,) int array
@@ -250,11 +251,18 @@ def channel_layout(data: Observables) -> ChannelLayout:
 
 
 def _amplitudes(data: Observables) -> FloatArray:
-    """2|V| of V², not below its noise, in units of the errors, (n_data,); 0 of closure phases."""
-    sigma = np.sqrt(data.covariance.variance[: data.n_vis2])
-    out = np.zeros(data.covariance.size)
-    out[: data.n_vis2] = 2.0 * np.sqrt(np.maximum(_pattern(data), sigma)) / sigma
-    return out
+    """Change by a coherent error of the visibility, in units of the errors, (n_data,).
+
+    Without a fit: 2|V| of V², not below its noise; 0 of closure phases.
+    """
+    sigma = np.sqrt(data.covariance.variance)
+    n = data.n_vis2
+    vis2, closure = data.vis2.coherent_slope, data.closure_phase.coherent_slope
+    if vis2 is None:
+        vis2 = 2.0 * np.sqrt(np.maximum(_pattern(data), sigma[:n]))
+    if closure is None:
+        closure = np.zeros(data.n_closure_phases)
+    return np.asarray(np.concatenate([vis2, closure]) / sigma)
 
 
 def _pattern(data: Observables) -> FloatArray:

@@ -33,6 +33,11 @@ def _told_apart(model: BinaryModel) -> tuple[object, ...]:
     return model.bands, model.moves, model.coloured
 
 
+FAINTEST = 0.005
+"""Visibility below which that of a fit is not taken for the size of a fringe: calibration errors
+alone are as large."""
+
+
 class Likelihood:
     """Likelihood of a model, vectorised over parameter sets: data, model and noise.
 
@@ -107,12 +112,22 @@ class Likelihood:
     def expecting(self, theta: FloatArray) -> Likelihood:
         """The same with V² of a fit (n_dim,) as what is expected of the data.
 
-        Noise that is made for these data afterwards has gains in proportion to them.
+        Noise that is made for these data afterwards has gains in proportion to them, and
+        coherent errors that weigh most on closure phases of faint fringes.
         """
-        data = self.observables
-        vis2 = np.asarray(self.predict(theta)[: data.n_vis2, 0])
-        known = replace(data, vis2=replace(data.vis2, expected=vis2))
-        return Likelihood(known, self.model, self.noise)
+        data, points = self.observables, self.samples
+        visibility = self.model.visibility(points, self._sets(theta))
+        size2 = np.maximum(np.abs(visibility[:, 0]) ** 2, FAINTEST**2)
+        vis2 = replace(
+            data.vis2,
+            expected=self._observe(visibility)[: self._n2, 0],
+            coherent_slope=np.sqrt(points.squares @ (4.0 * size2)),
+        )
+        slopes = np.sqrt(abs(points.legs) @ (1.0 / size2)) if self._n2 < len(data.data) else None
+        closure = replace(data.closure_phase, coherent_slope=slopes)
+        return Likelihood(
+            replace(data, vis2=vis2, closure_phase=closure), self.model, self.noise, points
+        )
 
     def residuals(self, theta: ArrayLike) -> FloatArray:
         """Whitened residuals data − model, (n_independent, n)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 
 import numpy as np
 
@@ -202,7 +202,7 @@ def _concatenated(parts: list[Measurements], k: int) -> Measurements:
     empty = {"u_m": np.empty((0, k)), "v_m": np.empty((0, k))}
     whole = {"stations": np.empty((0, k + 1), np.intp), "flag": np.empty(0, bool)}
     whole |= {name: np.empty(0, np.intp) for name in ("setup", "row", "channel")}
-    names = [f.name for f in fields(Measurements) if f.name != "expected"]
+    names = [f.name for f in fields(Measurements) if f.default is MISSING]
     start = {name: (empty | whole).get(name, np.empty(0)) for name in names}
     return Measurements(
         **{

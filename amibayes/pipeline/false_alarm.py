@@ -30,8 +30,8 @@ FIRST_DRAWS, NOT_SMALL = 500, 0.1
 """Draws after which a probability is given, if it is larger than that: no more would be made of
 it if it were known better."""
 
-NULL_WORK = 1e12
-"""Positions times data of all null searches together: half a minute of one core."""
+NULL_WORK = 3e11
+"""Positions times data of all null searches together: ten seconds of one core."""
 
 LEAST_DRAWS = 3000
 """Null searches where each is dear: α is then known to a half."""

@@ -247,7 +247,9 @@ def _noise_posterior(
     likelihood = averaged.likelihood
     if posterior is None or not likelihood.noise.parameters:
         return None
-    residual = likelihood.difference(posterior.samples[:MAX_NOISE_SAMPLES])
+    # Spread over the whole chain: its beginning alone is not the posterior.
+    every = max(1, len(posterior.samples) // MAX_NOISE_SAMPLES)
+    residual = likelihood.difference(posterior.samples[::every])
     return dict(likelihood.noise.posterior(residual))
 
 

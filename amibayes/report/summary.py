@@ -15,6 +15,7 @@ from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.models import models_lines
 from amibayes.report.result import upper_limit
+from amibayes.report.words import places_of
 from amibayes.support.terminal import row, with_warnings
 
 EVEN = 0.5
@@ -69,17 +70,33 @@ def _best_fit(report: SearchReport) -> list[str]:
         return [row("best fit", "not stated: the model is rejected (amibayes export, for images)")]
     contrast = row(
         "contrast",
-        f"{c.contrast:.5f} +/- {c.contrast_error:.5f} "
-        f"(delta mag {c.delta_mag:.2f} +/- {c.delta_mag_error:.2f})",
+        f"{with_error(c.contrast, c.contrast_error, largest=1.0)} "
+        f"(delta mag {with_error(c.delta_mag, c.delta_mag_error, largest=LARGEST_MAG)})",
     )
     if c.contrast <= 0.0:
         return [row("best fit", "no companion improves the fit"), contrast]
+    places = max(0, places_of(c.separation_error_mas)) if c.separation_error_mas > 0.0 else 2
+    angle = with_error(c.position_angle_deg, c.position_angle_error_deg, " deg", LARGEST_ANGLE_DEG)
     place = (
-        f"{c.separation_mas:.2f} +/- {c.separation_error_mas:.2f} mas, "
-        f"PA {c.position_angle_deg:.2f} +/- {c.position_angle_error_deg:.2f} deg "
-        f"(E {c.east_mas:.2f}, N {c.north_mas:.2f} mas)"
+        f"{with_error(c.separation_mas, c.separation_error_mas, ' mas', c.separation_mas)}, "
+        f"PA {angle} (E {c.east_mas:.{places}f}, N {c.north_mas:.{places}f} mas)"
     )
     return [row("best fit", place), contrast]
+
+
+def with_error(value: float, error: float, unit: str = "", largest: float = np.inf) -> str:
+    """Write a number and its error, both to the error's second digit.
+
+    An error above ``largest`` says that nothing is known.
+    """
+    if not np.isfinite(error) or error > largest:
+        return "undetermined"
+    places = max(0, places_of(error)) if error > 0.0 else 4
+    return f"{value:.{places}f} +/- {error:.{places}f}{unit}"
+
+
+LARGEST_MAG, LARGEST_ANGLE_DEG = 1.5, 60.0
+"""Errors of a magnitude and of an angle beyond which either may have any value."""
 
 
 def _verdict(report: SearchReport) -> str:
@@ -88,6 +105,8 @@ def _verdict(report: SearchReport) -> str:
         return "companion   not tested: no false-alarm probability was asked for"
     if tested.detected is None:
         return f"companion   undecided: {tested.n_draws} null draws are too few"
+    if report.verdict is not None and report.verdict.statement not in ("companion", "no companion"):
+        return f"companion   not stated: see the verdict; {_chance(tested)}"
     verdict = "DETECTED" if tested.detected else "not detected"
     return f"companion   {verdict}; {_chance(tested)}"
 
@@ -146,7 +165,7 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
             bound = value + UNRESOLVED * error
             shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
         else:
-            shown = f"{value:.4f} +/- {error:.4f}{unit}{' (star alone)' if alone else ''}"
+            shown = with_error(value, error, unit) + (" (star alone)" if alone else "")
         lines.append(row(label, shown))
     return lines
 

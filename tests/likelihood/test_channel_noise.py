@@ -264,3 +264,19 @@ def test_gains_that_channels_share_do_not_shrink_the_visibility(rng) -> None:
     bias = {k: np.mean(e) / (np.std(e) / np.sqrt(16)) for k, e in errors.items()}
     assert abs(bias["expected"]) < 4.5, bias
     assert bias["measured"] > 7.0, bias
+
+
+def test_a_coherent_error_changes_v2_and_closure_phase_as_the_slopes_say(rng) -> None:
+    """Against draws: small independent errors added to every complex visibility."""
+    likelihood = Likelihood(pionier(1, "diagonal"), BinaryModel(0, "free")).expecting(
+        np.array([3.0])
+    )
+    data, points, size = likelihood.observables, likelihood.samples, 1e-5
+    visibility = likelihood.model.visibility(points, np.array([[3.0]]))
+    error = size * rng.standard_normal((2, len(points), 4000))
+    change = likelihood._observe(visibility + error[0] + 1j * error[1]) - likelihood._observe(
+        visibility
+    )
+    slope = np.concatenate([data.vis2.coherent_slope, data.closure_phase.coherent_slope])
+    spread = likelihood.wrapped(change).std(axis=1) / size
+    np.testing.assert_allclose(spread / slope, 1.0, atol=4.5 / np.sqrt(2 * 4000))
