@@ -98,12 +98,11 @@ class Measurements:
     flag : (n,) bool array
         True where the number must not be used.
     expected : (n,) float array, optional
-        The same numbers as a fit has them. What is proportional to them (a gain that channels
-        share) must not be made proportional to the measured ones, whose noise it would follow:
-        fits would then be drawn towards zero (Peelle's puzzle).
+        The same numbers as a fit has them. A gain that channels share is in proportion to these:
+        measured ones have noise, and would draw fits towards zero (Peelle's puzzle).
     coherent_slope : (n,) float array, optional
-        Change of the numbers by an error of 1 in the complex visibility of each point, as a root
-        mean square: 2|V| of V², √Σ 1/|V|² (radians) of closure phases, V as a fit has it.
+        Root-mean-square change by an error of 1 in the complex visibility of each point:
+        2|V| of V², √Σ 1/|V|² (radians) of closure phases, V as a fit has it.
     """
 
     value: FloatArray
@@ -122,10 +121,9 @@ class Measurements:
     coherent_slope: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        n = len(self.value)
         for field in fields(self):
             column = getattr(self, field.name)
-            if column is not None and len(column) != n:
+            if column is not None and len(column) != len(self.value):
                 raise ValueError(f"{field.name} has another length than value")
         _freeze(self)
 
@@ -395,8 +393,8 @@ def join(parts: Sequence[Observables]) -> Observables:
 
 
 def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurements:
-    names = [f.name for f in fields(parts[0])]
-    names = [name for name in names if all(getattr(p, name) is not None for p in parts)]
+    every = [f.name for f in fields(parts[0])]
+    names = [name for name in every if all(getattr(p, name) is not None for p in parts)]
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
     columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
     return Measurements(**columns)

@@ -17,8 +17,8 @@ from scipy.special import gammaln
 
 from amibayes.data.observables import Measurements, Observables, exposure_labels
 from amibayes.detection.binomial import clopper_pearson
-from amibayes.detection.statistic import DRAWS_AT_ONCE, Statistic
-from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.detection.statistic import Statistic, pieces_of
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, spawn
 from amibayes.units import FloatArray, IntArray
 
 MIN_EXPOSURES = 10
@@ -173,7 +173,7 @@ def randomised(
     shuffle = randomisation_of(test.likelihood.observables)
     if not shuffle.enough:
         return Randomised(shuffle.n_exposures)
-    sizes = [len(range(n_draws)[part]) for part in slices(n_draws, DRAWS_AT_ONCE)]
+    sizes = pieces_of(n_draws, len(test.residual))
     pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
     work, where = partial(_piece, test, shuffle), executor or SerialExecutor()
     done = run_job(work, pieces, where, journal=journal, progress=progress)

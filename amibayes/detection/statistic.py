@@ -33,8 +33,15 @@ from amibayes.likelihood.student import SymmetricWhitening
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray, IntArray
 
-DRAWS_AT_ONCE = 2048
-"""Null data sets per matrix product: what keeps the product in cache."""
+DRAWS_AT_ONCE, NUMBERS_AT_ONCE = 2048, 8_000_000
+"""Null data sets per matrix product: what keeps the product in cache, and at most so many numbers
+of data, which keeps large data within 64 MB."""
+
+
+def pieces_of(n_draws: int, n_data: int) -> list[int]:
+    """Sizes of the pieces that null draws are made in."""
+    at_once = max(1, min(DRAWS_AT_ONCE, NUMBERS_AT_ONCE // max(n_data, 1)))
+    return [len(range(n_draws)[part]) for part in slices(n_draws, at_once)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +267,7 @@ class BankStatistic:
         journal : Journal, optional
             Keeps finished pieces.
         """
-        sizes = [len(range(n)[part]) for part in slices(n, DRAWS_AT_ONCE)]
+        sizes = pieces_of(n, self.bank.n_data)
         pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
         work, where = partial(_null_piece, self), executor or SerialExecutor()
         done = run_job(work, pieces, where, journal=journal, progress=progress)
