@@ -24,6 +24,11 @@ fits to the data themselves."""
 QUICK = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=3)
 """ln Z of simulated data is then known to 0.02 to 0.1: less than what decides."""
 
+THOROUGH = Effort(prior=2048, modes=2048, repeats=2, rounds=8)
+POOR = 0.2
+"""Effort where the quick one leaves a large error of ln Z, and that error: where data are so strong
+that the posterior is small and bent, few draws find it, and the evidence comes out too small."""
+
 HOPELESS = 15.0
 """A model whose largest ln L, which no evidence exceeds, is so far below another's evidence has
 odds below 1e-6: its own evidence is not measured, and that bound stands for it."""
@@ -98,7 +103,10 @@ def _evidences_of(
         if out[k] < best - HOPELESS:
             break
         cube, chi2 = tried[k]
-        found = integrate(fits[k].model, data, cube, chi2, rng, prior=prior[k], effort=QUICK)
+        for effort in (QUICK, THOROUGH):
+            found = integrate(fits[k].model, data, cube, chi2, rng, prior=prior[k], effort=effort)
+            if found.diagnostics["log_z_error"] < POOR:
+                break
         out[k] = found.diagnostics["log_z"]
         best = max(best, out[k])
     return out

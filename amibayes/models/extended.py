@@ -120,7 +120,7 @@ class Extended:
         """Make the source of ``values`` (n_parameters, n)."""
         of = self.named(values)
         flux, colour, log = self._flux(samples, of)
-        wave, rows = self._averaged(samples, of)
+        wave, rows = self._averaged(samples, of, slopes=slopes)
         if not slopes:
             return Source(flux, wave, None)
         found = []
@@ -150,23 +150,29 @@ class Extended:
         colour = np.exp(log * of["slope"])
         return of["flux"] * colour, colour, log
 
-    def _averaged(self, samples: UVPoints, of: dict[str, FloatArray]) -> tuple[ComplexArray, Rows]:
+    def _averaged(
+        self, samples: UVPoints, of: dict[str, FloatArray], *, slopes: bool
+    ) -> tuple[ComplexArray, Rows]:
         """Visibility (n_samples, n) averaged over the channels, and its derivatives."""
         half = 0.5 * samples.relative_band
         if not self.smearing or not half.any():
-            return self._at(samples.u, samples.v, of)
+            return self._at(samples.u, samples.v, of, slopes=slopes)
         factors = [1.0 - NODES * half, 1.0 + NODES * half]
-        (low, below), (high, above) = (self._at(samples.u * f, samples.v * f, of) for f in factors)
+        (low, below), (high, above) = (
+            self._at(samples.u * f, samples.v * f, of, slopes=slopes) for f in factors
+        )
         return 0.5 * (low + high), {k: 0.5 * (below[k] + above[k]) for k in below}
 
     def _at(
-        self, u: FloatArray, v: FloatArray, of: dict[str, FloatArray]
+        self, u: FloatArray, v: FloatArray, of: dict[str, FloatArray], *, slopes: bool
     ) -> tuple[ComplexArray, Rows]:
         """Visibility at frequencies (n_samples,) and its derivatives by every shape."""
         plane = Projection.of(u, v, of["axis_ratio"], of["position_angle_deg"])
         per_mas = np.pi * MAS
         x = per_mas * of[self.size] * plane.length
         value, over_x = PROFILES[self.profile](x)
+        if not slopes:
+            return self._wave(plane, of, x, value, over_x), {}
         by_ratio, by_angle = plane.length_slopes()
         square = (per_mas * of[self.size]) ** 2
         # Derivatives of x²/2, which is smooth where x is 0.
@@ -178,6 +184,23 @@ class Extended:
         if self.profile != "ring":
             return value.astype(complex), {k: over_x * m for k, m in moves.items()}
         return self._ring(plane, of, x, value, over_x, moves)
+
+    def _wave(
+        self,
+        plane: Projection,
+        of: dict[str, FloatArray],
+        x: FloatArray,
+        value: FloatArray,
+        over_x: FloatArray,
+    ) -> ComplexArray:
+        """Visibility without its derivatives."""
+        if self.profile != "ring":
+            return value.astype(complex)
+        wave = value.astype(complex)
+        if self.crescent:
+            along, _ = plane.along(of["bright_angle_deg"] - of["position_angle_deg"])
+            wave = wave + 1j * of["modulation"] * over_x * (np.pi * MAS * of[self.size] * along)
+        return wave * np.exp(-GAUSS * (of["width"] * x) ** 2) if self.smoothed else wave
 
     def _ring(
         self,

@@ -136,6 +136,13 @@ def test_colour_goes_with_wavelength() -> None:
     np.testing.assert_allclose(seen, 1.0 / (1.0 + flux), atol=1e-9)
 
 
+@pytest.mark.parametrize(("component", "theta"), CASES)
+def test_the_visibility_is_the_same_with_slopes(component, theta) -> None:
+    samples, values = uv_points_of(niriss()), np.array(theta)[:, None]
+    alone, both = (component.source(samples, values, slopes=s).wave for s in (False, True))
+    np.testing.assert_allclose(alone, both, atol=1e-13)
+
+
 def test_circle_limits() -> None:
     """A crescent without modulation is a ring; at a ratio of 1 the angle says nothing."""
     samples = uv_points_of(niriss())

@@ -35,7 +35,6 @@ LAYERS = [
     "posterior",
     "limits",
     "comparison",
-    "imaging",
     "pipeline",
     "validation",
     "plots",
