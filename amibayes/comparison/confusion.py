@@ -13,7 +13,7 @@ import numpy as np
 
 from amibayes.comparison.fit_models import ModelFit, embedded
 from amibayes.comparison.fitting import least_squares
-from amibayes.comparison.integral import Effort, PriorDraws, integrate
+from amibayes.comparison.integral import Effort, PriorDraws, integrate, log_z_laplace
 from amibayes.comparison.verdict import Confusion
 from amibayes.units import FloatArray
 
@@ -108,6 +108,10 @@ def _evidences_of(
             if found.diagnostics["log_z_error"] < POOR:
                 break
         out[k] = found.diagnostics["log_z"]
+        if found.diagnostics["log_z_error"] > POOR:
+            # Draws that miss a small, bent posterior make it too small, never too large.
+            laplace = log_z_laplace(fits[k].model, data, cube, chi2)
+            out[k] = max(out[k], laplace)
         best = max(best, out[k])
     return out
 

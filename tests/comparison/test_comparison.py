@@ -14,7 +14,7 @@ from amibayes.comparison.compare import NoiseSetting, compare_sky_models
 from amibayes.comparison.fit_models import embedded, fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import Hypothesis, hypotheses, prior_of
-from amibayes.comparison.integral import Effort, integrate
+from amibayes.comparison.integral import Effort, integrate, log_z_laplace
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.comparison.verdict import Confusion, choose
 from amibayes.errors import UsageError
@@ -244,3 +244,12 @@ def test_choice_by_odds_and_by_confusion() -> None:
     lucky = confusion(10.0, models)
     lucky.log_z[1] = [10.0, 0.0]
     assert choose(models, np.array([10.0, 0.0]), half, lucky).statement == "undecided"
+
+
+def test_laplace_of_a_strong_fit_is_near_the_integral() -> None:
+    base = base_of("companion", TRUTHS["companion"])
+    found = fitted("companion", base)
+    data = base.observables.data
+    sampled = integrate(found.model, data, found.cube, found.chi2, np.random.default_rng(1))
+    laplace = log_z_laplace(found.model, data, found.cube, found.chi2)
+    assert laplace == pytest.approx(sampled.diagnostics["log_z"], abs=1.0)
