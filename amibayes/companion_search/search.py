@@ -43,6 +43,9 @@ MAX_POSITIONS = 2_000_000
 MAX_NUISANCE_ROUNDS = 3
 """How often the exact map is made with the nuisance parameters of the best fit so far."""
 
+MISFIT = 10.0
+"""Reduced χ² of the best fit from which other sizes of the star are tried."""
+
 NUISANCE_HOLDS = 0.02
 """Change of the star's visibility with which the exact map need not be made again."""
 
@@ -194,8 +197,11 @@ def _fits(
         return found
     coarse = coarse_likelihood(likelihood, box)
     tried: list[FloatArray] = []
-    bright = survey.contrasts[peaks(grid, survey.gain, box.fringe_mas)].max() > NOT_FAINT
-    stars = trial_stars(likelihood, single, box) if bright else [single]
+    linear = survey.contrasts[peaks(grid, survey.gain, box.fringe_mas)].max()
+    fitted = max(m.companion.contrast for m in found)
+    stars = [single]
+    if max(linear, fitted) > NOT_FAINT or _misfits(likelihood, found):
+        stars = trial_stars(likelihood, single, box)
     for _ in range(MAX_NUISANCE_ROUNDS):
         new = [star for star in stars if _is_new(likelihood, star, tried)]
         if not new:
@@ -205,6 +211,12 @@ def _fits(
         best = max(found, key=lambda m: m.delta_chi2)
         stars = [np.array(best.theta)[likelihood.parameters.nuisance]]
     return found
+
+
+def _misfits(likelihood: Likelihood, found: Sequence[Mode]) -> bool:
+    """Whether the best of some fits is far from the data: the star it goes with may be wrong."""
+    theta = np.array(max(found, key=lambda m: m.delta_chi2).theta)
+    return bool(likelihood.chi2(theta)[0] > MISFIT * likelihood.n_independent)
 
 
 def _is_new(likelihood: Likelihood, nuisance: FloatArray, tried: list[FloatArray]) -> bool:
