@@ -113,7 +113,7 @@ class Likelihood:
         """The same with V² of a fit (n_dim,) as what is expected of the data.
 
         Noise that is made for these data afterwards has gains in proportion to them, and
-        coherent errors that weigh most on closure phases of faint fringes.
+        coherent errors that are largest in closure phases of faint fringes.
         """
         data, points = self.observables, self.samples
         visibility = self.model.visibility(points, self._sets(theta))

@@ -31,7 +31,7 @@ def calibrators(tmp_path: Path) -> list[Path]:
 KEYS = {
     "amibayes", "seed", "request", "options", "inputs", "data", "fit", "significance", "modes",
     "posterior", "calibration", "limits", "noise", "robust", "evidence", "warnings", "timing_s",
-    "verdict", "consistency", "bootstrap", "models", "confusion", "model_verdict",
+    "verdict", "consistency", "bootstrap", "models", "confusion", "model_verdict", "limits_beside",
 }  # fmt: skip
 
 

@@ -59,7 +59,9 @@ def test_expectation_says_what_is_left() -> None:
     assert coefficient_error(few, PAPER) is None
     more = coefficient_error(replace(PLAN, n_integrations=4 * PLAN.n_integrations), PAPER)
     assert found.error_per_e is not None
-    assert more == pytest.approx(0.5 * found.error_per_e)
+    assert more is not None
+    # Half, but for the prior of linearity, which more integrations do not narrow.
+    assert 0.5 <= more / found.error_per_e < 0.6
 
 
 def test_fewer_groups_where_the_bias_rules() -> None:
