@@ -130,7 +130,14 @@ def _others(content: Json) -> str:
     modes = content["modes"]
     if len(modes) < 2 or content["significance"]["detected"] is False:
         return ""
-    others = [m for m in modes[1:] if m.get("probability", 1.0) >= 0.01]
+    # An alias lies where the field of one answer has ended: a warning says so.
+    rivals = [m for m in modes[1:] if not m["alias"]]
+    whole = modes[0].get("probability", 0.0) + sum(m.get("probability", 0.0) for m in rivals)
+    rivals = [
+        m | ({"probability": m["probability"] / whole} if "probability" in m else {})
+        for m in rivals
+    ]
+    others = [m for m in rivals if m.get("probability", 1.0) >= 0.01]
     if not others:
         return ""
     text = "; ".join(
