@@ -65,7 +65,7 @@ class Exposure:
         if slopes:
             weight[:, 1:] = self.to_node.T @ weight[:, 1:]
         kept = weight if slopes else weight[:, :1]
-        parts = [slice(k, k + CHUNK) for k in range(0, len(index), CHUNK)]
+        parts = [slice(k, k + CHUNK) for k in range(0, max(len(index), 1), CHUNK)]
         found = [kept[p] @ self.coefficients[index[p]] for p in parts]
         return np.asarray(np.concatenate(found).transpose(1, 2, 0))
 

@@ -57,6 +57,14 @@ def test_the_edge_goes_on_for_ever() -> None:
     assert weight[0, 0].sum() == pytest.approx(1.0)
 
 
+def test_no_places_have_no_response(rng: np.random.Generator) -> None:
+    """A limit may leave none whose aliases have to be looked for."""
+    seen = Likelihood(with_lattice(rng)).samples.off_axis
+    assert seen is not None
+    fringe, flux = seen.at((np.empty(0), np.empty(0)))
+    assert fringe.shape[1] == flux.shape[1] == 0
+
+
 def test_lattice_images_are_shifted_images(rng: np.random.Generator) -> None:
     """Of cells that hold no frequency beyond what the interpolation is made for."""
     grid = np.hypot(*np.meshgrid(np.arange(150) - 70.3, np.arange(156) - 80.1))
