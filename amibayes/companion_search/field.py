@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.grid import Grid, make_grid
-from amibayes.companion_search.optimise import fit_single, refine, starting_points
+from amibayes.companion_search.optimise import fit_single, refine_at
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
@@ -183,10 +183,7 @@ def _holds(
     bank = TemplateBank(likelihood, within, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     tail = bank.matched_filter(residuals)(place)[0]
-    seed = starting_points(likelihood, place[None], tail[None], single, box)[0]
-    bright = likelihood.parameters.contrasts
-    seed[bright] = np.clip(seed[bright], *np.array(likelihood.parameters.bounds(bright)).T)
-    theta = np.array(refine(likelihood, seed, box, 0.0).theta)
+    theta = np.array(refine_at(likelihood, place, tail, single, box, 0.0).theta)
     stated = likelihood.expecting(theta)
     noisy = with_noise(stated, fit_noise(stated, theta, prior=prior))
     alone, chi2 = fit_single(noisy)

@@ -228,10 +228,21 @@ def global_check(
     start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
     position = np.asarray(optimiser.optimize(start))
     position = position if inside(position) else start
-    tail = best_at(position)[0][None]
-    seed = starting_points(likelihood, position[None], tail, single, box)[0]
-    low, high = np.array(likelihood.parameters.bounds(likelihood.parameters.contrasts)).T
+    return refine_at(likelihood, position, best_at(position)[0], single, box, deviance_single)
+
+
+def refine_at(
+    likelihood: Likelihood,
+    position: FloatArray,
+    tail: FloatArray,
+    single: FloatArray,
+    box: Box,
+    deviance_single: float,
+) -> Mode:
+    """Fit from a position (2,) with the contrasts and rates that a matched filter gives there."""
+    seed = starting_points(likelihood, position[None], tail[None], single, box)[0]
     bright = likelihood.parameters.contrasts
+    low, high = np.array(likelihood.parameters.bounds(bright)).T
     seed[bright] = np.clip(seed[bright], low, high)
     return refine(likelihood, seed, box, deviance_single)
 

@@ -171,17 +171,6 @@ class SearchResult:
     aliases: tuple[Mode, ...] = ()
 
     @property
-    def unambiguous_mas(self) -> float | None:
-        """Separation within which no position has an alias; None where the first mode has none.
-
-        Half of the shortest step to one: the (u, v) coverage repeats the sky at such steps. The
-        opposite position, which closure phases tell, does not count.
-        """
-        here = np.array(self.modes[0].place)
-        steps = [np.subtract(m.place, here) for m in self.aliases if not is_opposite(m, here)]
-        return 0.5 * float(min(np.hypot(*s) for s in steps)) if steps else None
-
-    @property
     def delta_chi2(self) -> float:
         """2Δln L of the companion: χ² without minus χ² with it where the covariance is known."""
         single, binary = self.likelihood.deviance([self.chi2_single, self.chi2_binary])

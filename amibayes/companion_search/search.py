@@ -193,11 +193,12 @@ def _fits(
     if known is not None:
         return refine_all(likelihood, np.vstack([seeds, known]), box, deviance_single)
     found = refine_all(likelihood, seeds, box, deviance_single)
-    if not may_be_bright(survey, peaks(grid, survey.gain, box.fringe_mas)):
+    at = peaks(grid, survey.gain, box.fringe_mas)
+    if not may_be_bright(survey, at):
         return found
     coarse = coarse_likelihood(likelihood, box)
     tried: list[FloatArray] = []
-    linear = survey.contrasts[peaks(grid, survey.gain, box.fringe_mas)].max()
+    linear = survey.contrasts[at].max()
     fitted = max(m.companion.contrast for m in found)
     stars = [single]
     if max(linear, fitted) > NOT_FAINT or _misfits(likelihood, found):

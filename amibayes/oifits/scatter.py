@@ -40,14 +40,13 @@ def scatter_table(
     share = upper.data / (sigma[upper.row] * sigma[upper.col])
     columns = {"IINDX": ("J", pairs[0]), "JINDX": ("J", pairs[1]), "SCATTER": ("D", share)}
     built = [fits.Column(name, form, array=values) for name, (form, values) in columns.items()]
-    table = fits.BinTableHDU.from_columns(built, name=SCATTER)
-    table.header["CORRNAME"] = corrname
-    for line in (
+    return _table(
+        SCATTER,
+        built,
+        corrname,
         "Covariance by the scatter between integrations alone, in units of the errors",
         "of the two data; that of OI_CORR has the expected noise in it too.",
-    ):
-        table.header["COMMENT"] = line
-    return table
+    )
 
 
 def scatter_of(
@@ -64,15 +63,10 @@ def scatter_of(
         Place of each datum in it; 0 where it has none.
     variance : (n,) float array
     """
-    found = [t for t in oifits.tables if t.name == SCATTER]
-    if len(tables) != 1 or len(found) != 1 or not (index > 0).all():
+    columns = _columns(oifits, SCATTER, tables, index)
+    if columns is None:
         return None
-    columns: Any = found[0].columns
-    if found[0].keyword("CORRNAME") != tables[0].keyword("CORRNAME") or not len(found[0]):
-        return None
-    place = np.full(max(int(c.max()) for c in (columns["IINDX"], columns["JINDX"], index)) + 1, -1)
-    place[index] = np.arange(len(index))
-    row, column = place[columns["IINDX"]], place[columns["JINDX"]]
+    row, column = _places(index, columns["IINDX"], columns["JINDX"])
     sigma = np.sqrt(variance)
     used = (row >= 0) & (column >= 0) & np.isfinite(columns["SCATTER"])
     row, column = row[used], column[used]
@@ -104,14 +98,13 @@ def shared_table(
         fits.Column("INDX", "J", array=np.tile(index, n)),
         fits.Column("CHANGE", "D", array=share.T.ravel()),
     ]
-    table = fits.BinTableHDU.from_columns(built, name=SHARED)
-    table.header["CORRNAME"] = corrname
-    for line in (
+    return _table(
+        SHARED,
+        built,
+        corrname,
         "Changes of the data, in units of their errors, for one standard deviation of",
         "errors that data of other files have too, under the same name.",
-    ):
-        table.header["COMMENT"] = line
-    return table
+    )
 
 
 def shared_of(
@@ -128,15 +121,10 @@ def shared_of(
         Place of each datum in it; 0 where it has none.
     variance : (n,) float array
     """
-    found = [t for t in oifits.tables if t.name == SHARED]
-    if len(tables) != 1 or len(found) != 1 or not (index > 0).all() or not len(found[0]):
+    columns = _columns(oifits, SHARED, tables, index)
+    if columns is None:
         return None
-    columns: Any = found[0].columns
-    if found[0].keyword("CORRNAME") != tables[0].keyword("CORRNAME"):
-        return None
-    place = np.full(max(int(columns["INDX"].max()), int(index.max())) + 1, -1)
-    place[index] = np.arange(len(index))
-    row = place[columns["INDX"]]
+    (row,) = _places(index, columns["INDX"])
     label = [str(name).strip() for name in columns["NAME"]]
     names = tuple(dict.fromkeys(label))
     changes = np.zeros((len(index), len(names)))
@@ -145,3 +133,34 @@ def shared_of(
     column = np.array([names.index(name) for name in label])
     changes[row[used], column[used]] = value[used] * np.sqrt(variance)[row[used]]
     return SharedErrors(names, changes)
+
+
+def _table(
+    name: str, columns: list[fits.Column], corrname: str, *comments: str
+) -> fits.BinTableHDU:
+    """Make a table that belongs to an OI_CORR."""
+    table = fits.BinTableHDU.from_columns(columns, name=name)
+    table.header["CORRNAME"] = corrname
+    for line in comments:
+        table.header["COMMENT"] = line
+    return table
+
+
+def _columns(oifits: OIFits, name: str, tables: list[OITable], index: IntArray) -> Any:
+    """Columns of the one table of a name that belongs to the OI_CORR in use; None without it.
+
+    None as well where not all data, of places ``index`` (n,), stand in that OI_CORR.
+    """
+    found = [t for t in oifits.tables if t.name == name]
+    if len(tables) != 1 or len(found) != 1 or not (index > 0).all() or not len(found[0]):
+        return None
+    if found[0].keyword("CORRNAME") != tables[0].keyword("CORRNAME"):
+        return None
+    return found[0].columns
+
+
+def _places(index: IntArray, *wanted: IntArray) -> list[IntArray]:
+    """Which datum, of places ``index`` (n,) in OI_CORR, stands at others; −1 for none of them."""
+    place = np.full(max(int(c.max()) for c in (index, *wanted)) + 1, -1)
+    place[index] = np.arange(len(index))
+    return [place[c] for c in wanted]

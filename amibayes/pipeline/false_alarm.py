@@ -141,5 +141,5 @@ def verdict_of(
         splits = consistency(result, rng, stated=data, prior=noise_prior(stated, options))
     test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
     rest = structure(test, options, rng, executor)
-    better = rest.probability > options.alpha or not within_calibration(test)
-    return verdict(result, tested, rest, splits, structured=better), splits
+    structured = rest.probability > options.alpha or not within_calibration(test)
+    return verdict(result, tested, rest, splits, structured=structured), splits
