@@ -13,6 +13,29 @@ from amibayes.errors import DataError
 from amibayes.units import FloatArray, IntArray
 
 
+INDEPENDENT = 1e-8
+"""Length, in units of the longest column, from which on what is new in a column is no rounding."""
+
+
+def orthonormal(columns: FloatArray) -> FloatArray:
+    """Orthonormal basis (n, rank) of the space of some columns (n, k), by Gram and Schmidt.
+
+    Singular vectors of equal singular values (those of closure phases are all equal) are turned
+    by the last digits, and with them all noise that is drawn in whitened data: from one
+    processor to the next. This basis is a smooth function of the columns.
+    """
+    columns = np.asarray(columns, dtype=float)
+    least = INDEPENDENT * float(np.linalg.norm(columns, axis=0).max(initial=0.0))
+    basis = np.empty((len(columns), 0))
+    for column in columns.T:
+        rest = column - basis @ (basis.T @ column)
+        rest = rest - basis @ (basis.T @ rest)  # once more: the first leaves rounding
+        length = float(np.linalg.norm(rest))
+        if length > least:
+            basis = np.column_stack([basis, rest / length])
+    return basis
+
+
 @dataclass(frozen=True, eq=False)
 class Block:
     """A correlated group of entries.
@@ -36,8 +59,7 @@ class Block:
         """Keep the entries ``inside`` of the block, which then stand at ``position``."""
         basis = self.basis
         if basis is not None:
-            left, singular, _ = np.linalg.svd(basis[inside], full_matrices=False)
-            basis = left[:, singular > 1e-8]
+            basis = orthonormal(basis[inside])
         return Block(position, self.matrix[np.ix_(inside, inside)], basis)
 
 
@@ -95,7 +117,11 @@ class Stack:
     def scaled(self, factors: FloatArray) -> Stack:
         """Blocks of data that are multiplied by numbers (size,)."""
         f = factors[self.index]
-        basis = None if self.basis is None else np.linalg.qr(f[:, :, None] * self.basis)[0]
+        basis = None
+        if self.basis is not None:
+            basis, upper = np.linalg.qr(f[:, :, None] * self.basis)
+            # Signs as those of `orthonormal`, which do not depend on rounding.
+            basis = basis * np.sign(np.einsum("grr->gr", upper))[:, None]
         return Stack(self.index, f[:, :, None] * self.matrix * f[:, None], basis)
 
     def select(self, place: IntArray) -> list[Stack]:

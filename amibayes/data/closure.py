@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import nnls
 
+from amibayes.data.blocks import orthonormal
 from amibayes.units import FloatArray, IntArray
 
 RIDGE = 1e-4
@@ -98,8 +99,7 @@ def _closure_matrix(triangles: bytes) -> tuple[FloatArray, IntArray]:
 
 def kernel_basis(matrix: FloatArray) -> FloatArray:
     """Orthonormal basis (n_triangles, rank) of the closure phases that a matrix can produce."""
-    left, singular, _ = np.linalg.svd(matrix, full_matrices=False)
-    return np.asarray(left[:, singular > 1e-8 * singular[0]])
+    return orthonormal(matrix)
 
 
 def baseline_variances(matrix: FloatArray, closure_variance: FloatArray) -> FloatArray:

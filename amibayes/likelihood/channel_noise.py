@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
+from amibayes.data.blocks import orthonormal
 from amibayes.data.covariance import (
     BlockCovariance,
     Covariance,
@@ -144,9 +145,7 @@ class ChannelCovariance:
     def select(self, keep: IntArray) -> Covariance:
         """Covariance of the entries ``keep``, in that order."""
         colour = csr_array(self._colouring)[keep].toarray()
-        left, singular, _ = np.linalg.svd(colour, full_matrices=False)
-        basis = left[:, singular > 1e-8 * singular.max(initial=0.0)]
-        return dense_covariance(colour @ colour.T, basis)
+        return dense_covariance(colour @ colour.T, orthonormal(colour))
 
 
 def _colouring(covariance: Covariance) -> Any:

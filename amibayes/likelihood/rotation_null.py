@@ -9,6 +9,7 @@ however wrong the expected noise that S was shrunk towards.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -43,6 +44,11 @@ class RotationNull:
     def __post_init__(self) -> None:
         read_only(self, "factor", "residual")
 
+    @cached_property
+    def _axes(self) -> FloatArray:
+        """Orthonormal directions (n_data, k) of the columns of the factor, which are orthogonal."""
+        return np.asarray(self.factor / np.linalg.norm(self.factor, axis=0))
+
     def draw(self, noise: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Means d of other rotations, (n_data, n); their scatter is S + residual² − ddᵀ.
 
@@ -53,8 +59,10 @@ class RotationNull:
         rng : numpy.random.Generator
             For the directions that are no datum.
         """
-        k = self.factor.shape[1]
-        normal, along = noise[:k], rng.standard_normal(noise.shape[1])
+        k, along = self.factor.shape[1], rng.standard_normal(noise.shape[1])
+        # Turned along the factor, which eigenvectors of whatever sign and order make up: the
+        # products are then the same on every machine.
+        normal = self._axes.T @ noise
         left = self.rows - k - 1.0
         rest = rng.chisquare(left, noise.shape[1]) if left > 0.0 else 0.0
         length = np.sqrt((normal**2).sum(axis=0) + along**2 + rest)

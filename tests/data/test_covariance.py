@@ -170,3 +170,13 @@ def test_sum_with_a_sparse_covariance_and_selection_are_those_of_the_matrices(
         np.linalg.pinv(dense + 0.5 * added, rcond=1e-10)[np.concatenate(places[3:])] @ x,
         atol=1e-8,
     )
+
+
+def test_basis_of_closures_does_not_turn_with_the_last_digits() -> None:
+    """All singular values of the closures of an array are equal: their vectors are any."""
+    matrix = closure_matrix(triangles(7))[0]
+    basis = kernel_basis(matrix)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(15), atol=1e-14)
+    np.testing.assert_allclose(basis @ (basis.T @ matrix), matrix, atol=1e-13)
+    shaken = matrix * (1.0 + 1e-12 * np.random.default_rng(1).standard_normal(matrix.shape))
+    np.testing.assert_allclose(kernel_basis(shaken), basis, atol=1e-10)

@@ -117,7 +117,7 @@ noise within its prior may hide spots."""
 
 @pytest.mark.parametrize("kind", EXPECTED)
 def test_one_of_each_kind_is_told_for_what_it_is(kind: str) -> None:
-    rng = np.random.default_rng([1, list(KINDS).index(kind)])
+    rng = np.random.default_rng([7, list(KINDS).index(kind)])
     data = observed(niriss(), KINDS[kind](rng), rng)
     found, _ = told(data, rng)
     assert found.statement in EXPECTED[kind], found
