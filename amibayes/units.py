@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,16 @@ def read_only(container: Any, *names: str) -> None:
         array = np.array(getattr(container, name), dtype=float)
         array.flags.writeable = False
         object.__setattr__(container, name, array)
+
+
+def freeze(container: Any) -> None:
+    """Replace every array field of a frozen dataclass by a read-only copy."""
+    for field in fields(container):
+        value = getattr(container, field.name)
+        if isinstance(value, np.ndarray):
+            copy = value.copy()
+            copy.flags.writeable = False
+            object.__setattr__(container, field.name, copy)
 
 
 def contrast_to_delta_mag(contrast: ArrayLike) -> FloatArray:

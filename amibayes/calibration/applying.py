@@ -59,7 +59,7 @@ def apply_response(
     sharing = target.select(*_on_entries(target, keep)).unflagged()
     used = sharing.without_shared_errors()
     key, sign = keys.key[keep], keys.sign[keep]
-    value, target_slope, response_slope = _values(used, key, sign, response)
+    value, target_slope, response_slope = _values(used, key, sign, response, keys.periodic[key])
     spread = coo_array((response_slope, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
     own = diags_array(target_slope)
     shared = _shared(sharing.shared, target_slope, response.shared, key, response_slope)
@@ -100,7 +100,11 @@ def _shared(
 
 
 def _values(
-    used: Observables, key: np.ndarray, sign: np.ndarray, response: TransferFunction
+    used: Observables,
+    key: np.ndarray,
+    sign: np.ndarray,
+    response: TransferFunction,
+    periodic: BoolArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Calibrated data and their derivatives by the target's datum and by the response.
 
@@ -110,7 +114,7 @@ def _values(
     of the target's datum over that V², whose error does not go with that of the ratio.
     """
     n, data, m = used.n_vis2, used.data, response.value[key]
-    value = np.concatenate([data[:n] / m[:n], wrapped(data[n:] - (sign * m)[n:])])
+    value = np.concatenate([data[:n] / m[:n], wrapped(data[n:] - (sign * m)[n:], periodic[n:])])
     by_target, by_response = np.ones(len(data)), -sign.astype(float)
     if n:
         own = used.covariance.variance[:n]

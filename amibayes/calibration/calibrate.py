@@ -238,7 +238,7 @@ def _transfers(
 
 def _consistent(serving: list[Transfer], keys: Keys, clip: float | None) -> list[Transfer]:
     """Calibrators with closure phases on one branch, without outliers."""
-    kept = on_one_branch(serving, keys.n_vis2)
+    kept = on_one_branch(serving, keys)
     return kept if clip is None else clipped(kept, keys, clip)
 
 
@@ -277,6 +277,12 @@ def _serving(
     serving = [j for j, transfer in enumerate(seen) if transfer.seen.any()]
     if not serving:
         names = ", ".join(c.source or "calibrator" for c in calibrators)
+        if any(s.kernel is not None for part in (target, *calibrators) for s in part.setups):
+            raise DataError(
+                f"has another kernel matrix, or wavelength, than {names}",
+                source=target.source,
+                remedy="extract both with one model of the pupil",
+            )
         raise DataError(
             f"has no baseline at the same wavelength in common with {names}",
             source=target.source,

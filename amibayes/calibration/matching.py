@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.data.closure import canonical
+from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import Measurements, Observables, Setup
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -64,6 +65,12 @@ class Keys:
 
     def __len__(self) -> int:
         return len(self.table)
+
+    @property
+    def periodic(self) -> BoolArray:
+        """Which keys are phases with a period of 2π: closure phases, not kernel phases."""
+        stations = self.table[:, 3:]
+        return np.asarray((stations[:, 2] >= 0) & ~stands_alone(stations))
 
     def closure_sets(self) -> list[IntArray]:
         """Keys of closure phases that share baselines: of one configuration, epoch and channel."""
@@ -246,12 +253,14 @@ def _station_map(configuration: Configuration, calibrator: Observables, setup: i
     """The target's station of each station of the calibrator, −1 for none.
 
     Stations are known by name; where no two names are shared, by their positions in the
-    mask or array, and last by the (u, v) coordinates of their baselines.
+    mask or array, and last by the (u, v) coordinates of their baselines. Kernel phases are
+    one where they have one name, which depends on the kernel matrix.
     """
     other = calibrator.setups[setup]
     names = {name.casefold(): i for i, name in enumerate(configuration.setup.stations)}
     by_name = np.array([names.get(s.casefold(), -1) for s in other.stations], dtype=np.intp)
-    if (by_name >= 0).sum() >= 2:
+    kernels = configuration.setup.kernel is not None or other.kernel is not None
+    if kernels or (by_name >= 0).sum() >= 2:
         return by_name
     if configuration.setup.station_xyz_m is not None and other.station_xyz_m is not None:
         found = _nearest(configuration.setup.station_xyz_m, other.station_xyz_m)

@@ -61,7 +61,7 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
     n_vis2 = calibrator.n_vis2
     scale, slope = _disc_correction(calibrator, found, diameter[0])
     value = calibrator.data[found.entry] * found.sign
-    value = np.where(found.entry < n_vis2, value, _unwrapped(value, found.key, len(keys)))
+    value = np.where(found.entry < n_vis2, value, _unwrapped(value, found.key, keys))
     weight = 1.0 / (calibrator.covariance.variance[found.entry] * scale**2)
     weight /= np.bincount(found.key, weight, len(keys))[found.key]
     combine = coo_array(
@@ -85,29 +85,29 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
     )
 
 
-def _unwrapped(value: FloatArray, key: IntArray, n_keys: int) -> FloatArray:
+def _unwrapped(value: FloatArray, key: IntArray, keys: Keys) -> FloatArray:
     """Phases of one key on one branch: within half a turn of the first."""
-    first = np.zeros(n_keys)
+    first = np.zeros(len(keys))
     first[key[::-1]] = value[::-1]
-    return np.asarray(first[key] + wrapped(value - first[key]))
+    return np.asarray(first[key] + wrapped(value - first[key], keys.periodic[key]))
 
 
-def on_one_branch(transfers: Sequence[Transfer], n_vis2: int) -> list[Transfer]:
+def on_one_branch(transfers: Sequence[Transfer], keys: Keys) -> list[Transfer]:
     """Closure phases of all calibrators within half a turn of the first one's."""
     first = np.zeros(len(transfers[0].value))
     for transfer in reversed(transfers):
         first[transfer.seen] = transfer.value[transfer.seen]
     out = []
     for transfer in transfers:
-        value = np.where(transfer.seen, first + wrapped(transfer.value - first), 0.0)
-        value[:n_vis2] = transfer.value[:n_vis2]
+        near = first + wrapped(transfer.value - first)
+        value = np.where(transfer.seen & keys.periodic, near, transfer.value)
         out.append(replace(transfer, value=value))
     return out
 
 
-def wrapped(phase: FloatArray) -> FloatArray:
-    """Phase in [−π, π); one that is there already keeps every bit."""
-    turns = np.floor((phase + np.pi) / (2 * np.pi))
+def wrapped(phase: FloatArray, periodic: BoolArray | bool = True) -> FloatArray:
+    """Phase in [−π, π); one that is there already, or has no period, keeps every bit."""
+    turns = np.where(periodic, np.floor((phase + np.pi) / (2 * np.pi)), 0.0)
     return np.where(turns == 0, phase, phase - 2 * np.pi * turns)
 
 

@@ -1,8 +1,9 @@
-"""``amibayes audit``: what is wrong or doubtful in an OIFITS file."""
+"""``amibayes audit``: what is wrong or doubtful in an OIFITS or KPFITS file."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,10 @@ from amibayes.errors import UsageError
 from amibayes.support.terminal import shortened
 
 if TYPE_CHECKING:
+    from amibayes.kpfits.audit import KernelAudit
     from amibayes.oifits.audit import Audit, Finding
+
+    AnyAudit = Audit | KernelAudit
 
 RESULT = "audit.json"
 
@@ -26,7 +30,7 @@ exit status: 0 nothing found, 1 findings, 3 a file that cannot be read
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``audit``."""
     parser.epilog = EXAMPLES
-    parser.add_argument("files", nargs="+", metavar="FILE", help="OIFITS file(s)")
+    parser.add_argument("files", nargs="+", metavar="FILE", help="OIFITS or KPFITS file(s)")
     parser.add_argument(
         "--fix",
         action="store_true",
@@ -40,10 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.files)
     from amibayes import __version__
-    from amibayes.oifits.audit import audit
     from amibayes.support.atomic_files import output_folder, write_json
 
-    audits = [audit(path) for path in arguments.files]
+    audits = [_audited(path) for path in arguments.files]
     copies = _copies(arguments, audits)
     folder = output_folder(arguments.out, [RESULT, *copies.values()], overwrite=arguments.overwrite)
     fixed = _fix(audits, copies, folder)
@@ -54,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
             a.as_json()
             | {
                 "fixed": [f.code for f in done],
-                "copy": str(folder / copies[a.oifits.path]) if done else None,
+                "copy": str(folder / copies[a.path]) if done else None,
             }
             for a, done in zip(audits, fixed, strict=True)
         ],
@@ -64,7 +67,17 @@ def run(arguments: argparse.Namespace) -> int:
     return int(any(a.findings for a in audits))
 
 
-def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str]:
+def _audited(path: str) -> AnyAudit:
+    """Audit a file by what it holds."""
+    from amibayes.extraction.reading import contents_of
+    from amibayes.kpfits import is_kpfits
+    from amibayes.kpfits.audit import audit_kpfits
+    from amibayes.oifits.audit import audit
+
+    return audit_kpfits(path) if is_kpfits(contents_of(path).names) else audit(path)
+
+
+def _copies(arguments: argparse.Namespace, audits: Sequence[AnyAudit]) -> dict[str, str]:
     """Name of the corrected copy of each file that has something certain to correct.
 
     Raises
@@ -74,7 +87,7 @@ def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str
     """
     if not arguments.fix:
         return {}
-    paths = [a.oifits.path for a in audits if any(f.certain for f in a.findings)]
+    paths = [a.path for a in audits if any(f.certain for f in a.findings)]
     names = {path: Path(path).name for path in paths}
     if len(set(names.values())) < len(names):
         raise UsageError(
@@ -83,23 +96,25 @@ def _copies(arguments: argparse.Namespace, audits: list[Audit]) -> dict[str, str
     return names
 
 
-def _fix(audits: list[Audit], copies: dict[str, str], folder: Path) -> list[list[Finding]]:
-    from amibayes.oifits.audit import repair
+def _fix(audits: Sequence[AnyAudit], copies: dict[str, str], folder: Path) -> list[list[Finding]]:
+    from amibayes.oifits.audit import Audit, repair
 
     out: list[list[Finding]] = []
     for a in audits:
-        name = copies.get(a.oifits.path)
+        name = copies.get(a.path)
         target = folder / name if name else None
-        if target is not None and target.resolve() == Path(a.oifits.path).resolve():
+        if target is not None and target.resolve() == Path(a.path).resolve():
             raise UsageError(
                 "would be written over itself", source=target, remedy="choose another --out"
             )
-        out.append([] if target is None else repair(a.oifits, list(a.findings), target))
+        out.append(
+            repair(a.oifits, list(a.findings), target) if target and isinstance(a, Audit) else []
+        )
     return out
 
 
 def _summary(
-    audits: list[Audit], fixed: list[list[Finding]], copies: dict[str, str], folder: Path
+    audits: Sequence[AnyAudit], fixed: list[list[Finding]], copies: dict[str, str], folder: Path
 ) -> list[str]:
     """At most 20 lines: what was found, each kind once for a file; the rest is in the JSON."""
     lines = []
@@ -107,8 +122,8 @@ def _summary(
         count = len(a.findings)
         found = "nothing found" if not count else f"{count} finding{'s' if count > 1 else ''}"
         if done:
-            found += f", {len(done)} corrected in {folder / copies[a.oifits.path]}"
-        lines.append(f"{a.oifits.path}: OIFITS {a.oifits.version}, {found}")
+            found += f", {len(done)} corrected in {folder / copies[a.path]}"
+        lines.append(f"{a.path}: {a.format}, {found}")
         lines += [_line(group) for group in _alike(a.findings)]
     return shortened(lines, [f"explained in {folder / RESULT}"])
 

@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from amibayes.calibration import calibrate, diameters_of
     from amibayes.extraction.reading import check_together, of_one_visit
-    from amibayes.oifits import write_oifits
+    from amibayes.kpfits import write_observables
     from amibayes.support.atomic_files import output_folder
 
     check_together(arguments.targets, arguments.cal)
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         charge_levels=arguments.charge_levels,
         rng=np.random.default_rng(arguments.seed),
     )
-    write_oifits(folder / RESULT, found.observables, overwrite=True)
+    write_observables(folder / RESULT, found.observables)
     content = _json(arguments, found, folder)
     common.finish(arguments, content, lambda: _summary(found, folder))
     return 0
@@ -151,7 +151,7 @@ def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> di
 def _summary(found: Calibration, folder: Path) -> list[str]:
     used = found.observables
     lines = [
-        f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
+        f"data        {used.n_vis2} V2, {used.n_closure_phases} {used.phase_name}s, "
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"method      {found.method}",
     ]

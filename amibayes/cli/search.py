@@ -188,13 +188,13 @@ def _write(
     arguments: argparse.Namespace, report: SearchReport, folder: Path, request: str
 ) -> dict[str, object]:
     """Write everything but the chain; the result last: where it is, the run is finished."""
-    from amibayes.oifits import write_oifits
+    from amibayes.kpfits import write_observables
     from amibayes.plots.pictures import save_pictures
     from amibayes.report import captioned, result_json, search_page, write_page
     from amibayes.support.atomic_files import write_json
 
     if report.calibration is not None:
-        write_oifits(folder / CALIBRATED, report.observables, overwrite=True)
+        write_observables(folder / CALIBRATED, report.observables)
     drawn = save_pictures(report, folder)
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from amibayes.data.blocks import orthonormal
+from amibayes.data.kernel_model import stands_alone
 from amibayes.units import FloatArray, IntArray
 
 RIDGE = 1e-4
@@ -34,13 +35,15 @@ def canonical(stations: IntArray) -> tuple[IntArray, IntArray]:
     ordered : int array of the same shape
     sign : (n,) int array
         +1 or −1: a closure phase changes sign when two stations change places (0 where a
-        station comes twice). A squared visibility does not: always +1.
+        station comes twice, +1 for kernel phases, see `amibayes.data.kernel_model`). A squared
+        visibility does not: always +1.
     """
     ordered = np.sort(stations, axis=1)
     if stations.shape[1] == 2:
         return ordered, np.ones(len(stations), dtype=np.intp)
     a, b, c = stations.T
-    return ordered, np.sign((b - a) * (c - a) * (c - b)).astype(np.intp)
+    sign = np.sign((b - a) * (c - a) * (c - b)).astype(np.intp)
+    return ordered, np.where(stands_alone(stations), 1, sign)
 
 
 def canonical_uv(stations: IntArray, u_m: FloatArray, v_m: FloatArray) -> FloatArray:
@@ -78,6 +81,7 @@ def closure_matrix(triangles: IntArray) -> tuple[FloatArray, IntArray]:
     -------
     matrix : (n, n_baselines) float array
         Entries −1, 0, +1; a baseline is counted positive from the lower to the higher station.
+        A kernel phase has a column of its own, with √3: as much noise as three baselines make.
     baselines : (n_baselines, 2) int array
         The baselines that the triangles use, each with its lower station first.
     """
@@ -94,6 +98,8 @@ def _closure_matrix(triangles: bytes) -> tuple[FloatArray, IntArray]:
     baselines, column = np.unique(np.sort(legs, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
     matrix = np.zeros((len(a), len(baselines)))
     np.add.at(matrix, (np.repeat(np.arange(len(a)), 3), column.ravel()), sign.ravel())
+    alone = np.flatnonzero((a == b) & (b == c))
+    matrix[alone, column.reshape(-1, 3)[alone, 0]] = np.sqrt(3.0)
     return matrix, baselines
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from astropy.table import QTable
@@ -14,11 +14,14 @@ from scipy.sparse import csr_array
 from amibayes.data.closure import closure_matrix
 from amibayes.data.covariance import Covariance, stack_covariances
 from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
-from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.kernel_model import stands_alone
+from amibayes.data.setup import Setup
 from amibayes.data.shared_errors import SharedErrors, joined_errors, vis2_first, with_shared
 from amibayes.data.tables import observables_html, observables_table
 from amibayes.errors import DataError
-from amibayes.units import BoolArray, FloatArray, IntArray
+from amibayes.units import BoolArray, FloatArray, IntArray, freeze
+
+__all__ = ["CovarianceKind", "Measurements", "Observables", "Setup", "closure_sets", "join"]
 
 CovarianceKind = Literal["diagonal", "assumed", "given", "estimated"]
 
@@ -26,56 +29,6 @@ SIMULTANEOUS_S = 17.0
 """Rows of one setup nearer in time than this, or than they were integrated, go together."""
 
 DAY_S = 86400.0
-
-
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """One instrument configuration: its name, stations and spectral channels.
-
-    Parameters
-    ----------
-    insname, arrname, target : str
-        Names as OIFITS gives them (stripped).
-    stations : tuple of str
-        Station names; `Measurements.stations` indexes them.
-    station_index : (n_stations,) int array
-        The numbers that OIFITS uses for them (STA_INDEX).
-    wavelength_m, band_m : (n_channels,) float array
-        Effective wavelength and width of each channel, in metres.
-    station_xyz_m : (n_stations, 3) float array, optional
-        Positions (holes of a mask, telescopes of an array) in metres.
-    station_diameter_m : (n_stations,) float array, optional
-    source : str
-        The file the data come from.
-    right_ascension_deg, declination_deg : float
-        Of the target (0 where unknown).
-    response : OffAxisResponse, optional
-        What the extraction lets through of light off the axis.
-    array_frame : str
-        FRAME of OI_ARRAY: "GEOCENTRIC" coordinates have their origin in ``array_centre_m``;
-        empty on the sky, or where unknown.
-    array_centre_m : tuple of float
-        ARRAYX, ARRAYY, ARRAYZ.
-    """
-
-    insname: str
-    arrname: str
-    target: str
-    stations: tuple[str, ...]
-    station_index: IntArray
-    wavelength_m: FloatArray
-    band_m: FloatArray
-    station_xyz_m: FloatArray | None = None
-    station_diameter_m: FloatArray | None = None
-    source: str = ""
-    right_ascension_deg: float = 0.0
-    declination_deg: float = 0.0
-    response: OffAxisResponse | None = None
-    array_frame: str = ""
-    array_centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        _freeze(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +78,7 @@ class Measurements:
             column = getattr(self, field.name)
             if column is not None and len(column) != len(self.value):
                 raise ValueError(f"{field.name} has another length than value")
-        _freeze(self)
+        freeze(self)
 
     def __len__(self) -> int:
         return len(self.value)
@@ -233,6 +186,13 @@ class Observables:
         return int((~self.closure_phase.flag).sum())
 
     @property
+    def phase_name(self) -> str:
+        """What the phases are: closure phases, kernel phases or both, in the singular."""
+        alone = stands_alone(self.closure_phase.stations)
+        both = "closure or kernel phase" if alone.any() else "closure phase"
+        return "kernel phase" if alone.any() and alone.all() else both
+
+    @property
     def n_independent(self) -> int:
         """Number of independent data."""
         return self.covariance.rank
@@ -310,15 +270,6 @@ class Observables:
             f"{self.n_independent} independent data, {self.covariance_kind} covariance, "
             f"{', '.join(dict.fromkeys(s.insname for s in self.setups))}>"
         )
-
-
-def _freeze(container: Any) -> None:
-    for field in fields(container):
-        value = getattr(container, field.name)
-        if isinstance(value, np.ndarray):
-            copy = value.copy()
-            copy.flags.writeable = False
-            object.__setattr__(container, field.name, copy)
 
 
 def exposure_labels(closure_phase: Measurements) -> IntArray:

@@ -23,6 +23,7 @@ from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.response import pipeline_response
 from amibayes.extraction.visits import visit_maps
 from amibayes.instrument import load_instrument
+from amibayes.kpfits import is_kpfits, kernel_observables
 from amibayes.oifits import OIFits, observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
@@ -221,22 +222,13 @@ def residual_share(path: str) -> str:
 
 
 def _has_kernel_phases(contents: Contents) -> bool:
-    return "KP-DATA" in contents.names
+    return is_kpfits(contents.names)
 
 
 def _kernel_phases(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    """Refuse KPFITS (Kammerer et al. 2022), whose images would be taken for those of a mask."""
-    contents = contents_of(paths[0])
-    shapes = dict(zip(contents.names, contents.shapes, strict=True))
-    size = (shapes.get("KER-MAT") or ("?", "?"))[:2]
-    raise DataError(
-        f"holds kernel phases (KPFITS): {size[0]} sums over {size[1]} baselines each, where "
-        "amibayes takes V² and phases of three baselines that close",
-        source=paths[0],
-        remedy="give the images of a mask (calints) or OIFITS; fouriever fits kernel phases",
-    )
+    return [kernel_observables(path, **options) for path in paths]
 
 
 FORMATS: tuple[InputFormat, ...] = (

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import Observables
 from amibayes.likelihood.noise import NoiseModel, noise_of
 from amibayes.models.bands import band_numbers
@@ -70,6 +71,8 @@ class Likelihood:
         self.noise = noise_of(self.observables) if noise is None else noise
         self.samples = _samples(self.observables, self.model) if samples is None else samples
         self._n2 = len(self.observables.vis2)
+        alone = stands_alone(self.observables.closure_phase.stations)
+        self._turn = np.where(alone, 0.0, 2.0 * np.pi)[:, None]
 
     @property
     def parameters(self) -> Parameters:
@@ -123,7 +126,8 @@ class Likelihood:
             expected=self._observe(visibility)[: self._n2, 0],
             coherent_slope=np.sqrt(points.squares @ (4.0 * size2)),
         )
-        slopes = np.sqrt(abs(points.legs) @ (1.0 / size2)) if self._n2 < len(data.data) else None
+        has_phases = self._n2 < len(data.data)
+        slopes = np.sqrt(points.legs.power(2) @ (1.0 / size2)) if has_phases else None
         closure = replace(data.closure_phase, coherent_slope=slopes)
         return Likelihood(
             replace(data, vis2=vis2, closure_phase=closure), self.model, self.noise, points
@@ -227,9 +231,12 @@ class Likelihood:
         return self.wrapped(self.observables.data[:, None] - model)
 
     def wrapped(self, change: FloatArray) -> FloatArray:
-        """Differences of data (n_data, n), closure phases the short way round; in place."""
+        """Differences of data (n_data, n), closure phases the short way round; in place.
+
+        Kernel phases are real sums and have no period.
+        """
         closure = change[self._n2 :]
-        closure -= 2.0 * np.pi * np.rint(closure / (2.0 * np.pi))
+        closure -= self._turn * np.rint(closure / (2.0 * np.pi))
         return change
 
 

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import Observables
 from amibayes.data.off_axis_response import bspline_weights
 from amibayes.units import MAS, ComplexArray, FloatArray, IntArray, read_only
@@ -172,8 +173,11 @@ def off_axis_of(
     if all(s.response is None for s in data.setups):
         return None
     v2, cp = data.vis2, data.closure_phase
+    cp = cp.select(~stands_alone(cp.stations))
     # The third leg closes the triangle: from its last station back to its first.
-    legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)])[first]
+    legs = np.concatenate([v2.stations, cp.stations[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)])
+    # Kernel phases, whose points come last, have no stations and no such response.
+    legs = np.pad(legs, ((0, max(int(first.max()) + 1 - len(legs), 0)), (0, 0)))[first]
     exposures = []
     for setup, mjd in np.unique(exposure, axis=0):
         response = data.setups[int(setup)].response

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
 from amibayes.models.off_axis import OffAxis, off_axis_of
+from amibayes.models.uv_sums import phase_sums
 from amibayes.units import FloatArray, IntArray
 
 YEAR_DAYS = 365.25
@@ -30,11 +31,11 @@ class UVPoints:
     u, v : (n,) float array
         Spatial frequencies, cycles per radian.
     relative_band : (n,) float array
-        Δλ/λ of the channel; 0 where ``off_axis`` has the smearing.
+        Δλ/λ of the channel; 0 where ``off_axis`` has the smearing, and of kernel phases.
     squares : (n_vis2, n) sparse array
         V² = squares · |V|²; one entry 1 in each row.
     legs : (n_closure, n) sparse array
-        Closure phase = legs · phase; entries are ±1.
+        Closure phase = legs · phase; entries are ±1, those of kernel phases any number.
     off_axis : OffAxis, optional
         Response of the extraction to light off the axis; 1 where there is none.
     bands : (n,) int array, optional
@@ -114,30 +115,33 @@ def uv_points_of(
     """
     data = observables.unflagged()
     v2, cp = data.vis2, data.closure_phase
-    u3 = np.concatenate([cp.u_m, -cp.u_m.sum(axis=1, keepdims=True)], axis=1)
-    v3 = np.concatenate([cp.v_m, -cp.v_m.sum(axis=1, keepdims=True)], axis=1)
-    wavelength = np.concatenate([v2.wavelength_m, np.repeat(cp.wavelength_m, 3)])
-    band = np.concatenate([v2.band_m, np.repeat(cp.band_m, 3)])
-    u = np.concatenate([v2.u_m[:, 0], u3.ravel()]) / wavelength
-    v = np.concatenate([v2.v_m[:, 0], v3.ravel()]) / wavelength
-    setup = np.concatenate([v2.setup, np.repeat(cp.setup, 3)])
-    mjd = np.concatenate([v2.mjd, np.repeat(cp.mjd, 3)])
+    sums = phase_sums(data)
+
+    def column(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(v2, name), getattr(cp, name)[sums.owner]])
+
+    wavelength, band, setup, mjd = (column(n) for n in ("wavelength_m", "band_m", "setup", "mjd"))
+    u = np.concatenate([v2.u_m[:, 0], sums.u_m]) / wavelength
+    v = np.concatenate([v2.v_m[:, 0], sums.v_m]) / wavelength
     bands = None if band_of_setup is None else band_of_setup[setup]
     labels = ([] if bands is None else [bands]) + ([mjd] if dated else [])
     labels += [wavelength] if coloured else []
     extracted = np.array([s.response is not None for s in data.setups])[setup]
     if extracted.any():
         labels += [setup, mjd]  # each exposure has a response, and a centre, of its own
-    first, index, sign = _distinct(u, v, band / wavelength, labels)
+    # A transform of an image has one spatial frequency for the whole band: it smears nothing.
+    sharp = extracted | np.array([s.kernel is not None for s in data.setups])[setup]
+    width = np.where(sharp, 0.0, band / wavelength)
+    first, index, sign = _distinct(u, v, width, labels)
     n, n2, n3 = len(first), len(v2), len(cp)
-    rows = np.repeat(np.arange(n3), 3)
-    legs = csr_array((sign[n2:], (rows, index[n2:])), shape=(n3, n))
+    weight = sums.weight * sign[n2 + sums.column]
+    legs = csr_array((weight, (sums.row, index[n2 + sums.column])), shape=(n3, n))
     orientation = sign[first]
     uv = np.stack([u[first], v[first]], axis=1) * orientation[:, None]
     return UVPoints(
         uv[:, 0],
         uv[:, 1],
-        np.where(extracted[first], 0.0, (band / wavelength)[first]),
+        width[first],
         csr_array((np.ones(n2), (np.arange(n2), index[:n2])), shape=(n2, n)),
         legs,
         off_axis_of(data, first, orientation, uv, np.column_stack([setup, mjd])[first]),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amibayes import __version__
 from amibayes.data.covariance import DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
-from amibayes.errors import UsageError
+from amibayes.errors import DataError, UsageError
 from amibayes.oifits.correlations import pair_covariance
 from amibayes.oifits.dates import first_date
 from amibayes.oifits.layout import UNKNOWN, Grid, Layout, grids_of, measurements_of, printable
@@ -65,6 +65,12 @@ def write_oifits(
     """
     if Path(path).exists() and not overwrite:
         raise UsageError("is there already", source=path, remedy="choose another name")
+    if any(s.kernel is not None for s in observables.setups):
+        raise DataError(
+            "OIFITS has no place for kernel phases",
+            source=observables.source,
+            remedy="write them with amibayes.kpfits.write_kpfits",
+        )
     hdus = to_hdus(observables, header or {})
     with atomic_path(path) as temporary:
         hdus.writeto(temporary, overwrite=True, output_verify="exception")

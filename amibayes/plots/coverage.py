@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.observables import Observables
+from amibayes.models.uv_sums import phase_sums
 from amibayes.plots.style import BLACK, BLUE, GREY, SEQUENTIAL, new_figure, styled
 from amibayes.units import FloatArray
 
@@ -37,9 +38,9 @@ def coverage_plot(observables: Observables) -> Figure:
     figure = new_figure(13.3 if limits else 12.7)
     for ax, scaled in zip(figure.subplots(2, 1), (False, True), strict=True):
         colours = limits if scaled else None
-        for m, marker in [(data.closure_phase, "x"), (data.vis2, "o")]:
-            if len(m):
-                drawn = _scatter(ax, _points(m, scaled), marker, colours)
+        for points, marker in [(_of_phases(data), "x"), (_of_vis2(data), "o")]:
+            if points.shape[1]:
+                drawn = _scatter(ax, _both(points, scaled), marker, colours)
         _frame(ax, "Mλ" if scaled else "m")
         if colours:
             figure.colorbar(drawn, ax=ax, label="Wavelength (µm)", location="bottom", aspect=35)
@@ -59,15 +60,22 @@ def _limits(data: Observables) -> tuple[float, float] | None:
     return float(wavelength.min()), float(wavelength.max())
 
 
-def _points(m: Measurements, scaled: bool) -> FloatArray:
+def _of_vis2(data: Observables) -> FloatArray:
+    """u, v and wavelength of V², metres, (3, n)."""
+    return np.stack([data.vis2.u_m[:, 0], data.vis2.v_m[:, 0], data.vis2.wavelength_m])
+
+
+def _of_phases(data: Observables) -> FloatArray:
+    """Those of the points whose phases are summed."""
+    sums = phase_sums(data)
+    return np.stack([sums.u_m, sums.v_m, data.closure_phase.wavelength_m[sums.owner]])
+
+
+def _both(points: FloatArray, scaled: bool) -> FloatArray:
     """Distinct u, v and wavelength in µm, (3, n), mirror images included."""
-    u, v = m.u_m, m.v_m
-    if u.shape[1] == 2:
-        u = np.column_stack([u, -u.sum(axis=1)])
-        v = np.column_stack([v, -v.sum(axis=1)])
-    wavelength = np.broadcast_to(m.wavelength_m[:, None], u.shape)
+    u, v, wavelength = points
     unit = 1e6 * wavelength if scaled else 1.0
-    half = np.stack([(u / unit).ravel(), (v / unit).ravel(), wavelength.ravel() / MICRON])
+    half = np.stack([u / unit, v / unit, wavelength / MICRON])
     both = np.concatenate([half, half * [[-1.0], [-1.0], [1.0]]], axis=1)
     return np.unique(np.round(both, 6), axis=1)
 
@@ -104,6 +112,5 @@ def _frame(ax: Axes, unit: str) -> None:
 
 def _explain(figure: Figure, data: Observables) -> None:
     setups = "1 setup" if len(data.setups) == 1 else f"{len(data.setups)} setups"
-    figure.suptitle(
-        f"V² (circles): {data.n_vis2}, closure phases (crosses): {data.n_closure_phases}, {setups}"
-    )
+    phases = f"{data.phase_name}s (crosses): {data.n_closure_phases}"
+    figure.suptitle(f"V² (circles): {data.n_vis2}, {phases}, {setups}")

@@ -100,9 +100,12 @@ def _kinds(result: SearchResult) -> tuple[_Kind, _Kind]:
     sigma, n2 = np.sqrt(data.covariance.variance), data.n_vis2
     columns = np.stack([data.data, sigma, single, binary])
     degrees = np.degrees(columns[:, n2:])
+    alone = data.phase_name == "kernel phase"  # a real sum, without a period
+    axis = "Baseline of the largest share (Mλ)" if alone else "Longest baseline (Mλ)"
+    wraps = None if data.phase_name != "closure phase" else 360.0
     return (
         _sorted("V²", "Baseline length (Mλ)", data.vis2, columns[:, :n2]),
-        _sorted("closure phase (°)", "Longest baseline (Mλ)", data.closure_phase, degrees, 360.0),
+        _sorted(f"{data.phase_name} (°)", axis, data.closure_phase, degrees, wraps),
     )
 
 

@@ -46,6 +46,7 @@ def data_json(result: SearchResult) -> Json:
     return {
         "n_vis2": used.n_vis2,
         "n_closure_phases": used.n_closure_phases,
+        **({} if used.phase_name == "closure phase" else {"phases": used.phase_name}),
         "n_independent": used.n_independent,
         "covariance": used.covariance_kind,
         "n_integrations": used.n_integrations,

@@ -125,7 +125,8 @@ def limits_summary(content: Json, folder: Path) -> list[str]:
     """Sum ``limits.json`` up in at most 20 lines."""
     data = content["data"]
     lines = [
-        f"data        {data['n_vis2']} V2, {data['n_closure_phases']} closure phases, "
+        f"data        {data['n_vis2']} V2, {data['n_closure_phases']} "
+        f"{data.get('phases', 'closure phase')}s, "
         f"{data['n_independent']} independent ({data['covariance']} covariance)",
         f"method      {content['method']}: {content['criterion']}",
         *_rate_lines(content),

@@ -98,7 +98,8 @@ def _subtitle(content: Json) -> str:
     data = content["data"]
     return (
         f"{', '.join(data['instruments'])}: {data['n_vis2']} squared visibilities and "
-        f"{data['n_closure_phases']} closure phases, {data['n_independent']} independent numbers"
+        f"{data['n_closure_phases']} {data.get('phases', 'closure phase')}s, "
+        f"{data['n_independent']} independent numbers"
     )
 
 
@@ -146,7 +147,7 @@ def _data(content: Json) -> Section:
     data = content["data"]
     text = [
         f"{count(data['n_vis2'], 'squared visibility', 'squared visibilities')} and "
-        f"{count(data['n_closure_phases'], 'closure phase')} hold "
+        f"{count(data['n_closure_phases'], data.get('phases', 'closure phase'))} hold "
         f"{count(data['n_independent'], 'independent number')}: "
         f"{COVARIANCE[data['covariance']]} ({data['covariance']} covariance)."
     ]

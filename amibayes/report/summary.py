@@ -31,7 +31,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     used = result.likelihood.observables
     lines = [
         *_statement(report),
-        f"data        {used.n_vis2} V2, {used.n_closure_phases} closure phases, "
+        f"data        {used.n_vis2} V2, {used.n_closure_phases} {used.phase_name}s, "
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"field       {result.grid.inner_mas:.4g} to {result.grid.outer_mas:.4g} mas, "
         f"{len(result.grid)} positions",

@@ -26,6 +26,7 @@ LAYERS = [
     "simulation",
     "data",
     "oifits",
+    "kpfits",
     "extraction",
     "calibration",
     "models",

@@ -41,6 +41,16 @@ class Audit:
     oifits: OIFits
     findings: tuple[Finding, ...]
 
+    @property
+    def path(self) -> str:
+        """The file."""
+        return self.oifits.path
+
+    @property
+    def format(self) -> str:
+        """What the file is, as the summary names it."""
+        return f"OIFITS {self.oifits.version}"
+
     def as_json(self) -> dict[str, object]:
         """As `audit.json` holds it."""
         return {
