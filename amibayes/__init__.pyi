@@ -18,7 +18,8 @@ from .cube import (
     read_cube as read_cube,
     write_cube as write_cube,
 )
-from .data.observables import Observables as Observables, join as join
+from .data.joining import join as join
+from .data.observables import Observables as Observables
 from .data.point_source import point_source as point_source
 from .detection.false_alarm import Significance as Significance, significance as significance
 from .detection.statistic import statistic_of as statistic_of

@@ -7,6 +7,26 @@ and what the user can do. The command line prints the line and exits with
 
 from __future__ import annotations
 
+import re
+
+OPTION = re.compile(r"(?<![\w-])--([a-z][a-z-]+)( [A-Z]+\b)?")
+"""An option of the command line in a message, and the word for its value."""
+
+ARGUMENTS = {
+    "cal": "calibrators",
+    "merge-epochs": "merge_epochs_days",
+    "pixel-scale": "pixel_scale_rad",
+    "position-angle": "position_angle_deg",
+    "separation": "separation_mas",
+}
+"""Options whose arguments in Python have other names than with - for _."""
+
+
+def _argument(option: re.Match[str]) -> str:
+    """Name in Python of what an option sets."""
+    name = ARGUMENTS.get(option[1], option[1].replace("-", "_"))
+    return f"{name}={option[2].strip()}" if option[2] else name
+
 
 class AmibayesError(Exception):
     """Anything that amibayes reports to its user.
@@ -22,6 +42,15 @@ class AmibayesError(Exception):
     """
 
     exit_status = 4
+
+    def __str__(self) -> str:
+        """One line, with arguments by their names in Python."""
+        return OPTION.sub(_argument, self.command_line)
+
+    @property
+    def command_line(self) -> str:
+        """The same line with arguments by their options on the command line."""
+        return str(self.args[0])
 
     def __init__(self, what: str, *, source: object = None, remedy: str = "") -> None:
         self.what = what

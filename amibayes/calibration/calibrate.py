@@ -19,9 +19,10 @@ from amibayes.calibration.transfer import (
 )
 from amibayes.calibration.weighted import TransferFunction, clipped, weighted_response
 from amibayes.data.observables import Observables, join
-from amibayes.errors import DataError, UsageError
-from amibayes.support.options import CLIP_CALIBRATORS, CalibrationMethod, choices
-from amibayes.support.quantities import takes_quantities
+from amibayes.errors import DataError
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Rows, Shown
+from amibayes.support.options import CLIP_CALIBRATORS, CalibrationMethod
 from amibayes.units import FloatArray
 
 
@@ -45,9 +46,15 @@ class CalibratorUse:
     n_used: int
     n_clipped: int
 
+    @property
+    def in_words(self) -> str:
+        """Kept or left out, and why."""
+        used = f"{self.n_used} values used" if self.kept else "left out"
+        return f"{used}: {self.reason}" if self.reason else used
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Shown):
     """A calibrated target and how it came about.
 
     Parameters
@@ -72,6 +79,17 @@ class Calibration:
     tau_closure_phase_rad: float | None
     n_setups: tuple[int, ...]
     tau: FloatArray | None = None
+
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        taus = (("V²", self.tau_vis2, ""), ("closure phase", self.tau_closure_phase_deg, "°"))
+        return [
+            ("method", self.method),
+            ("targets", len(self.n_setups)),
+            *((use.path or "calibrator", use.in_words) for use in self.calibrators),
+            *((f"scatter of {name}", f"{t:.2g}{unit}") for name, t, unit in taus if t is not None),
+            ("result", repr(self.observables)),
+        ]
 
     @property
     def tau_closure_phase_deg(self) -> float | None:
@@ -104,7 +122,7 @@ class Calibration:
         )
 
 
-@takes_quantities
+@checks_arguments
 def calibrate(
     targets: Observables | Sequence[Observables],
     calibrators: Sequence[Observables],
@@ -171,10 +189,6 @@ def _method(
     method: CalibrationMethod | None, target: Observables, serving: list[Transfer]
 ) -> CalibrationMethod:
     """The method asked for, or what the calibrators of one baseline are enough for."""
-    if method is not None and method not in (known := choices(CalibrationMethod)):
-        raise UsageError(
-            f"{method!r} is no method of calibration", remedy=f"one of {', '.join(known)}"
-        )
     together = int(np.sum([t.seen for t in serving], axis=0).max())
     if method == "hierarchical" and together < 2:
         raise DataError(

@@ -157,7 +157,7 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
         own.targets = row.files(row.target)
         own.cal = row.files(row.cal) if row.cal else arguments.cal
     except DataError as error:
-        return Job(row.name, None, str(error))
+        return Job(row.name, None, error.command_line)
     given = common.without(arguments.words[1:], common.OF_THE_RUN | {"--cal": sys.maxsize})
     files = [*own.targets, *(["--cal", *own.cal] if own.cal else [])]
     own.words = [own.command, *files, *given, *words]
@@ -254,7 +254,7 @@ def _one(command: str, job: Job) -> str:
         with output_locks():
             importlib.import_module(f"amibayes.cli.{command}").perform(job.arguments)
     except AmibayesError as error:
-        return str(error)
+        return error.command_line
     except MemoryError as error:
         return f"not enough memory: {error} (ask for less)"
     except Exception as error:

@@ -144,7 +144,7 @@ def _report(error: Exception) -> int:
     """Print in one line what went wrong; give the exit status."""
     status = 4
     if isinstance(error, AmibayesError):
-        text, status = str(error), error.exit_status
+        text, status = error.command_line, error.exit_status
     elif isinstance(error, MemoryError):
         text = f"not enough memory: {error} (ask for less)"
     elif isinstance(error, OSError):

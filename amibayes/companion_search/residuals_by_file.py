@@ -10,6 +10,7 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.residuals import files_of
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray
 
 
@@ -38,6 +39,7 @@ class FileResiduals:
     single_closure_phase: float
 
 
+@checks_arguments
 def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
     """Reduced χ² of every file and kind of observable, with the companion and without."""
     binary, single = result.likelihood, single_likelihood(result.likelihood)

@@ -11,13 +11,14 @@ from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from amibayes.companion_search.grid import Grid
-from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
+from amibayes.data.tables import UNITS, pretty, quantity_table
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.student import Robustness, StudentNoise, SymmetricWhitening
 from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import YEAR_DAYS
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments, one_of
+from amibayes.support.notebook import html_table
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -26,7 +27,7 @@ from amibayes.units import (
 )
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Companion:
     """A companion's parameters with 1σ errors.
@@ -112,6 +113,33 @@ class Mode:
     def place(self) -> tuple[float, float]:
         """East and north of the first companion, mas."""
         return self.companion.east_mas, self.companion.north_mas
+
+    @property
+    def separation_mas(self) -> float:
+        """Angular separation of the first companion, mas."""
+        return self.companion.separation_mas
+
+    @property
+    def position_angle_deg(self) -> float:
+        """Position angle of the first companion, degrees east of north in [0, 360)."""
+        return self.companion.position_angle_deg
+
+    @property
+    def contrast(self) -> float:
+        """Flux ratio of the first companion to the star."""
+        return self.companion.contrast
+
+    @property
+    def delta_mag(self) -> float:
+        """Magnitude difference of the first companion to the star."""
+        return self.companion.delta_mag
+
+    def __repr__(self) -> str:
+        """One line for a notebook."""
+        return (
+            f"<Mode: {self.separation_mas:.2f} mas, PA {self.position_angle_deg:.2f}°, contrast "
+            f"{self.contrast:.3g}, Δχ² {self.delta_chi2:.1f}>"
+        )
 
 
 def is_opposite(mode: Mode, place: FloatArray) -> bool:
@@ -217,9 +245,11 @@ class SearchResult:
 
     def nuisance(self, name: str) -> float:
         """Value in the best fit, free or fixed, of a field of the model such as the diameter."""
-        if name in self.likelihood.parameters.names:
-            return float(self.theta[self.likelihood.parameters.index(name)])
-        return float(getattr(self.likelihood.model, name))
+        parameters, model = self.likelihood.parameters, self.likelihood.model
+        if name in parameters.names:
+            return float(self.theta[parameters.index(name)])
+        one_of("SearchResult.nuisance", "name", name, (*parameters.names, *vars(model)))
+        return float(getattr(model, name))
 
     def star_alone(self) -> dict[str, tuple[float, float]]:
         """Each free parameter of the fit without a companion: its value and error."""

@@ -26,7 +26,7 @@ from amibayes.companion_search.template_bank import TemplateBank, rates_per_axis
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import annulus, checks_arguments
 from amibayes.units import FloatArray
 
 MIN_STEPS, MAX_STEPS = 5, 8
@@ -50,7 +50,7 @@ NUISANCE_HOLDS = 0.02
 """Change of the star's visibility with which the exact map need not be made again."""
 
 
-@takes_quantities
+@checks_arguments
 def search(
     likelihood: Likelihood,
     separation_mas: tuple[float, float] | None = None,
@@ -77,6 +77,7 @@ def search(
     UsageError
         Where the annulus holds no position.
     """
+    annulus("search", "separation_mas", separation_mas)
     _refuse_underdetermined(likelihood)
     inner, outer = separation_mas or default_separation(likelihood)
     box = Box(inner, outer, resolution_mas(likelihood))

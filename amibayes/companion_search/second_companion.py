@@ -15,6 +15,8 @@ from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import Box, Parameters
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import FloatArray
 
 FIRST_MODES = 3
@@ -27,8 +29,8 @@ MAX_ROUNDS = 4
 """How often each companion is looked for again on what the other one leaves."""
 
 
-@dataclass(frozen=True, eq=False)
-class TwoCompanions:
+@dataclass(frozen=True, eq=False, repr=False)
+class TwoCompanions(Shown):
     """The joint fit of two companions, the brighter one first.
 
     Parameters
@@ -54,6 +56,7 @@ class TwoCompanions:
         return companions_of(self.likelihood.parameters, self.theta, self.theta_covariance)
 
 
+@checks_arguments
 def search_second(result: SearchResult) -> TwoCompanions:
     """Look for a second companion beside the one that was found, and fit both together.
 

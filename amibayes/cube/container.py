@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from amibayes.errors import DataError, UsageError
 from amibayes.scene.orientation import Orientation
-from amibayes.units import FloatArray
+from amibayes.support.arguments import checks_arguments, in_range
+from amibayes.support.notebook import Rows, Shown
+from amibayes.units import MAS, FloatArray
 
 DQ_FLAGS = {
     name: 1 << bit
@@ -43,6 +45,10 @@ NEVER_USED = ("DO_NOT_USE", "NON_SCIENCE", "DEAD", "REFERENCE_PIXEL")
 """Flags of pixels that see no light; slopes that jumps or saturation only cut short are good."""
 
 
+MIN_PIXEL_RAD, MAX_PIXEL_RAD = 1e-12, 1e-3
+"""Between 0.2 µas and 3 arcmin: pixel scales of other sizes are in other units than radians."""
+
+
 def flag_bits(names: Collection[str]) -> int:
     """Bits of flags by name.
 
@@ -61,8 +67,9 @@ def flag_bits(names: Collection[str]) -> int:
     return sum(DQ_FLAGS[name] for name in set(names))
 
 
-@dataclass(frozen=True, eq=False)
-class Cube:
+@checks_arguments
+@dataclass(frozen=True, eq=False, repr=False)
+class Cube(Shown):
     """Images of one exposure.
 
     Parameters
@@ -120,6 +127,20 @@ class Cube:
     notes: tuple[str, ...] = ()
     bad_flags: tuple[str, ...] = NEVER_USED
 
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        n, ny, nx = self.images.shape
+        mjd = self.mjd is not None and len(self.mjd)
+        return [
+            ("source", self.source),
+            ("images", f"{n} of {ny} × {nx} pixels of {self.pixel_scale_rad / MAS:.4g} mas"),
+            ("instrument", f"{self.instrument} {self.filter}"),
+            ("unit", self.unit),
+            ("errors", "none" if self.error is None else "of every pixel"),
+            ("begins", f"MJD {self.mjd[0]:.5f}" if mjd else "at an unknown date"),  # type: ignore[index]
+            *(("note", note) for note in self.notes),
+        ]
+
     def __post_init__(self) -> None:
         self._hold("images", _real(self.images))
         if self.images.ndim != 3:
@@ -131,6 +152,7 @@ class Cube:
             self._hold("error", _real(self.error))
         for name in ("error", "dq"):
             self._check_shape(name, self.images.shape)
+        in_range("Cube", "pixel_scale_rad", self.pixel_scale_rad, MIN_PIXEL_RAD, MAX_PIXEL_RAD)
         if self.mjd is not None:
             self._hold("mjd", np.asarray(self.mjd, dtype=float))
             self._check_shape("mjd", self.images.shape[:1])

@@ -26,6 +26,7 @@ from amibayes.instrument import (
     load_instrument,
     recognised,
 )
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import DEGREE, FloatArray
 
@@ -84,6 +85,7 @@ def no_light(source: str) -> DataError:
     return DataError("every pixel is flagged, not a number, or the same", source=source)
 
 
+@checks_arguments
 def read_cube(path: str | Path, **options: Any) -> Cube:
     """Read a whole cube; see `open_cube` for the options and errors."""
     with open_cube(path, **options) as file:

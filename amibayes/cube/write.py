@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from amibayes.cube.container import Cube
 from amibayes.cube.stream import EmptyImage, FitsStream
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import DEGREE, MAS, FloatArray
 
 DAY_S = 86400.0
@@ -142,6 +143,7 @@ def cube_stream(
         yield CubeStream(stream)
 
 
+@checks_arguments
 def write_cube(path: str | Path, cube: Cube) -> None:
     """Write a whole cube as a ``calints`` file.
 

@@ -7,11 +7,35 @@ from collections.abc import Sequence
 import numpy as np
 
 from amibayes.data.observables import Measurements, Observables
+from amibayes.data.observables import join as joined
 from amibayes.errors import UsageError
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray
 
 SEPARATOR = ", "
 """Between the names of files that are exposures of one."""
+
+
+@checks_arguments
+def join(parts: Sequence[Observables]) -> Observables:
+    """Lay data sets together for one fit.
+
+    The kind of the whole covariance is that of its least certain part, in the order
+    given, estimated, assumed, diagonal.
+
+    Parameters
+    ----------
+    parts : sequence of Observables
+
+    Raises
+    ------
+    UsageError
+        Where there are none, or all data of one stand in another: they would count twice.
+    """
+    if not parts:
+        raise UsageError("no data set to join", source="join", remedy="give at least one")
+    refuse_twice(parts)
+    return joined(parts)
 
 
 def in_order(parts: Sequence[Observables]) -> list[Observables]:
@@ -95,4 +119,4 @@ def different_targets(parts: Sequence[Observables]) -> tuple[str, ...]:
     return (f"targets of different names are fitted as one: {', '.join(names)}",)
 
 
-__all__ = ["SEPARATOR", "different_targets", "in_order", "refuse_twice", "unused"]
+__all__ = ["SEPARATOR", "different_targets", "in_order", "join", "refuse_twice", "unused"]

@@ -9,9 +9,11 @@ from numpy.typing import ArrayLike
 
 from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray
 
 
+@checks_arguments
 def point_source(
     stations_m: ArrayLike,
     wavelength_m: ArrayLike,

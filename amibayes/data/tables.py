@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from html import escape
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from astropy.table import QTable
 
+from amibayes.support.arguments import one_of
+from amibayes.support.notebook import html_table
+
 if TYPE_CHECKING:
     from amibayes.data.observables import Observables
-
-
-def html_table(title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Lay texts out as a small HTML table; everything is escaped."""
-
-    def line(cells: Sequence[object], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{escape(str(c))}</{tag}>" for c in cells) + "</tr>"
-
-    head = line(header, "th") if header else ""
-    body = "".join(line(row, "td") for row in rows)
-    caption = f'<caption style="text-align:left"><strong>{escape(title)}</strong></caption>'
-    return f"<table>{caption}{head}{body}</table>"
 
 
 def quantity_table(
@@ -48,9 +38,14 @@ def pretty(name: str) -> str:
     return name.replace("_", " ")
 
 
+KINDS = ("vis2", "closure_phase")
+"""Kinds of data that have a table."""
+
+
 def observables_table(observables: Observables, kind: Literal["vis2", "closure_phase"]) -> QTable:
     """One kind of data, a row each, with errors, places in the (u, v) plane and stations."""
-    number = ("vis2", "closure_phase").index(kind)
+    one_of("Observables.to_table", "kind", kind, KINDS)
+    number = KINDS.index(kind)
     m, error = (observables.vis2, observables.closure_phase)[number], observables.errors[number]
     setups = observables.setups
     sides = [f"{i + 1}" for i in range(m.u_m.shape[1])] if number else [""]

@@ -23,6 +23,8 @@ from amibayes.detection.tails import (
     tail_of,
 )
 from amibayes.parallel import Executor, Journal, Progress
+from amibayes.support.arguments import checks_arguments, in_range
+from amibayes.support.notebook import Rows, Shown, ranged
 from amibayes.support.options import ALPHA
 from amibayes.units import FloatArray
 
@@ -30,8 +32,8 @@ MIN_ABOVE = 10
 """Draws that have to reach a statistic for their share to be its probability."""
 
 
-@dataclass(frozen=True, eq=False)
-class Significance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Significance(Shown):
     """Global false-alarm probability of a search.
 
     Parameters
@@ -66,6 +68,17 @@ class Significance:
     test: Statistic | None = None
     field: FloatArray | None = None
     randomised: Randomised | None = None
+
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        few = f"cannot be told below {self.alpha:.3g} with so few draws"
+        return [
+            ("statistic", f"{self.statistic:.4g}"),
+            ("false-alarm probability", ranged(self.probability, self.interval)),
+            ("null draws", f"{self.n_draws}, {self.n_above} of them as large"),
+            ("extrapolated", "no" if self.tail is None else "by a generalised Pareto law"),
+            ("detected", few if self.detected is None else str(self.detected)),
+        ]
 
     @property
     def n_draws(self) -> int:
@@ -143,6 +156,7 @@ class Significance:
         }
 
 
+@checks_arguments
 def significance(
     test: Statistic,
     n_draws: int,
@@ -169,6 +183,8 @@ def significance(
     executor, progress, journal
         As in `amibayes.detection.statistic.BankStatistic.draw_null`.
     """
+    in_range("significance", "n_draws", n_draws, 1)
+    in_range("significance", "alpha", alpha, 0.0, 1.0)
     if observed is None:
         observed = float(test.evaluate(test.observed[:, None])[0])
     drawn = test.draw_null(n_draws, rng, executor=executor, progress=progress, journal=journal)

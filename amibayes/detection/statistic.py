@@ -31,6 +31,7 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.rotation_null import rotation_null
 from amibayes.likelihood.student import SymmetricWhitening
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray, IntArray
 
 DRAWS_AT_ONCE, NUMBERS_AT_ONCE = 2048, 8_000_000
@@ -302,6 +303,7 @@ def _null_piece(
     return {"statistic": test.simulated(size, np.random.default_rng(seed)).statistic}
 
 
+@checks_arguments
 def statistic_of(
     result: SearchResult, *, stated_errors: bool = False, beside: bool = False
 ) -> BankStatistic:

@@ -35,6 +35,7 @@ from amibayes.extraction.table import independent_basis, observables_of, target_
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import exposures, visit_maps
 from amibayes.ramps.correction import MigrationFree
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import EXTRACTION_METHODS
 from amibayes.units import ComplexArray, FloatArray
 
@@ -91,6 +92,7 @@ class Extraction:
         ]
 
 
+@checks_arguments
 def extract(
     cubes: Cube | str | Path | Sequence[Cube | str | Path],
     method: str = next(iter(EXTRACTION_METHODS)),

@@ -18,6 +18,8 @@ from amibayes.instrument.bandpass import Bandpass
 from amibayes.instrument.header_rules import HeaderRules, rules_of
 from amibayes.instrument.mask import SHAPES, Mask
 from amibayes.scene.spectrum import Spectrum
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.support.toml import Section, read_toml
 from amibayes.units import DEGREE, MAS, FloatArray, read_only
 
@@ -84,8 +86,8 @@ class Planning:
     rates_e_s: Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Instrument:
+@dataclass(frozen=True, eq=False, repr=False)
+class Instrument(Shown):
     """A mask, a filter and a detector's pixel scale.
 
     Parameters
@@ -243,6 +245,7 @@ def header_rules(name: str) -> HeaderRules:
     return rules_of(top.section("header")) if "header" in top else HeaderRules()
 
 
+@checks_arguments
 def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
     """Load an instrument that comes with the package, or from a TOML file.
 

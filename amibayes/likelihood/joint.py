@@ -8,10 +8,12 @@ from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.bands import bands_of, dates
 from amibayes.models.uv_points import YEAR_DAYS
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import ContrastSharing
 from amibayes.units import MAS
 
 
+@checks_arguments
 def joint_likelihood(
     likelihood: Likelihood,
     *,

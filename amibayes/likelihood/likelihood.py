@@ -9,11 +9,14 @@ from numpy.typing import ArrayLike
 
 from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import Observables
+from amibayes.errors import UsageError
 from amibayes.likelihood.noise import NoiseModel, noise_of
 from amibayes.models.bands import band_numbers
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import UVPoints, uv_points_of
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Rows, Shown
 from amibayes.units import MAS, ComplexArray, FloatArray
 
 SMALL_DISC = 0.05
@@ -39,7 +42,8 @@ FAINTEST = 0.005
 alone are as large."""
 
 
-class Likelihood:
+@checks_arguments
+class Likelihood(Shown):
     """Likelihood of a model, vectorised over parameter sets: data, model and noise.
 
     Parameters
@@ -73,6 +77,19 @@ class Likelihood:
         self._n2 = len(self.observables.vis2)
         alone = stands_alone(self.observables.closure_phase.stations)
         self._turn = np.where(alone, 0.0, 2.0 * np.pi)[:, None]
+
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        data, noise = self.observables, type(self.noise).__name__
+        kinds = f"{data.n_vis2} V², {data.n_closure_phases} closure phases"
+        degrees = f", t of {self.degrees:.3g} degrees" if np.isfinite(self.degrees) else ""
+        return [
+            ("data", f"{kinds}, {self.n_independent} independent numbers"),
+            ("noise", f"{noise}, {data.covariance_kind} covariance{degrees}"),
+            ("parameters", ", ".join(self.parameters.names) or "none"),
+            ("model", repr(self.model)),
+            ("source", data.source),
+        ]
 
     @property
     def parameters(self) -> Parameters:
@@ -218,7 +235,11 @@ class Likelihood:
         sets = np.atleast_2d(np.asarray(theta, dtype=float))
         names = self.model.parameters.names
         if sets.shape[1] != len(names):
-            raise ValueError(f"theta needs {len(names)} columns: {names}")
+            raise UsageError(
+                f"theta has {sets.shape[1]} columns, not {len(names)}",
+                source="Likelihood",
+                remedy=f"its parameters are {', '.join(names)}",
+            )
         return sets
 
     def _observe(self, visibility: ComplexArray) -> FloatArray:

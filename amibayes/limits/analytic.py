@@ -37,8 +37,9 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.detection.statistic import Statistic, make_statistic
 from amibayes.likelihood.combinations import combination_of, require
 from amibayes.limits.rings import Rings, make_rings
+from amibayes.support.arguments import checks_arguments, in_range
+from amibayes.support.notebook import Rows, Shown
 from amibayes.support.options import LIMITS_SEPARATIONS, AnalyticMethod
-from amibayes.support.quantities import takes_quantities
 from amibayes.units import BoolArray, FloatArray, contrast_to_delta_mag
 
 SIGMAS = 3.0
@@ -66,8 +67,8 @@ CRITERIA: dict[AnalyticMethod, str] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class AnalyticLimit:
+@dataclass(frozen=True, eq=False, repr=False)
+class AnalyticLimit(Shown):
     """A limit by one of the closed criteria, at every position.
 
     Parameters
@@ -89,6 +90,14 @@ class AnalyticLimit:
     contrast_at: FloatArray
     rings: Rings
     removed: bool = False
+
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        pairs = zip(self.separation_mas, self.delta_mag, strict=True)
+        return [
+            ("criterion", self.criterion),
+            *((f"{rho:.4g} mas", f"{mag:.2f} mag") for rho, mag in pairs),
+        ]
 
     @property
     def by_detection(self) -> BoolArray:
@@ -134,7 +143,7 @@ class AnalyticLimit:
         return contrast_to_delta_mag(self.contrast)
 
 
-@takes_quantities
+@checks_arguments
 def analytic_limit(
     result: SearchResult,
     method: AnalyticMethod,
@@ -170,6 +179,7 @@ def analytic_limit(
     UsageError
         Where bands have contrasts of their own, or the companion moves.
     """
+    in_range("analytic_limit", "sigmas", sigmas, 0.0)
     likelihood = result.likelihood
     require(combination_of(likelihood, method="closed limits"), likelihood.observables.source)
     rings = make_rings(result, n_separations, separation_mas)

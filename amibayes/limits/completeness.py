@@ -30,7 +30,7 @@ from amibayes.limits.limit import DetectionLimit
 from amibayes.limits.logistic import fit_logistic
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.parallel import Executor, Journals, Progress
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments, in_range
 from amibayes.units import FloatArray, IntArray
 
 N_SEPARATIONS = 16
@@ -61,7 +61,7 @@ SPREAD = (0.16, 0.5, 0.84)
 """Quantiles over the position angle."""
 
 
-@takes_quantities
+@checks_arguments
 def detection_limit(
     result: SearchResult,
     significance: Significance,
@@ -100,6 +100,7 @@ def detection_limit(
     -------
     DetectionLimit
     """
+    in_range("detection_limit", "trials_per_cell", trials_per_cell, 1)
     rings = make_rings(result, n_separations, separation_mas)
     test, threshold = _without_companion(result, significance, rng, executor, journals)
     setting, lost, sigma = _prepared(test, threshold, rings, executor, journals)

@@ -27,12 +27,14 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.injection import Recovery, classify_recovery, recover
 from amibayes.optics import psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.support.options import ALPHA
 from amibayes.units import MAS, FloatArray, read_only
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredStar:
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredStar(Shown):
     """The star of a cube: what is needed to make it a companion.
 
     Parameters
@@ -126,6 +128,7 @@ class MeasuredStar:
         return psf(turned, view.channels, size, oversample=over, integrate=False), over
 
 
+@checks_arguments
 def measure_star(cube: Cube, options: ExtractOptions | None = None) -> MeasuredStar:
     """Find the star of a cube, its flux and its place in every integration.
 
@@ -180,8 +183,8 @@ class ImageRecovery:
     statistic: float
 
 
-@dataclass(frozen=True, eq=False)
-class Criterion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Criterion(Shown):
     """What a search takes for a companion, to be applied to other data of the same kind.
 
     Parameters
@@ -240,6 +243,7 @@ class Criterion:
         return tuple(kind for kind, n in held.items() if n)
 
 
+@checks_arguments
 def make_criterion(
     result: SearchResult,
     rng: np.random.Generator,

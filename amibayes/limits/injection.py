@@ -17,6 +17,7 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.statistic import Hits, Statistic
+from amibayes.errors import UsageError
 from amibayes.limits.aliases import ambiguous, nearer_alias
 from amibayes.limits.rings import Rings
 from amibayes.parallel import (
@@ -29,6 +30,8 @@ from amibayes.parallel import (
     slices,
     spawn,
 )
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 ROUNDS = 4
@@ -166,8 +169,8 @@ ALIAS = 0.875
 """Correlation of two templates on the lattice above which one position stands for the other."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recovery:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recovery(Shown):
     """What became of injected companions.
 
     Parameters
@@ -183,6 +186,7 @@ class Recovery:
     located: BoolArray
 
 
+@checks_arguments
 def recover(
     test: Statistic,
     companions: FloatArray,
@@ -219,6 +223,9 @@ def recover(
     -------
     Recovery
     """
+    companions = np.asarray(companions, dtype=float)
+    if companions.ndim != 2 or companions.shape[1] != 3 or not np.isfinite(companions).all():
+        raise UsageError("companions are not rows of 3 columns of finite numbers", source="recover")
     parts = slices(len(companions), TRIALS_AT_ONCE)
     pieces = [
         (companions[p], None if nearer is None else nearer[p], seed)

@@ -9,9 +9,10 @@ import numpy as np
 from astropy.table import QTable
 from scipy import stats
 
-from amibayes.data.tables import UNITS, html_table, quantity_table
+from amibayes.data.tables import UNITS, quantity_table
 from amibayes.detection.binomial import clopper_pearson
 from amibayes.limits.logistic import Logistic, fit_logistic
+from amibayes.support.notebook import html_table
 from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag
 
 CRITERION = (

@@ -10,6 +10,7 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.support.arguments import in_range
 from amibayes.support.options import LIMITS_SEPARATIONS
 from amibayes.units import FloatArray, offset
 
@@ -61,6 +62,9 @@ def make_rings(
     separation_mas : sequence of float, optional
         These separations instead.
     """
+    in_range("limits", "n_separations", n_separations, 1)
+    for one in () if separation_mas is None else separation_mas:
+        in_range("limits", "separation_mas", one, 0.0)
     grid = result.grid
     rho = np.linspace(grid.inner_mas, grid.outer_mas, n_separations)
     if separation_mas is not None:

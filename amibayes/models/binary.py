@@ -22,7 +22,7 @@ from amibayes.models.parameters import Parameters
 from amibayes.models.source import CENTRED, Component, Slope, Source
 from amibayes.models.star import Star
 from amibayes.models.uv_points import UVPoints
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments, in_range
 from amibayes.units import ComplexArray, FloatArray
 
 
@@ -49,7 +49,14 @@ class LinearResponse:
     disc: FloatArray
 
 
-@takes_quantities
+NEVER_NEGATIVE = (
+    "companions", "diameter_mas", "background", "fastest_mas_yr", "limb_darkening",
+    "companion_diameter_mas", "reference_wavelength_m",
+)  # fmt: skip
+"""Fields of `BinaryModel` that are sizes, numbers or fluxes."""
+
+
+@checks_arguments
 @dataclass(frozen=True)
 class BinaryModel:
     """What is fitted and what is held fixed.
@@ -95,6 +102,12 @@ class BinaryModel:
     companion_diameter_mas: float | Literal["free"] = 0.0
     contrast_slope: float | Literal["free"] = 0.0
     reference_wavelength_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("contrast_slope", "reference_mjd"):
+            in_range("BinaryModel", name, getattr(self, name))
+        for name in NEVER_NEGATIVE:
+            in_range("BinaryModel", name, getattr(self, name), 0.0)
 
     @property
     def n_contrasts(self) -> int:

@@ -16,7 +16,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from amibayes.errors import DataError
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.fits_errors import reporting_damage
+from amibayes.support.notebook import Shown
 
 USED = ("OI_TARGET", "OI_ARRAY", "OI_WAVELENGTH", "OI_VIS2", "OI_T3", "OI_CORR", "V2COV", "CPCOV")
 """Extensions that `observables_of` reads."""
@@ -70,8 +72,8 @@ class OITable:
         return plain(self.header.get(name, ""))
 
 
-@dataclass(frozen=True, eq=False)
-class OIFits:
+@dataclass(frozen=True, eq=False, repr=False)
+class OIFits(Shown):
     """A whole OIFITS file.
 
     Parameters
@@ -115,6 +117,7 @@ def plain(value: object) -> str:
     return str(value).strip(" \0\t\n")
 
 
+@checks_arguments
 def open_oifits(path: str | Path) -> OIFits:
     """Read every table of an OIFITS file, version 1 or 2, plain or gzipped.
 

@@ -29,6 +29,7 @@ from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.oifits.scatter import scatter_table, shared_table
 from amibayes.oifits.standard import TABLES
 from amibayes.oifits.tables import OWN_KEY
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.atomic_files import atomic_path
 from amibayes.units import DEGREE, BoolArray, FloatArray, IntArray
 
@@ -38,6 +39,7 @@ ARCSEC = DEGREE / 3600.0
 HeaderValue = str | int | float | bool
 
 
+@checks_arguments
 def write_oifits(
     path: str | Path,
     observables: Observables,

@@ -16,11 +16,13 @@ import numpy as np
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.psf import axis_nodes, pixel_rule
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class FringeBasis:
+@dataclass(frozen=True, eq=False, repr=False)
+class FringeBasis(Shown):
     """Images of which every on-axis image is a sum.
 
     Parameters
@@ -58,6 +60,7 @@ class FringeBasis:
         return np.asarray(self.matrix @ coefficients).reshape(self.shape)
 
 
+@checks_arguments
 def fringe_basis(
     instrument: Instrument,
     channels: Channels,

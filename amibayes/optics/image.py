@@ -22,6 +22,7 @@ from amibayes.optics.psf import Wavefront, axis_nodes, intensity, psf
 from amibayes.optics.sampling import fine_sampling, fine_size, pixel_operator, pixel_transform
 from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Scene
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import MAS, ComplexArray, FloatArray, read_only
 
 OVERSAMPLE = 11
@@ -94,6 +95,7 @@ class ShiftedImage:
         return np.asarray((y[:, :, None] * x[:, None, :]).reshape(len(shift), -1))
 
 
+@checks_arguments
 def scene_image(
     scene: Scene,
     instrument: Instrument,

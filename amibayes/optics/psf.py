@@ -16,14 +16,16 @@ from amibayes.errors import UsageError
 from amibayes.instrument import Channels, Instrument, Mask
 from amibayes.optics.holes import hole_transform
 from amibayes.optics.pupil import PupilMap
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import ComplexArray, FloatArray, read_only
 
 _TOLERANCE = 1e-9
 """Error of a pixel average, as a fraction of the peak."""
 
 
-@dataclass(frozen=True, eq=False)
-class Wavefront:
+@dataclass(frozen=True, eq=False, repr=False)
+class Wavefront(Shown):
     """Wavefront error, hole by hole or as a map over the pupil.
 
     Parameters
@@ -49,6 +51,7 @@ class Wavefront:
                 raise UsageError(f"wavefront {name} needs one entry for each hole")
 
 
+@checks_arguments
 def psf(
     instrument: Instrument,
     channels: Channels,

@@ -15,6 +15,7 @@ import numpy as np
 from amibayes.errors import UsageError
 from amibayes.instrument import Mask
 from amibayes.optics.holes import coverage
+from amibayes.support.notebook import Shown
 from amibayes.units import FloatArray, read_only
 
 
@@ -38,8 +39,8 @@ class Patch:
     opd_m: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class PupilMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class PupilMap(Shown):
     """Optical path over a square pupil.
 
     Parameters

@@ -26,6 +26,8 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.run import Announce, Run, silent
 from amibayes.pipeline.warnings import search_warnings
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Rows, Shown
 from amibayes.support.options import (
     LIMITS_NULL_DRAWS,
     LIMITS_SEPARATIONS,
@@ -42,6 +44,7 @@ NAMES: dict[Kinds, str] = {("vis2", "cp"): "V² + CP", ("vis2",): "V²", ("cp",)
 """Choices of observables, for readers."""
 
 
+@checks_arguments
 @dataclass(frozen=True)
 class LimitsOptions:
     """What is asked of `measure_limits`.
@@ -92,8 +95,8 @@ class MeasuredLimit:
     limit: Limit
 
 
-@dataclass(frozen=True, eq=False)
-class LimitsReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class LimitsReport(Shown):
     """Everything `measure_limits` found; the first of ``limits`` is the main one."""
 
     options: LimitsOptions
@@ -105,12 +108,23 @@ class LimitsReport:
     warnings: tuple[str, ...]
     timing_s: dict[str, float] = field(default_factory=dict)
 
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        return [
+            ("targets", ", ".join(self.targets)),
+            ("calibrators", ", ".join(self.calibrators) or "none"),
+            ("criterion", self.options.criterion),
+            *((NAMES[one.observables], repr(one.limit)) for one in self.limits),
+            *(("warning", text) for text in self.warnings),
+        ]
+
     @property
     def main(self) -> MeasuredLimit:
         """The limit from all the observables that were asked for."""
         return self.limits[0]
 
 
+@checks_arguments
 def measure_limits(
     targets: Sequence[str | Path],
     calibrators: Sequence[str | Path] = (),

@@ -6,23 +6,36 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from amibayes.extraction.reading import ImageOptions
 from amibayes.posterior.priors import PriorSetting
+from amibayes.support.arguments import annulus, checks_arguments, in_range, one_of
 from amibayes.support.options import (
     ALPHA,
     CLIP_CALIBRATORS,
+    COMPANIONS,
     EVIDENCE_METHODS,
     NOISE_PRIOR,
     OBSERVABLES,
+    SAMPLERS,
     SEED,
     CalibrationMethod,
     ClosureCovariance,
     ContrastSharing,
 )
-from amibayes.support.quantities import takes_quantities
+
+RANGES = {
+    "diameter": (0.0, np.inf), "limb_darkening": (0.0, np.inf), "clip": (0.0, np.inf),
+    "companion_diameter": (0.0, np.inf), "background": (0.0, np.inf), "alpha": (0.0, 1.0),
+    "contrast_slope": (-np.inf, np.inf), "bin_channels": (1, np.inf), "null_draws": (0, np.inf),
+    "merge_epochs_days": (0.0, np.inf), "fastest_mas_yr": (0.0, np.inf), "seed": (0, np.inf),
+    "bootstrap": (0, np.inf),
+}  # fmt: skip
+"""Least and largest numbers of the fields of `SearchOptions`."""
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class SearchOptions:
     """What the main job is asked to do.
@@ -150,6 +163,16 @@ class SearchOptions:
     prior: tuple[PriorSetting, ...] = ()
     seed: int = SEED
     images: ImageOptions | None = None
+
+    def __post_init__(self) -> None:
+        annulus("SearchOptions", "separation_mas", self.separation_mas)
+        for name, (low, high) in RANGES.items():
+            in_range("SearchOptions", name, getattr(self, name), low, high)
+        for name, known in (("observables", OBSERVABLES), ("companions", COMPANIONS)):
+            for one in getattr(self, name) or ():
+                one_of("SearchOptions", name, one, known)
+        methods = (*EVIDENCE_METHODS, *SAMPLERS)  # those too that were put there since
+        one_of("SearchOptions", "evidence_method", self.evidence_method, dict.fromkeys(methods))
 
     def to_json(self) -> dict[str, Any]:
         """All of them in JSON's types, as ``result.json`` keeps them."""

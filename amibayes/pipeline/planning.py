@@ -27,6 +27,7 @@ from amibayes.pipeline.migration_plan import MigrationExpectation, expect_migrat
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels
 from amibayes.simulation.slopes import electron_variance, slope_weights
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import PLAN_SEPARATION_MAS
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
@@ -86,6 +87,7 @@ class Expectation:
     migration: MigrationExpectation | None = None
 
 
+@checks_arguments
 def expect(
     plan: Plan,
     separation_mas: tuple[float, float] = PLAN_SEPARATION_MAS,

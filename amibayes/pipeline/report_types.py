@@ -22,10 +22,11 @@ from amibayes.posterior.bootstrap import Bootstrap
 from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import Evidence
 from amibayes.posterior.grid import GridPosterior
+from amibayes.support.notebook import Rows, Shown
 
 
-@dataclass(frozen=True, eq=False)
-class SearchReport:
+@dataclass(frozen=True, eq=False, repr=False)
+class SearchReport(Shown):
     """Everything the main job found, for `amibayes.report` and `amibayes.plots`."""
 
     options: SearchOptions
@@ -52,6 +53,21 @@ class SearchReport:
     limits_beside: LimitsBeside | None = None
     charge_migration: CubeMigration | None = None
     timing_s: dict[str, float] = field(default_factory=dict)
+
+    def rows(self) -> Rows:
+        """What an interpreter shows."""
+        stages = ("significance", "posterior", "limits", "evidence", "models")
+        kept = [stage for stage in stages if getattr(self, stage) is not None]
+        chance = self.significance
+        return [
+            ("targets", ", ".join(self.targets)),
+            ("calibrators", ", ".join(self.calibrators) or "none"),
+            ("statement", "not tested" if self.verdict is None else self.verdict.statement),
+            ("best fit", repr(self.result).strip("<>").removeprefix("SearchResult: ")),
+            ("false alarm", "not tested" if chance is None else f"{chance.probability:.3g}"),
+            ("holds", ", ".join(["result", "observables", *kept])),
+            *(("warning", text) for text in self.warnings),
+        ]
 
 
 def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:

@@ -38,6 +38,7 @@ from amibayes.posterior.ensemble import Posterior, sample
 from amibayes.posterior.evidence import Evidence, compare_models
 from amibayes.posterior.grid import GridPosterior, affordable, grid_posterior
 from amibayes.posterior.priors import Prior, default_prior, edit_prior
+from amibayes.support.arguments import checks_arguments
 
 MAX_NOISE_SAMPLES = 2000
 """Samples of the posterior that the noise is averaged over: its median is then known to 2 % of
@@ -46,6 +47,7 @@ its width."""
 Streams = dict[str, np.random.Generator]
 
 
+@checks_arguments
 def search_companion(
     targets: Sequence[str | Path],
     calibrators: Sequence[str | Path] = (),

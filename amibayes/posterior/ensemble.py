@@ -12,7 +12,7 @@ import numpy as np
 from astropy.table import QTable
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.tables import UNITS, html_table, pretty, quantity_table
+from amibayes.data.tables import UNITS, pretty, quantity_table
 from amibayes.errors import DataError, UsageError
 from amibayes.posterior.chain import (
     MAX_STEPS,
@@ -30,6 +30,8 @@ from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import ModelPrior
+from amibayes.support.arguments import checks_arguments, one_of
+from amibayes.support.notebook import html_table
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -40,6 +42,9 @@ from amibayes.units import (
 START_WIDTH = 0.05
 """Longest scatter of the walkers' start, in units of the field."""
 
+
+DERIVED = ("separation_mas", "position_angle_deg", "delta_mag")
+"""Quantities that follow from the parameters of the companion."""
 
 Progress = Callable[[int, int], None]
 
@@ -110,6 +115,7 @@ class Posterior:
             return position_angle_deg(self.column("east_mas"), self.column("north_mas"))
         if name == "delta_mag":
             return contrast_to_delta_mag(self.column("contrast"))
+        one_of("Posterior.column", "name", name, (*self.names, *DERIVED))
         return self.samples[:, self.names.index(name)]
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
@@ -128,14 +134,13 @@ class Posterior:
 
     def to_table(self) -> QTable:
         """All samples as an astropy table with units, with separation, angle and Δmag."""
-        derived = ("separation_mas", "position_angle_deg", "delta_mag")
-        columns = {name: self.column(name) for name in (*self.names, *derived)}
+        columns = {name: self.column(name) for name in (*self.names, *DERIVED)}
         return quantity_table(columns | {"log_prob": self.log_prob}, UNITS)
 
     def _repr_html_(self) -> str:
         """Show medians and intervals in a notebook."""
         rows = []
-        for name in ("separation_mas", "position_angle_deg", "delta_mag", *self.names):
+        for name in (*DERIVED, *self.names):
             median, low, high = self.interval(name)
             _, low95, high95 = self.interval(name, 0.95)
             rows.append((pretty(name), *(f"{x:.5g}" for x in (median, low, high, low95, high95))))
@@ -189,6 +194,7 @@ class Posterior:
         return f"<Posterior: {len(self.samples)} samples of {', '.join(self.names)}; {state}>"
 
 
+@checks_arguments
 def sample(
     result: SearchResult,
     prior: Prior,

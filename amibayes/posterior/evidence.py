@@ -27,6 +27,8 @@ from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
 from amibayes.posterior.priors import Prior, Range
 from amibayes.posterior.sampler import draw_posterior
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import html_table
 from amibayes.support.options import SAMPLERS
 from amibayes.units import FloatArray
 
@@ -95,7 +97,22 @@ class Evidence:
         each = zip(self.companions, self.log_z, strict=True)
         return f"<Evidence: {', '.join(f'{k} companions ln Z {z:.2f}' for k, z in each)}>"
 
+    def _repr_html_(self) -> str:
+        """Show the evidences in a notebook."""
+        each = zip(
+            self.companions,
+            self.log_z,
+            self.log_z_error,
+            self.probability,
+            self.method,
+            strict=True,
+        )
+        rows = [(k, f"{z:.2f}", f"{e:.2g}", f"{p:.3g}", how) for k, z, e, p, how in each]
+        header = ("companions", "ln Z", "1σ", "probability", "method")
+        return html_table("Evidence", header, rows)
 
+
+@checks_arguments
 def compare_models(
     result: SearchResult,
     prior: Prior,

@@ -23,6 +23,8 @@ from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.integrand import Cells, Integrand, Nuisance
 from amibayes.posterior.priors import Prior
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import html_table
 from amibayes.units import BoolArray, FloatArray
 
 FLOOR = 10.0
@@ -79,6 +81,13 @@ class GridPosterior:
             f"<GridPosterior: {len(self.cells)} cells, ln Z {self.log_z:.3f}, "
             f"{self.log_z - self.log_z_none:+.3f} against no companion>"
         )
+
+    def _repr_html_(self) -> str:
+        """Show medians and intervals in a notebook."""
+        names = ("separation_mas", "position_angle_deg", "contrast", "delta_mag")
+        each = {name: self.interval(name) for name in (*names, *self.nuisance_names)}
+        rows = [(name, *(f"{x:.5g}" for x in three)) for name, three in each.items()]
+        return html_table(repr(self).strip("<>"), ("", "median", "16 %", "84 %"), rows)
 
     def marginal(self, name: str) -> Marginal:
         """Distribution of east_mas, north_mas, separation_mas, ln_contrast or a nuisance."""
@@ -173,6 +182,7 @@ class GridPosterior:
         return np.asarray(mass, dtype=float)
 
 
+@checks_arguments
 def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) -> GridPosterior:
     """Integrate the posterior of one companion over the whole field.
 

@@ -18,8 +18,8 @@ from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.companion import companion_parameters
 from amibayes.models.parameters import Parameter, Parameters
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import ContrastForm, PositionForm, choices
-from amibayes.support.quantities import takes_quantities
 from amibayes.units import FloatArray, offset
 
 STAR_SCALE_MAS = 1.0
@@ -28,7 +28,7 @@ STAR_SCALE_MAS = 1.0
 SYNTAX = "contrast=[FORM:]LOW:HIGH, contrast=FORM, position=area|separation or NAME=LOW:HIGH"
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Prior:
     """Prior of the companions and the nuisance parameters.
@@ -77,10 +77,6 @@ class Prior:
         _check("contrast", self.contrast_min, self.contrast_max, least=1e-300)
         for k, (low, high) in enumerate(self.nuisance):
             _check(f"nuisance {k}", low, high, least=-np.inf)
-        if self.contrast_form not in choices(ContrastForm):
-            raise UsageError(f"{self.contrast_form!r} is no distribution of the contrast")
-        if self.position_form not in choices(PositionForm):
-            raise UsageError(f"{self.position_form!r} is no distribution of the position")
 
     @property
     def description(self) -> str:
@@ -393,5 +389,5 @@ def _check(name: str, low: float, high: float, least: float) -> None:
     if not (least <= low < high < np.inf):
         raise UsageError(
             f"the range of the {name}, {low:g} to {high:g}, is empty or impossible",
-            remedy="give LOW:HIGH with LOW below HIGH" + (" and above 0" if least > 0 else ""),
+            remedy="give a lower limit below the upper one" + (" and above 0" if least > 0 else ""),
         )

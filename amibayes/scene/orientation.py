@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import DEGREE, FloatArray
 
 SAME_ORIENTATION_RAD = 0.05 * DEGREE
@@ -22,7 +22,7 @@ SAME_ORIENTATION_RAD = 0.05 * DEGREE
 0.35 mas for one of two exposures, and nothing for their mean."""
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Orientation:
     """How an image lies on the sky.

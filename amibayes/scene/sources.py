@@ -16,7 +16,8 @@ from scipy.special import j0, j1
 
 from amibayes.errors import DataError
 from amibayes.scene.spectrum import Flat, Spectrum
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import ComplexArray, FloatArray, read_only
 
 _BLOCK = 4096
@@ -38,7 +39,7 @@ class Component(Protocol):
         """Fourier transform at spatial frequencies (cycles per radian), times the flux."""
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Point:
     """A point source.
@@ -76,7 +77,7 @@ class Point:
         return np.ones_like(frequency)
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class UniformDisc(Point):
     """A disc of even brightness, ``diameter_rad`` across."""
@@ -94,7 +95,7 @@ class UniformDisc(Point):
         return _airy(np.pi * self.diameter_rad * frequency)
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class GaussianDisc(Point):
     """A round Gaussian of full width ``fwhm_rad`` at half its maximum."""
@@ -113,7 +114,7 @@ class GaussianDisc(Point):
         return np.asarray(np.exp(-((np.pi * self.fwhm_rad * frequency) ** 2) / (4.0 * np.log(2.0))))
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Ring(Point):
     """A flat ring of mean diameter ``diameter_rad`` and radial width ``width_rad``."""
@@ -214,8 +215,8 @@ class SkyImage:
         return np.asarray(np.einsum("fx,fx->f", up @ self.pixels, across))
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Shown):
     """A star with a magnitude and a spectrum, and what surrounds it.
 
     Parameters

@@ -20,6 +20,7 @@ from amibayes.optics import psf
 from amibayes.scene.spectrum import Blackbody, Spectrum, g2v
 from amibayes.simulation.detector import PRESETS, Detector
 from amibayes.simulation.exposure import MAX_INTEGRATIONS
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import PEAK_LIMIT_E
 
 PAPER_TEMPERATURE_K = 5450.0
@@ -164,6 +165,7 @@ class Plan:
         return self.peaks.centred * self.count_rate_e_s * self.integration_time_s
 
 
+@checks_arguments
 def make_plan(
     instrument: Instrument,
     *,

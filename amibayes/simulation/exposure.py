@@ -16,7 +16,7 @@ from amibayes.parallel import Executor, Journal, Progress, child_seeds, run_job,
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import read_ramps
 from amibayes.simulation.slopes import SlopeFit
-from amibayes.support.quantities import takes_quantities
+from amibayes.support.arguments import checks_arguments
 from amibayes.units import MAS, FloatArray
 
 PIECE = 32
@@ -47,7 +47,7 @@ def refuse_too_many(n_integrations: int) -> None:
         )
 
 
-@takes_quantities
+@checks_arguments
 @dataclass(frozen=True)
 class Exposure:
     """How an exposure is taken.

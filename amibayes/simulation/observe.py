@@ -29,13 +29,15 @@ from amibayes.simulation.exposure import (
     record,
 )
 from amibayes.simulation.truth import exposure_header, instrument_keyword, truth_tables
+from amibayes.support.arguments import checks_arguments
+from amibayes.support.notebook import Shown
 from amibayes.units import FloatArray
 
 DAY_S = 86400.0
 
 
-@dataclass(frozen=True, eq=False)
-class Observation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observation(Shown):
     """All that decides what an exposure shows, but for the random numbers.
 
     Parameters
@@ -182,6 +184,7 @@ def open_shutter(
     return PreparedExposure(observation, pointings, recorder, noise)
 
 
+@checks_arguments
 def simulate(
     scene: Scene,
     instrument: Instrument,

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from functools import wraps
-from typing import Any, TypeVar, cast
+from typing import Any
 
 from amibayes.errors import UsageError
 
 UNITS = {"mas": "mas", "rad": "rad", "deg": "deg", "m": "m", "s": "s", "days": "day"}
 """Last word of a name → unit of its number."""
-
-Target = TypeVar("Target", bound=Callable[..., Any])
 
 
 def plain(name: str, value: Any) -> Any:
@@ -32,7 +27,7 @@ def plain(name: str, value: Any) -> Any:
     """
     if isinstance(value, tuple | list):
         return type(value)(plain(name, part) for part in value)
-    if not _has_unit(value):
+    if not has_unit(value):
         return value
     unit = UNITS.get(name.rpartition("_")[2])
     if unit is None:
@@ -43,31 +38,8 @@ def plain(name: str, value: Any) -> Any:
         raise UsageError(f"{name} is in {unit}, which {value} cannot be") from error
 
 
-def takes_quantities(target: Target) -> Target:
-    """Let a function, or the constructor of a class, take quantities where names have units."""
-    if isinstance(target, type):
-        target.__init__ = _converting(target.__init__)  # type: ignore[misc]
-        return target
-    return cast(Target, _converting(target))
-
-
-def _converting(function: Callable[..., Any]) -> Callable[..., Any]:
-    signature = inspect.signature(function)
-
-    @wraps(function)
-    def converted(*args: Any, **kwargs: Any) -> Any:
-        if any(_has_unit(value) for value in (*args, *kwargs.values())):
-            bound = signature.bind(*args, **kwargs)
-            for name, value in bound.arguments.items():
-                bound.arguments[name] = plain(name, value)
-            args, kwargs = bound.args, bound.kwargs
-        return function(*args, **kwargs)
-
-    return converted
-
-
-def _has_unit(value: Any) -> bool:
+def has_unit(value: Any) -> bool:
     """Whether it is a quantity, or holds one."""
     if isinstance(value, tuple | list):
-        return any(_has_unit(part) for part in value)
+        return any(has_unit(part) for part in value)
     return hasattr(value, "to_value") and hasattr(value, "unit")

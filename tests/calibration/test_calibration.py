@@ -518,7 +518,7 @@ def test_dependence_on_charge_level(rng: np.random.Generator) -> None:
     ("levels", "fault"),
     [
         ([1.0, 2.0, 3.0], "charge level"),
-        ([1.0, 2.0, np.nan, 3.0], "charge level"),
+        ([1.0, 2.0, np.inf, 3.0], "charge level"),
         ([1.0, 2.0, 2.0, 2.0], "levels"),
     ],
 )
@@ -643,7 +643,7 @@ def bad(  # noqa: C901
     if case == "diameters":
         return target, [cal], {"diameters_mas": [1.0, 2.0]}
     if case == "diameter":
-        return target, [cal], {"diameters_mas": [np.nan]}
+        return target, [cal], {"diameters_mas": [np.inf]}
     if case == "time":
         late = instrument.star("c.fits", mjd=60100.0)
         return target, [late], {"window_days": 1.0}

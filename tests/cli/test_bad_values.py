@@ -56,13 +56,13 @@ TRIANGLE = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0]])
         (lambda: ExtractOptions(window_px=-1.0), "window is -1 pixels"),
         (lambda: ExtractOptions(window_px=float("inf")), "window is inf pixels"),
         (lambda: ExtractOptions(window_px=float("nan")), "window is nan pixels"),
-        (lambda: Prior(50.0, 400.0, contrast_form="normal"), "no distribution of the contrast"),  # type: ignore[arg-type]
-        (lambda: Prior(50.0, 400.0, position_form="disc"), "no distribution of the position"),  # type: ignore[arg-type]
+        (lambda: Prior(50.0, 400.0, contrast_form="normal"), "form is 'normal'"),  # type: ignore[arg-type]
+        (lambda: Prior(50.0, 400.0, position_form="disc"), "position_form is 'disc'"),  # type: ignore[arg-type]
         (lambda: SkyImage(np.ones((4, 4)), np.eye(2), flux=-1.0), "relative flux -1"),
         (lambda: SkyImage(np.ones(4), np.eye(2)), "two axes"),
         (lambda: SkyImage(-np.ones((4, 4)), np.eye(2)), "negative pixels"),
         (lambda: SkyImage(np.ones((4, 4)), np.zeros((2, 2))), "pixel scale above zero"),
-        (lambda: Cube(np.ones((4, 4)), "NIRISS", "F430M", 3e-7), "has 2 axes, not 3"),
+        (lambda: Cube(np.ones((4, 4)), 3e-7, "NIRISS", "F430M"), "has 2 axes, not 3"),
         (lambda: PupilMap(np.full((4, 4), np.nan), 6.0), "not finite"),
         (lambda: WavefrontErrors(piston_m=-1e-9), "wavefront.piston_m is -1e-09"),
         (lambda: Detector(flat_error=0.5), "detector.flat_error is 0.5"),

@@ -261,6 +261,6 @@ def test_several_targets_say_which_option_chooses(tmp_path) -> None:
     ]
 
     write_oifits(path, join(renamed))
-    with pytest.raises(DataError, match=r"several targets: A, B \(choose .* --target"):
+    with pytest.raises(DataError, match=r"several targets: A, B \(choose .* target=NAME"):
         read_oifits(path)
     assert read_oifits(path, target="B").n_vis2 == 21

@@ -422,7 +422,7 @@ def test_methods_are_not_mixed(niriss: Instrument, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="extracted by square, the target by fringes"):
         calibrate(target, [read_oifits(tmp_path / "square.oifits")])
     other = extract(cube_of(images[:4], niriss), "fringes")
-    with pytest.raises(UsageError, match="'foo' is no method of calibration"):
+    with pytest.raises(UsageError, match="method is 'foo', not 'hierarchical'"):
         calibrate(target, [other], method="foo")  # type: ignore[arg-type]
 
 

@@ -41,7 +41,7 @@ def test_differences_need_no_magnitude_of_the_star_and_units_are_kept(tmp_path: 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mass,absolute_mag\n1,14\n2,12\n", "--primary-magnitude"),
+        ("mass,absolute_mag\n1,14\n2,12\n", "primary_magnitude=M"),
         ("weight,delta_mag\n1,14\n2,12\n", "no column mass"),
         ("mass,colour\n1,14\n2,12\n", "no column delta_mag"),
         ("mass,delta_mag\n1,14\n", "two rows"),

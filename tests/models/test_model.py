@@ -7,6 +7,7 @@ import pytest
 from helpers import NIRISS_HOLES, niriss, numerical_gradient, simulated
 
 from amibayes.data.point_source import point_source
+from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.uv_points import uv_points_of
@@ -133,5 +134,5 @@ def test_closure_phase_residuals_wrap() -> None:
 
 
 def test_theta_of_wrong_length_is_refused() -> None:
-    with pytest.raises(ValueError, match="3 columns"):
+    with pytest.raises(UsageError, match=r"2 columns, not 3 .*east_mas, north_mas, contrast"):
         Likelihood(niriss()).log_prob([[1.0, 2.0]])

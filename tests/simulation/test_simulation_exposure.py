@@ -184,7 +184,7 @@ def test_ramps_are_kept_on_request() -> None:
         ({"n_integrations": 0}, "n_integrations is 0; it must be 1 or more"),
         ({"n_pixels": 2}, "n_pixels is 2; it must be 8 or more"),
         ({"jitter_rad": -1.0}, "jitter is -1"),
-        ({"dither_rad": float("nan")}, "dither is nan"),
+        ({"dither_rad": float("nan")}, "dither_rad is NaN"),
     ],
 )
 def test_exposures_that_make_no_sense(numbers: dict[str, float], message: str) -> None:

@@ -18,6 +18,7 @@ from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits, open_oifits, plain
 from amibayes.oifits.writer import write_oifits
 from amibayes.scene.orientation import SAME_ORIENTATION_RAD
+from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import ClosureCovariance
 from amibayes.units import FloatArray
 
@@ -25,6 +26,7 @@ USED = ("OI_VIS", "OI_Q4", "ASDF")
 """Tables that need not be said to be set aside: used for repairs, or derived from others."""
 
 
+@checks_arguments
 def read_oifits(
     path: str | Path,
     *,
