@@ -22,7 +22,12 @@ from .data.joining import join as join
 from .data.observables import Observables as Observables
 from .data.point_source import point_source as point_source
 from .detection.false_alarm import Significance as Significance, significance as significance
-from .detection.statistic import statistic_of as statistic_of
+from .detection.statistic import (
+    BankStatistic as BankStatistic,
+    Hits as Hits,
+    Statistic as Statistic,
+    statistic_of as statistic_of,
+)
 from .errors import (
     AmibayesError as AmibayesError,
     DataError as DataError,
@@ -37,6 +42,7 @@ from .instrument import (
 )
 from .likelihood.joint import joint_likelihood as joint_likelihood
 from .likelihood.likelihood import Likelihood as Likelihood
+from .likelihood.noise import FittedNoise as FittedNoise, NoiseModel as NoiseModel
 from .limits.analytic import AnalyticLimit as AnalyticLimit, analytic_limit as analytic_limit
 from .limits.completeness import detection_limit as detection_limit
 from .limits.image_injection import (
@@ -48,6 +54,8 @@ from .limits.image_injection import (
 from .limits.injection import Recovery as Recovery, recover as recover
 from .limits.limit import DetectionLimit as DetectionLimit
 from .models.binary import BinaryModel as BinaryModel
+from .models.parameters import Parameter as Parameter
+from .models.source import Component as Component, Slope as Slope, Source as Source
 from .oifits import (
     OIFits as OIFits,
     OITable as OITable,
@@ -78,6 +86,7 @@ from .posterior.ensemble import Posterior as Posterior, sample as sample
 from .posterior.evidence import Evidence as Evidence, compare_models as compare_models
 from .posterior.grid import GridPosterior as GridPosterior, grid_posterior as grid_posterior
 from .posterior.priors import Prior as Prior
+from .posterior.sampler import Draws as Draws, Sampler as Sampler
 from .scene.file import load_scene as load_scene
 from .scene.orientation import Orientation as Orientation
 from .scene.sources import Scene as Scene

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from astropy import units
@@ -18,6 +19,7 @@ from amibayes.likelihood.student import Robustness, StudentNoise, SymmetricWhite
 from amibayes.models.parameters import Parameters
 from amibayes.models.uv_points import YEAR_DAYS
 from amibayes.support.arguments import checks_arguments, one_of
+from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.units import (
     FloatArray,
@@ -147,6 +149,10 @@ def is_opposite(mode: Mode, place: FloatArray) -> bool:
     return bool(np.hypot(*np.add(mode.place, place)) < 1e-2)
 
 
+SKY = ("north_mas", "east_mas")
+"""Axes of a map."""
+
+
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """What a search found.
@@ -267,6 +273,30 @@ class SearchResult:
         columns = {name: [getattr(c, name) for c in found] for name in names}
         gains = {"delta_chi2": [mode.delta_chi2 for mode in self.modes]}
         return quantity_table(columns | gains, UNITS)
+
+    def to_xarray(self) -> Any:
+        """Maps over the field and all distinct solutions as labelled arrays (extra ``xarray``).
+
+        Returns
+        -------
+        xarray.Dataset
+            Of (north_mas, east_mas): ``delta_chi2_map``, ``contrast_map`` and
+            ``contrast_error_map``, NaN outside the field. Of mode: ``separation_mas`` and others
+            by the names of ``result.json``, best first.
+        """
+        axis = np.arange(-self.grid.half_width, self.grid.half_width + 1) * self.grid.step_mas
+        maps = {
+            "delta_chi2_map": self.bank_delta_chi2,
+            "contrast_map": self.bank_contrast,
+            "contrast_error_map": self.bank_sigma,
+        }
+        names = ("separation_mas", "position_angle_deg", "contrast", "delta_mag", "delta_chi2")
+        modes = {n: (("mode",), np.array([getattr(m, n) for m in self.modes])) for n in names}
+        images = {name: (SKY, self.grid.image(values)) for name, values in maps.items()}
+        coordinates = {"north_mas": axis, "east_mas": axis, "mode": np.arange(len(self.modes))}
+        facts = {"source": self.likelihood.observables.source, "ndof": self.ndof}
+        chi2 = {"chi2_single": self.chi2_single, "chi2_binary": self.chi2_binary}
+        return labelled({**images, **modes}, coordinates, facts | chi2)
 
     def _repr_html_(self) -> str:
         """Show the best fit in a notebook."""

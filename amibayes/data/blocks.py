@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 from amibayes.errors import DataError
 from amibayes.units import FloatArray, IntArray
 
-
 INDEPENDENT = 1e-8
 """Length, in units of the longest column, from which on what is new in a column is no rounding."""
 

@@ -38,6 +38,7 @@ from amibayes.detection.statistic import Statistic, make_statistic
 from amibayes.likelihood.combinations import combination_of, require
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.support.arguments import checks_arguments, in_range
+from amibayes.support.labelled import labelled
 from amibayes.support.notebook import Rows, Shown
 from amibayes.support.options import LIMITS_SEPARATIONS, AnalyticMethod
 from amibayes.units import BoolArray, FloatArray, contrast_to_delta_mag
@@ -119,6 +120,26 @@ class AnalyticLimit(Shown):
 
     def cells(self) -> None:
         """None: there are no injections."""
+
+    def to_xarray(self) -> Any:
+        """The limit at every separation and over the position angle (extra ``xarray``).
+
+        Returns
+        -------
+        xarray.Dataset
+            Of separation_mas: ``contrast`` and ``delta_mag``, medians over the position angle;
+            of (separation_mas, quantile): ``contrast_spread``.
+        """
+        along = ("separation_mas",)
+        return labelled(
+            {
+                "contrast": (along, self.contrast),
+                "delta_mag": (along, self.delta_mag),
+                "contrast_spread": ((*along, "quantile"), self.spread),
+            },
+            {"separation_mas": self.separation_mas, "quantile": np.array(SPREAD)},
+            {"method": self.method, "criterion": self.criterion},
+        )
 
     @property
     def criterion(self) -> str:

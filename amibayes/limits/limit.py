@@ -12,6 +12,7 @@ from scipy import stats
 from amibayes.data.tables import UNITS, quantity_table
 from amibayes.detection.binomial import clopper_pearson
 from amibayes.limits.logistic import Logistic, fit_logistic
+from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag
 
@@ -140,6 +141,34 @@ class DetectionLimit:
             "completeness": self.completeness,
         }
         return quantity_table(columns, UNITS, meta)
+
+    def to_xarray(self) -> Any:
+        """The curve and the completeness as labelled arrays (extra ``xarray``).
+
+        Returns
+        -------
+        xarray.Dataset
+            Of separation_mas: ``delta_mag``, ``contrast`` and others by the names of
+            ``limits.json``; of (separation_mas, level): the injected contrasts, trials,
+            detected and located companions, and their share, ``completeness``.
+        """
+        along, cells = ("separation_mas",), ("separation_mas", "level")
+        curves = {"contrast": self.contrast, "delta_mag": self.delta_mag, **self.columns()}
+        counts = {
+            "injected_contrast": self.level,
+            "trials": self.trials,
+            "detected": self.detected,
+            "located": self.located,
+            "completeness": self.share,
+        }
+        variables: dict[str, Any] = {name: (along, values) for name, values in curves.items()}
+        coordinates = {"separation_mas": self.separation_mas}
+        facts = {"false_positive_rate": self.false_positive_rate, "limit_at": self.completeness}
+        return labelled(
+            variables | {name: (cells, values) for name, values in counts.items()},
+            coordinates,
+            {"method": self.method, **facts},
+        )
 
     def __repr__(self) -> str:
         """One line for a notebook."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, mode
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import ModelPrior
 from amibayes.support.arguments import checks_arguments, one_of
+from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.units import (
     FloatArray,
@@ -136,6 +137,26 @@ class Posterior:
         """All samples as an astropy table with units, with separation, angle and Δmag."""
         columns = {name: self.column(name) for name in (*self.names, *DERIVED)}
         return quantity_table(columns | {"log_prob": self.log_prob}, UNITS)
+
+    def to_xarray(self) -> Any:
+        """The chain, burn-in removed, as labelled arrays (extra ``xarray``).
+
+        Returns
+        -------
+        xarray.Dataset
+            Of (chain, draw), a walker being a chain, which ArviZ takes too: every parameter,
+            separation, position angle and magnitude difference, and ``log_prob``.
+        """
+        kept = replace(self, samples=self.chain[self.n_burn :].reshape(-1, len(self.names)))
+        shape = (-1, self.n_walkers)
+        columns = {n: kept.column(n).reshape(shape).T for n in (*self.names, *DERIVED)}
+        columns["log_prob"] = self.chain_log_prob[self.n_burn :].T
+        facts = {"converged": int(self.converged), "split_rhat": self.split_rhat}
+        return labelled(
+            {name: (("chain", "draw"), values) for name, values in columns.items()},
+            {"chain": np.arange(self.n_walkers), "draw": np.arange(self.n_burn, self.n_steps)},
+            facts | {"autocorrelation_time": self.autocorrelation_time},
+        )
 
     def _repr_html_(self) -> str:
         """Show medians and intervals in a notebook."""

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from amibayes import __version__
 from amibayes.errors import RunError
 
-EXTRAS = ("cluster", "evidence", "arviz", "mpi")
+EXTRAS = ("cluster", "evidence", "arviz", "xarray", "mpi")
 """Extras that users need; the others are for work on amibayes itself. Each brings one package."""
 
 GEMM_SIZE = 1024
