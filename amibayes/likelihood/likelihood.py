@@ -252,12 +252,13 @@ class Likelihood(Shown):
         return self.wrapped(self.observables.data[:, None] - model)
 
     def wrapped(self, change: FloatArray) -> FloatArray:
-        """Differences of data (n_data, n), closure phases the short way round; in place.
+        """Differences of data (n_data,) or (n_data, n), closure phases the short way; in place.
 
         Kernel phases are real sums and have no period.
         """
         closure = change[self._n2 :]
-        closure -= self._turn * np.rint(closure / (2.0 * np.pi))
+        turn = self._turn if closure.ndim > 1 else self._turn[:, 0]
+        closure -= turn * np.rint(closure / (2.0 * np.pi))
         return change
 
 

@@ -133,6 +133,16 @@ def test_closure_phase_residuals_wrap() -> None:
     np.testing.assert_allclose(Likelihood(turned).chi2([[100.0, 50.0, 0.0]]), 0.0, atol=1e-18)
 
 
+def test_one_data_set_is_wrapped_as_several_are() -> None:
+    likelihood = Likelihood(niriss())
+    change = np.linspace(-9.0, 9.0, len(likelihood.observables.data))
+    several = likelihood.wrapped(np.column_stack([change, change]))
+    np.testing.assert_array_equal(likelihood.wrapped(change.copy()), several[:, 0])
+    n = likelihood.observables.n_vis2
+    assert np.abs(several[n:]).max() <= np.pi
+    np.testing.assert_array_equal(several[:n, 0], change[:n])
+
+
 def test_theta_of_wrong_length_is_refused() -> None:
     with pytest.raises(UsageError, match=r"2 columns, not 3 .*east_mas, north_mas, contrast"):
         Likelihood(niriss()).log_prob([[1.0, 2.0]])
