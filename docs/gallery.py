@@ -66,7 +66,7 @@ def other_commands(folder: Path) -> None:
 MORE = {
     "vet/vetting.png": "vetting.png",
     "limits/limits.png": "limits_of_observables.png",
-    "survey/summary.png": "summary.png",
+    "survey/survey.png": "survey.png",
     "joint/files.png": "files.png",
 }
 """Pictures of the other commands, and what they are called in the gallery."""

@@ -7,9 +7,11 @@ import copy
 import importlib
 import logging
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -19,7 +21,7 @@ from amibayes.support.atomic_files import output_locks
 
 if TYPE_CHECKING:
     from amibayes.pipeline.batch import SurveyTarget
-    from amibayes.report.survey import Outcome, Status
+    from amibayes.survey.rows import Outcome
 
 NOT_OF_A_ROW = {
     "--batch", "--cal", "--debug", "--help", "--json", "--out", "--overwrite", "--quiet",
@@ -28,6 +30,10 @@ NOT_OF_A_ROW = {
 """Options of the whole run, which no row can set for itself."""
 
 SOME_FAILED = 4
+
+WRITE_EVERY_S, WRITE_SHARE = 20.0, 0.02
+"""While targets are done the survey's table is written this often, and in at most this share of
+the time: the targets' own results are what ``--resume`` goes by."""
 
 
 def add_inputs(parser: argparse.ArgumentParser) -> None:
@@ -64,14 +70,26 @@ class Job:
     name: str
     arguments: argparse.Namespace | None
     error: str = ""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def command(self) -> Any:
+        """The module of the command."""
+        assert self.arguments is not None
+        return importlib.import_module(f"amibayes.cli.{self.arguments.command}")
+
+    @property
+    def result(self) -> Path:
+        """File of the result, which is written last."""
+        assert self.arguments is not None
+        return Path(self.arguments.out) / str(self.command.RESULT)
 
     def request(self) -> str:
         """Digest of the options and of the files' content; empty where a file is missing."""
         if self.arguments is None:
             return ""
-        command = importlib.import_module(f"amibayes.cli.{self.arguments.command}")
         try:
-            return str(command.request(self.arguments))
+            return str(self.command.request(self.arguments))
         except AmibayesError:  # reported when its turn comes
             return ""
 
@@ -85,47 +103,98 @@ def run_batch(arguments: argparse.Namespace) -> int:
         0 where all targets were done, 4 where some failed.
     """
     from amibayes.pipeline.batch import read_targets
-    from amibayes.report.survey import summary_lines, write_picture
+    from amibayes.report.survey import survey_lines
 
     if arguments.targets:
         raise UsageError(
             "takes the place of targets", source="--batch", remedy="put them into the table"
         )
-    rows = read_targets(arguments.batch)
-    jobs = [_job(arguments, row) for row in rows]
-    folder = _folder(arguments, jobs)
-    outcomes = _finished_or_pending(arguments, jobs, folder)
-    content = _written(arguments, outcomes, folder)
-    for k, outcome in _carry_out(arguments, jobs, outcomes):
-        outcomes[k] = outcome
-        content = _written(arguments, outcomes, folder)
-    write_picture(outcomes, folder)
-    common.finish(arguments, content, lambda: summary_lines(content, folder))
+    jobs = [_job(arguments, row) for row in read_targets(arguments.batch)]
+    survey = _Survey(arguments, jobs, _folder(arguments, jobs))
+    with survey.interruptible():
+        for k, outcome in _carry_out(arguments, jobs):
+            survey.record(k, outcome)
+    content = survey.finish()
+    common.finish(arguments, content, lambda: survey_lines(content, survey.folder))
     return SOME_FAILED if content["n_failed"] else 0
 
 
-def _written(
-    arguments: argparse.Namespace, outcomes: list[Outcome], folder: Path
-) -> dict[str, Any]:
-    from amibayes.report.survey import summary_json, write_summary
+class _Survey:
+    """What has come of the targets so far, and the files that tell of it."""
 
-    content = summary_json(arguments.command, arguments.seed, outcomes)
-    write_summary(content, folder)
-    return content
+    def __init__(self, arguments: argparse.Namespace, jobs: list[Job], folder: Path) -> None:
+        from amibayes.survey.rows import Outcome
+
+        self._arguments, self.folder = arguments, folder
+        self._outcomes = [Outcome(j.name, "pending", facts=j.facts) for j in jobs]
+        self._due = 0.0
+        self._write()
+
+    def record(self, index: int, outcome: Outcome) -> None:
+        """Take in what came of a target; the files follow as often as they cost little."""
+        if outcome.error:
+            print(f"amibayes: {outcome.name}: {outcome.error}", file=sys.stderr)
+        self._outcomes[index] = outcome
+        if time.monotonic() >= self._due:
+            self._write()
+
+    def finish(self) -> dict[str, Any]:
+        """Write everything, with the statistics of all targets together."""
+        from amibayes.report.survey import PAGE_NAME
+        from amibayes.report.survey_page import write_survey_page
+
+        content = self._write(whole=True)
+        drawn = _pictures(content, self.folder)
+        link = "report.html" if self._arguments.command == "search" else "limits.json"
+        write_survey_page(self.folder / PAGE_NAME, content, drawn, link)
+        return content
+
+    @contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Write what there is, and name it, where the run is interrupted."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self._write()
+            n = sum(o.status == "done" for o in self._outcomes)
+            raise KeyboardInterrupt(
+                f"{n} of {len(self._outcomes)} targets are done in {self.folder}, and of the "
+                "others every finished stage is kept"
+            ) from None
+        except BaseException:
+            self._write()
+            raise
+
+    def _write(self, *, whole: bool = False) -> dict[str, Any]:
+        from amibayes.report.survey import write_survey
+        from amibayes.survey.together import survey_json
+
+        begin = time.monotonic()
+        command, seed = self._arguments.command, self._arguments.seed
+        content = survey_json(command, seed, self._outcomes, whole=whole)
+        write_survey(content, self.folder)
+        took = time.monotonic() - begin
+        self._due = begin + took + max(WRITE_EVERY_S, took / WRITE_SHARE)
+        return content
+
+
+def _pictures(content: dict[str, Any], folder: Path) -> list[str]:
+    """Draw the survey's pictures in the process that draws those of its targets."""
+    from amibayes.parallel import run_apart
+    from amibayes.plots.survey import save_survey_pictures
+
+    drawn: list[str] = run_apart(save_survey_pictures, content, folder)
+    return drawn
 
 
 def _folder(arguments: argparse.Namespace, jobs: list[Job]) -> Path:
-    from amibayes.report.survey import JSON_NAME, PICTURE_NAME, TABLE_NAME
+    from amibayes.report.survey import JSON_NAME, PAGE_NAME, TABLE_NAME
     from amibayes.support.atomic_files import output_folder
 
-    names = [JSON_NAME, TABLE_NAME, PICTURE_NAME]
-    names += [f"{job.name}/{_result_name(arguments.command)}" for job in jobs]
+    result = importlib.import_module(f"amibayes.cli.{arguments.command}").RESULT
+    names = [JSON_NAME, TABLE_NAME, PAGE_NAME, *(f"{job.name}/{result}" for job in jobs)]
     overwrite = arguments.overwrite or arguments.resume
     return output_folder(arguments.out, names, overwrite=overwrite)
-
-
-def _result_name(command: str) -> str:
-    return str(importlib.import_module(f"amibayes.cli.{command}").RESULT)
 
 
 class _RowParser(argparse.ArgumentParser):
@@ -146,7 +215,8 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
     own = copy.copy(arguments)
     own.out = str(Path(arguments.out) / row.name)
     own.batch, own.workers, own.scheduler = None, 1, None
-    own.quiet, own.json = True, False
+    own.quiet, own.json, own.in_batch = True, False, True
+    facts = row.facts
     try:
         words = _set_options(own, row)
     except UsageError as error:
@@ -157,20 +227,29 @@ def _job(arguments: argparse.Namespace, row: SurveyTarget) -> Job:
         own.targets = row.files(row.target)
         own.cal = row.files(row.cal) if row.cal else arguments.cal
     except DataError as error:
-        return Job(row.name, None, error.command_line)
+        return Job(row.name, None, error.command_line, facts)
     given = common.without(arguments.words[1:], common.OF_THE_RUN | {"--cal": sys.maxsize})
     files = [*own.targets, *(["--cal", *own.cal] if own.cal else [])]
     own.words = [own.command, *files, *given, *words]
-    return Job(row.name, own)
+    return Job(row.name, own, facts=facts)
+
+
+@cache
+def _row_parser(command: str) -> _RowParser:
+    parser = _RowParser(add_help=False, allow_abbrev=False)
+    importlib.import_module(f"amibayes.cli.{command}").add_arguments(parser)
+    return parser
 
 
 def _set_options(own: argparse.Namespace, row: SurveyTarget) -> list[str]:
     """Set the options of a row; give them as on the command line."""
-    parser = _RowParser(add_help=False, allow_abbrev=False)
-    importlib.import_module(f"amibayes.cli.{own.command}").add_arguments(parser)
-    words = [
-        word for column, value in row.options.items() for word in _words(parser, column, value)
-    ]
+    parser = _row_parser(own.command)
+    options = {**row.options, **row.facts}
+    known = parser._option_string_actions
+    for fact in row.facts:  # what the command does not ask for is the survey's own
+        if "--" + fact.replace("_", "-") not in known:
+            del options[fact]
+    words = [word for column, value in options.items() for word in _words(parser, column, value)]
     targets = own.targets
     parser.parse_args(words, namespace=own)
     own.targets = targets
@@ -185,7 +264,9 @@ def _words(parser: argparse.ArgumentParser, column: str, value: object) -> Itera
         import difflib
 
         allowed = [f[2:].replace("-", "_") for f in flags if f not in NOT_OF_A_ROW]
-        near = difflib.get_close_matches(column, [*allowed, "target", "cal", "name"], n=1)
+        near = difflib.get_close_matches(
+            column, [*allowed, "target", "cal", "name", "distance_pc"], n=1
+        )
         hint = f"did you mean '{near[0]}'?" if near else "columns are target, cal, name, options"
         raise UsageError(f"column '{column}' is no option of a target", remedy=hint)
     if flags[flag].nargs != 0:
@@ -200,59 +281,46 @@ def _words(parser: argparse.ArgumentParser, column: str, value: object) -> Itera
         yield no
 
 
-def _finished_or_pending(
-    arguments: argparse.Namespace, jobs: list[Job], folder: Path
-) -> list[Outcome]:
-    """Outcomes before anything is done: with ``--resume``, the jobs that are finished."""
-    from amibayes.report.survey import Outcome
-    from amibayes.support.request import answers
-
-    outcomes = []
-    for job in jobs:
-        path, key = folder / job.name / _result_name(arguments.command), job.request()
-        content = answers(path, key) if arguments.resume else None
-        status: Status = "pending" if content is None else "done"
-        outcomes.append(Outcome(job.name, status, "", key, content))
-    return outcomes
-
-
-def _carry_out(
-    arguments: argparse.Namespace, jobs: list[Job], outcomes: list[Outcome]
-) -> Iterator[tuple[int, Outcome]]:
-    """Do what is not done yet; give the number of each target and what came of it."""
+def _carry_out(arguments: argparse.Namespace, jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
+    """Do the targets; give the number of each and what came of it."""
     from amibayes.parallel import run_job
+    from amibayes.survey.rows import Outcome
 
-    todo = [k for k, outcome in enumerate(outcomes) if outcome.status != "done"]
-    keys = [outcome.key for outcome in outcomes]
+    def lost(index: int, error: AmibayesError) -> Outcome:
+        return Outcome(jobs[index].name, "failed", str(error), facts=jobs[index].facts)
+
     with (
         common.executor_of(arguments) as executor,
         common.progress_of(arguments, "targets", unit="target") as progress,
     ):
-        work = partial(_one, arguments.command)
-        errors = run_job(work, [jobs[k] for k in todo], executor, progress=progress)
-        for k, error in zip(todo, errors, strict=True):
-            yield k, _outcome(arguments, jobs[k], keys[k], error)
+        yield from enumerate(run_job(_one, jobs, executor, progress=progress, lost=lost))
 
 
-def _outcome(arguments: argparse.Namespace, job: Job, key: str, error: str) -> Outcome:
-    from amibayes.report.survey import Outcome
-    from amibayes.support.request import read_answer
+def _one(job: Job) -> Outcome:
+    """Do one target, unless ``--resume`` finds it done."""
+    from amibayes.support.request import answers, read_answer
+    from amibayes.survey.rows import Outcome, detection_of, row_of
 
-    if error:
-        print(f"amibayes: {job.name}: {error}", file=sys.stderr)
-        return Outcome(job.name, "failed", error, key)
-    path = Path(arguments.out) / job.name / _result_name(arguments.command)
-    return Outcome(job.name, "done", "", key, read_answer(path))
-
-
-def _one(command: str, job: Job) -> str:
-    """Do one target; give in one line what went wrong, or nothing."""
     if job.arguments is None:
-        return job.error
+        return Outcome(job.name, "failed", job.error, facts=job.facts)
+    key = job.request()
+    content = answers(job.result, key) if job.arguments.resume else None
+    if content is None:
+        error = _performed(job)
+        if error:
+            return Outcome(job.name, "failed", error, key, facts=job.facts)
+        content = read_answer(job.result) or {}
+    row, detection = row_of(content), detection_of(content)
+    return Outcome(job.name, "done", "", key, row, job.facts, detection)
+
+
+def _performed(job: Job) -> str:
+    """Do one target; give in one line what went wrong, or nothing."""
+    assert job.arguments is not None
     common.configure_logging(job.arguments)
     try:
         with output_locks():
-            importlib.import_module(f"amibayes.cli.{command}").perform(job.arguments)
+            job.command.perform(job.arguments)
     except AmibayesError as error:
         return error.command_line
     except MemoryError as error:

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from amibayes.errors import UsageError
 from amibayes.support.options import (
@@ -173,6 +173,24 @@ def add_parallel_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_picture_option(group: argparse._ActionsContainer) -> None:
+    """Add ``--no-pictures``."""
+    group.add_argument(
+        "--no-pictures",
+        action="store_true",
+        help="write no pictures, which take most of the time of a short run",
+    )
+
+
+def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -> Any:
+    """Let pictures be drawn: here, or for a target of a table in a process of their own."""
+    if not getattr(arguments, "in_batch", False):
+        return save(*of)
+    from amibayes.parallel import run_apart
+
+    return run_apart(save, *of)
+
+
 def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
     """Open the workers that ``--workers`` or ``--scheduler`` ask for."""
     from amibayes.parallel import open_executor
@@ -182,7 +200,7 @@ def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executo
 
 OF_THE_RUN = {
     "--out": 1, "--batch": 1, "--workers": 1, "--scheduler": 1, "--overwrite": 0, "--resume": 0,
-    "--json": 0, "--quiet": 0, "--verbose": 0, "--debug": 0,
+    "--json": 0, "--quiet": 0, "--verbose": 0, "--debug": 0, "--no-pictures": 0,
 }  # fmt: skip
 """Options that leave the numbers of a result alone, and how many words follow each."""
 

@@ -88,6 +88,7 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         metavar="M",
         help="absolute magnitude of the star, for a table of absolute magnitudes",
     )
+    common.add_picture_option(group)
     group.add_argument(
         "--resume",
         action="store_true",
@@ -116,7 +117,7 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     from amibayes.support.request import refuse_other
 
     options = _options(arguments)
-    names = _names(options)
+    names = _names(options, pictures=not arguments.no_pictures)
     overwrite = arguments.overwrite or arguments.resume
     folder = output_folder(arguments.out, names, overwrite=overwrite)
     request = _request(arguments, options)
@@ -130,11 +131,11 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     return content, folder
 
 
-def _names(options: LimitsOptions) -> list[str]:
+def _names(options: LimitsOptions, *, pictures: bool) -> list[str]:
     """List the files of a run."""
     from amibayes.plots.contrast_curve import limits_picture_names
 
-    return [RESULT, TABLE, *limits_picture_names(options.criterion)]
+    return [RESULT, TABLE, *(limits_picture_names(options.criterion) if pictures else ())]
 
 
 def request(arguments: argparse.Namespace) -> str:
@@ -179,17 +180,20 @@ def _measure(
             executor=executor,
         )
     content = limits_report_json(report, request)
-    _write(report, content, folder)
+    _write(arguments, report, content, folder)
     journals.remove()
     return content
 
 
-def _write(report: LimitsReport, content: object, folder: Path) -> None:
+def _write(
+    arguments: argparse.Namespace, report: LimitsReport, content: object, folder: Path
+) -> None:
     from amibayes.plots.contrast_curve import save_limits_pictures
     from amibayes.report import write_limits_table
     from amibayes.support.atomic_files import write_json
 
-    save_limits_pictures(report, folder)
+    if not arguments.no_pictures:
+        common.draw(arguments, save_limits_pictures, report, folder)
     write_limits_table(folder / TABLE, report)
     # Last: where it is, the run is finished.
     write_json(folder / RESULT, content)

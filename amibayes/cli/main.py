@@ -109,8 +109,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         _abandon_output()
         return 0
-    except KeyboardInterrupt:
-        print(f"amibayes: interrupted{_way_on(words)}", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        kept = f": {stop}" if str(stop) else ""
+        print(f"amibayes: interrupted{kept}{_way_on(words)}", file=sys.stderr)
         return 4
     except Exception as error:
         if "--debug" in words:

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from amibayes.pipeline.report_types import SearchReport
 
 RESULT, REPORT = "result.json", "report.html"
+PICTURES = (".png", ".fits")
+"""Of the files that are written: the pictures, and the numbers of the maps."""
+
 CHAIN, CALIBRATED, JOURNAL = "posterior.h5", "calibrated.oifits", "search.journal"
 
 EXAMPLES = """examples:
@@ -48,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fit N times to exposures drawn anew, for intervals beside the posterior's",
     )
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
+    common.add_picture_option(stages)
     stages.add_argument(
         "--resume",
         action="store_true",
@@ -116,6 +120,8 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     overwrite = arguments.overwrite or arguments.resume
     several = len(arguments.targets) > 1
     names = _names(options, calibrated=bool(arguments.cal), several=several)
+    if arguments.no_pictures:
+        names = [name for name in names if Path(name).suffix not in PICTURES]
     folder = output_folder(arguments.out, names, overwrite=overwrite)
     asked = request(arguments)
     if arguments.resume and not arguments.overwrite:
@@ -195,7 +201,7 @@ def _write(
 
     if report.calibration is not None:
         write_observables(folder / CALIBRATED, report.observables)
-    drawn = save_pictures(report, folder)
+    drawn = [] if arguments.no_pictures else common.draw(arguments, save_pictures, report, folder)
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
     write_page(folder / REPORT, search_page(content, figures, common.command_line(arguments)))

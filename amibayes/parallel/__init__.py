@@ -5,6 +5,7 @@ piece carries its own random seed and is computed with one BLAS thread, so a res
 the same to the last bit for any number of workers, and after any interruption.
 """
 
+from amibayes.parallel.apart import run_apart
 from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
 from amibayes.parallel.job import (
     Executor,
@@ -32,6 +33,7 @@ __all__ = [
     "child_seeds",
     "open_executor",
     "progress_bar",
+    "run_apart",
     "run_job",
     "slices",
     "spawn",

@@ -7,10 +7,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from amibayes.errors import RunError
+from amibayes.parallel.processes import Lost
 from amibayes.parallel.threads import run_in_worker
 
 PATIENCE_S = 60.0
@@ -48,6 +50,13 @@ def _optional(module: str, extra: str) -> Any:
         ) from error
 
 
+@dataclass(frozen=True)
+class _Killed:
+    """Stands for the result of a piece that killed several workers."""
+
+    error: RunError
+
+
 class DaskExecutor:
     """Compute pieces on the workers of a running dask scheduler.
 
@@ -73,7 +82,9 @@ class DaskExecutor:
         except (OSError, TimeoutError, ValueError) as error:
             raise self._lost("no dask scheduler answers") from error
 
-    def map(self, function: Callable[[Any], Any], pieces: Sequence[Any]) -> Iterator[Any]:
+    def map(
+        self, function: Callable[[Any], Any], pieces: Sequence[Any], lost: Lost | None = None
+    ) -> Iterator[Any]:
         """See `Executor.map`; a piece whose worker dies goes to another one.
 
         Raises
@@ -85,11 +96,20 @@ class DaskExecutor:
         shared = self._client.submit(_same, function, pure=False)
         submit = partial(self._client.submit, run_in_worker, shared, pure=False)
         ahead = max(AHEAD, 2 * sum(self._client.nthreads().values()))
-        return _in_order(submit, self._result, pieces, ahead)
+        found = _in_order(submit, self._result, pieces, ahead)
+        return (self._or_instead(k, answer, lost) for k, answer in enumerate(found))
 
     def close(self) -> None:
         """Let the scheduler go; its workers are not ours to end."""
         self._client.close()
+
+    @staticmethod
+    def _or_instead(index: int, answer: Any, lost: Lost | None) -> Any:
+        if not isinstance(answer, _Killed):
+            return answer
+        if lost is None:
+            raise answer.error
+        return lost(index, answer.error)
 
     def _result(self, future: Any) -> Any:
         alone_since: float | None = None
@@ -104,7 +124,9 @@ class DaskExecutor:
                 if failed:  # the piece's own error, not our impatience
                     raise
             except self._distributed.KilledWorker as error:
-                raise self._lost("a piece killed its worker again and again") from error
+                killed = self._lost("a piece killed its worker again and again")
+                killed.__cause__ = error
+                return _Killed(killed)
             except CancelledError as error:
                 raise self._lost("the dask scheduler went away") from error
             alone_since = self._alone(alone_since)
@@ -146,8 +168,10 @@ class MPIExecutor:
         self._pool = _optional("mpi4py.futures", "mpi").MPIPoolExecutor()
         self._pool.bootup(wait=True)
 
-    def map(self, function: Callable[[Any], Any], pieces: Sequence[Any]) -> Iterator[Any]:
-        """See `Executor.map`."""
+    def map(
+        self, function: Callable[[Any], Any], pieces: Sequence[Any], lost: Lost | None = None
+    ) -> Iterator[Any]:
+        """See `Executor.map`; a rank that dies ends all of them, as MPI has it."""
         submit = partial(self._pool.submit, run_in_worker, function)
         ahead = max(AHEAD, 2 * self._pool.num_workers)
         return _in_order(submit, lambda future: future.result(), pieces, ahead)

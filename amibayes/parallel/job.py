@@ -12,7 +12,7 @@ import numpy as np
 from amibayes.errors import UsageError
 from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
 from amibayes.parallel.journal import Journal
-from amibayes.parallel.processes import ProcessExecutor
+from amibayes.parallel.processes import Lost, ProcessExecutor
 from amibayes.parallel.progress import Progress
 from amibayes.parallel.threads import run_here
 
@@ -23,12 +23,18 @@ Result = TypeVar("Result")
 class Executor(Protocol):
     """Something that computes pieces."""
 
-    def map(self, function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> Iterator[Result]:
+    def map(
+        self,
+        function: Callable[[Piece], Result],
+        pieces: Sequence[Piece],
+        lost: Lost | None = None,
+    ) -> Iterator[Result]:
         """Give the results in the order of the pieces, each as soon as it may be had.
 
         ``function`` and the pieces travel to other processes, so the function is one of
         a module (or a ``functools.partial`` of one). Pieces are handed out only a little
-        ahead of the consumer, which keeps memory flat.
+        ahead of the consumer, which keeps memory flat. What ``lost`` returns stands for a
+        piece that has ended worker after worker; without it the run ends with an error.
         """
 
     def close(self) -> None:
@@ -38,7 +44,12 @@ class Executor(Protocol):
 class SerialExecutor:
     """Compute the pieces here, one after the other."""
 
-    def map(self, function: Callable[[Piece], Result], pieces: Sequence[Piece]) -> Iterator[Result]:
+    def map(
+        self,
+        function: Callable[[Piece], Result],
+        pieces: Sequence[Piece],
+        lost: Lost | None = None,
+    ) -> Iterator[Result]:
         """See `Executor.map`."""
         for piece in pieces:
             yield run_here(function, piece)
@@ -96,6 +107,7 @@ def run_job(
     *,
     journal: Journal | None = None,
     progress: Progress | None = None,
+    lost: Lost | None = None,
 ) -> Iterator[Any]:
     """Compute the pieces that are not yet in the journal; give all results in order.
 
@@ -111,6 +123,9 @@ def run_job(
         Where finished pieces are kept.
     progress : Progress, optional
         Called after each piece.
+    lost : callable, optional
+        Called with the index of a piece that has ended worker after worker and the error; what
+        it returns is the piece's result. Without it the error is raised.
 
     Yields
     ------
@@ -119,7 +134,8 @@ def run_job(
     """
     kept = {i for i in range(len(pieces)) if journal is not None and journal.read(i) is not None}
     todo = [i for i in range(len(pieces)) if i not in kept]
-    fresh = executor.map(function, [pieces[i] for i in todo])
+    instead = None if lost is None else lambda k, error: lost(todo[k], error)
+    fresh = executor.map(function, [pieces[i] for i in todo], instead)
     report = progress or _ignore
     report(len(kept), len(pieces))
     finished = len(kept)

@@ -27,6 +27,9 @@ from amibayes.parallel.threads import run_in_worker
 ATTEMPTS = 3
 """How many workers a piece may lose before the run gives up."""
 
+Lost = Callable[[int, RunError], Any]
+"""Called with the index of a piece that has cost too many workers, and the error."""
+
 _SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -123,6 +126,7 @@ class _Job:
     function: Callable[[Any], Any]
     pieces: Sequence[Any]
     todo: deque[int]
+    instead: Lost | None = None
     done: dict[int, Any] = field(default_factory=dict)
     lost: Counter[int] = field(default_factory=Counter)
     next: int = 0
@@ -140,7 +144,9 @@ class ProcessExecutor:
         self._n = workers
         self._workers: list[_Worker] = []
 
-    def map(self, function: Callable[[Any], Any], pieces: Sequence[Any]) -> Iterator[Any]:
+    def map(
+        self, function: Callable[[Any], Any], pieces: Sequence[Any], lost: Lost | None = None
+    ) -> Iterator[Any]:
         """See `Executor.map`.
 
         Raises
@@ -148,7 +154,7 @@ class ProcessExecutor:
         RunError
             When a piece has lost three workers.
         """
-        job = _Job(function, pieces, deque(range(len(pieces))))
+        job = _Job(function, pieces, deque(range(len(pieces))), lost)
         try:
             for job.next in range(len(pieces)):
                 while job.next not in job.done:
@@ -207,9 +213,13 @@ class ProcessExecutor:
         self._end([worker])
         assert worker.piece is not None
         job.lost[worker.piece] += 1
-        if job.lost[worker.piece] == ATTEMPTS:
-            raise _died(worker.piece, worker.process.exitcode)
-        job.todo.appendleft(worker.piece)
+        if job.lost[worker.piece] < ATTEMPTS:
+            job.todo.appendleft(worker.piece)
+            return
+        error = _died(worker.piece, worker.process.exitcode)
+        if job.instead is None:
+            raise error
+        job.done[worker.piece] = job.instead(worker.piece, error)
 
 
 def _start() -> _Worker:

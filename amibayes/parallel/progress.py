@@ -15,6 +15,9 @@ def _report(line: str) -> None:
     tqdm.write(line, file=sys.stderr)
 
 
+LINE_EVERY_S = 60.0
+"""Off a terminal a stage reports with a line of its own, as often as that."""
+
 Progress = Callable[[int, int], None]
 """Called with (pieces done, pieces in all); the first call gives where the run starts."""
 
@@ -23,7 +26,7 @@ Progress = Callable[[int, int], None]
 def progress_bar(
     description: str, *, unit: str = "piece", scale: float = 1.0, quiet: bool = False
 ) -> Iterator[Progress]:
-    """Draw a bar on standard error where that is a terminal.
+    """Draw a bar on standard error, or write a line a minute where that is no terminal.
 
     Parameters
     ----------
@@ -57,6 +60,8 @@ class StageBars:
         self._verbose, self._begun = verbose, 0.0
         self._name, self._counts = "", False
         self._bar: tqdm[None] | None = None
+        self._lines = not quiet and not sys.stderr.isatty()
+        self._start, self._spoken = (0.0, 0), time.perf_counter()
 
     def stage(self, name: str) -> None:
         """Begin a stage: its name, and a bar as soon as its progress is known."""
@@ -70,6 +75,8 @@ class StageBars:
     def update(self, done: int, total: int) -> None:
         """Show how much of the stage is done; the total may grow."""
         now, end = round(done * self._scale), round(total * self._scale)
+        if self._lines:
+            self._write_line(now, end)
         if self._bar is None or not self._counts:
             self.close()
             self._bar, self._counts = self._new(now, end), True
@@ -78,6 +85,20 @@ class StageBars:
         self._bar.update(now - self._bar.n)
         if grown:
             self._bar.refresh()
+
+    def _write_line(self, now: int, end: int) -> None:
+        """Write how far the stage is, where the last line was a minute ago or more."""
+        clock = time.perf_counter()
+        if not self._counts or now < self._start[1]:
+            self._start = clock, now
+        if clock - self._spoken < LINE_EVERY_S:
+            return
+        self._spoken = clock
+        begun, before = self._start
+        rate = (now - before) / max(clock - begun, 1e-9)
+        left = f", {tqdm.format_interval((end - now) / rate)} left" if rate > 0 else ""
+        unit = self._unit
+        _report(f"amibayes: {self._name}: {now} of {end} {unit}s, {rate:.3g} {unit}s/s{left}")
 
     def end(self) -> None:
         """End the stage, and report how long it took where that is wanted."""

@@ -16,6 +16,9 @@ from amibayes.errors import DataError
 
 FILES, CALIBRATORS, NAME = "target", "cal", "name"
 
+FACTS = ("distance_pc", "primary_magnitude", "mass_table")
+"""Columns of what is known of a star, which the survey's statistics use."""
+
 Value = str | bool | int | float
 
 
@@ -40,6 +43,36 @@ class SurveyTarget:
     cal: tuple[str, ...]
     options: Mapping[str, Value]
     beside: Path
+
+    @property
+    def facts(self) -> dict[str, Value]:
+        """What is known of the star; a table of masses beside the survey's table is found there.
+
+        Raises
+        ------
+        DataError
+            Where a distance or magnitude is no number.
+        """
+        found = {name: self.options[name] for name in FACTS if name in self.options}
+        for name in ("distance_pc", "primary_magnitude"):
+            if name in found:
+                found[name] = self._number(name, found[name])
+        if "mass_table" in found and (self.beside / str(found["mass_table"])).is_file():
+            found["mass_table"] = str(self.beside / str(found["mass_table"]))
+        return found
+
+    def _number(self, name: str, value: Value) -> float:
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or (name == "distance_pc" and number <= 0.0):
+            raise DataError(
+                f"target {self.name}: column '{name}' holds {value!r}",
+                source=self.beside,
+                remedy="write a number" + (" above zero" if name == "distance_pc" else ""),
+            )
+        return number
 
     def files(self, patterns: tuple[str, ...]) -> list[str]:
         """Find the files of some patterns, in the order of the table; names within a pattern.

@@ -53,7 +53,7 @@ def limits_report_json(report: LimitsReport, request: str = "") -> Json:
         "companion_detected": None if main.significance is None else main.significance.detected,
         **_curve(main, report),
         "curves": [_curve(limit, report) for limit in report.limits],
-        "completeness_map": _map(main.limit),
+        "completeness_map": map_json(main.limit),
         "warnings": list(report.warnings),
     }
 
@@ -72,7 +72,7 @@ def _curve(measured: MeasuredLimit, report: LimitsReport) -> Json:
     return out
 
 
-def _map(limit: Limit) -> Json | None:
+def map_json(limit: Limit) -> Json | None:
     """Completeness of every cell, with its Jeffreys interval; null for closed criteria."""
     cells = limit.cells()
     return cells and cells | {"completeness": [numbers(row) for row in cells["completeness"]]}

@@ -184,7 +184,8 @@ class Page:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Give the templates of pages: every text in them is escaped."""
     environment = Environment(
         loader=PackageLoader("amibayes.report"),
         autoescape=True,
@@ -198,7 +199,7 @@ def _environment() -> Environment:
 
 def page_html(page: Page) -> str:
     """Turn a page into the text of one HTML file."""
-    template = _environment().get_template("page.html")
+    template = environment().get_template("page.html")
     return template.render(page=page, version=__version__) + "\n"
 
 

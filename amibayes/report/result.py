@@ -32,7 +32,7 @@ from amibayes.report.common import (
     systematics_json,
 )
 from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
-from amibayes.report.limits import limits_json
+from amibayes.report.limits import limits_json, map_json
 from amibayes.report.models import models_json
 from amibayes.units import contrast_to_delta_mag
 
@@ -355,7 +355,7 @@ def _limits(report: SearchReport) -> Json | None:
         return None
     joint = not integrable(report.result.likelihood)
     companion = {"companion": "the same contrast in every band, at rest"} if joint else {}
-    return limits_json(report.limits) | companion
+    return limits_json(report.limits) | companion | {"completeness_map": map_json(report.limits)}
 
 
 def _calibration(report: SearchReport) -> Json | None:

@@ -9,6 +9,8 @@ import os
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -114,29 +116,44 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
     return names
 
 
-_held: dict[Path, int] = {}
-"""Folders that this process writes into, each with the handle that locks it."""
+@dataclass
+class _OutputRun:
+    """A run's folders: each with the handle that locks it, and those that were not there."""
 
-_made: set[Path] = set()
-"""Folders that were not there before."""
+    outer: _OutputRun | None = None
+    held: dict[Path, int] = field(default_factory=dict)
+    made: set[Path] = field(default_factory=set)
+
+    def has(self, folder: Path) -> bool:
+        """Whether this run, or the one that it is a part of, writes into a folder."""
+        return folder in self.held or (self.outer is not None and self.outer.has(folder))
+
+
+_WITHOUT_RUN = _OutputRun()
+"""Of calls outside of `output_locks`: their locks end with the process."""
+
+_run: ContextVar[_OutputRun] = ContextVar("run", default=_WITHOUT_RUN)
+"""The run of this thread: several may write into folders of their own in one process."""
 
 
 @contextmanager
 def output_locks() -> Iterator[None]:
     """Let go, at the end, of the folders that `output_folder` has taken meanwhile.
 
-    Those that it made and nothing was written into are taken away again.
+    Those that it made and nothing was written into are taken away again. Locks belong to the
+    run that took them, not to the process: other threads have runs of their own.
     """
-    before, made_before = set(_held), set(_made)
+    own = _OutputRun(_run.get())
+    token = _run.set(own)
     try:
         yield
     finally:
-        for folder in _made - made_before:
+        _run.reset(token)
+        for folder in own.made:
             with suppress(OSError):  # what holds files stays
                 folder.rmdir()
-        _made.intersection_update(made_before)
-        for folder in set(_held) - before:
-            os.close(_held.pop(folder))
+        for handle in own.held.values():
+            os.close(handle)
 
 
 def _hold(folder: Path) -> None:
@@ -148,7 +165,8 @@ def _hold(folder: Path) -> None:
         Where another run has it.
     """
     key = folder.resolve()
-    if fcntl is None or key in _held:
+    run = _run.get()
+    if fcntl is None or run.has(key):
         return
     handle = os.open(key, os.O_RDONLY)
     try:
@@ -161,7 +179,7 @@ def _hold(folder: Path) -> None:
     except OSError:  # a file system without locks: nothing can be known, and work goes on
         os.close(handle)
     else:
-        _held[key] = handle
+        run.held[key] = handle
 
 
 def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
@@ -187,7 +205,7 @@ def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> P
     if not os.access(path, os.W_OK | os.X_OK):
         raise UsageError("cannot be written into", source=path, remedy="choose another --out")
     if is_new:
-        _made.add(path.resolve())
+        _run.get().made.add(path.resolve())
     _hold(path)
     present = [name for name in names if (path / name).exists()]
     if present and not overwrite:

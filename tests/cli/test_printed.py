@@ -30,7 +30,7 @@ from amibayes.report.limits import limits_summary
 from amibayes.report.result import result_json, upper_limit
 from amibayes.report.statement import statement_of
 from amibayes.report.summary import summary
-from amibayes.report.survey import summary_lines
+from amibayes.report.survey import survey_lines
 
 FIRST, SECOND = [110.0, -75.0, 0.05], [-60.0, 140.0, 0.03]
 
@@ -352,14 +352,14 @@ def test_a_surprise_with_one_target_spares_the_others(
     words = ("--null-draws", 0, "--no-posterior", "--no-limits", "--separation", "80:200")
     assert run("search", "--batch", batch, *words, "--out", out, "--quiet") == 4
     assert said in error_of(capsys)
-    summary = json.loads((out / "summary.json").read_text())
+    summary = json.loads((out / "survey.json").read_text())
     assert [entry["status"] for entry in summary["targets"]] == ["failed", "done"]
 
 
 def test_a_survey_of_many_is_told_in_twenty_lines(tmp_path: Path) -> None:
     targets = [{"name": f"s{k}", "status": "failed", "error": "gone"} for k in range(40)]
     content = {"targets": targets, "n_done": 0, "n_targets": 40, "n_failed": 40}
-    lines = summary_lines(content, tmp_path)
+    lines = survey_lines(content, tmp_path)
     assert len(lines) == 20
     assert lines[0] == "targets     0 of 40 done, 40 failed"
     shown = sum(text.startswith("s") for text in lines)

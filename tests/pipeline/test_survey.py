@@ -55,7 +55,7 @@ def test_a_survey_does_what_it_can_and_says_what_it_could_not(survey, tmp_path, 
     assert "not detected" in next(line for line in said if line.startswith("single"))
     complaints = captured.err.strip().split("\n")
     assert [line.split(": ")[1] for line in complaints] == ["broken", "gone"]
-    summary = json.loads((out / "summary.json").read_text())
+    summary = json.loads((out / "survey.json").read_text())
     assert [e["status"] for e in summary["targets"]] == ["done", "done", "failed", "failed"]
     first, second, third, _ = summary["targets"]
     assert first["detected"] is True
@@ -64,11 +64,11 @@ def test_a_survey_does_what_it_can_and_says_what_it_could_not(survey, tmp_path, 
     assert "broken.oifits" in third["error"]
     own = json.loads((out / "HD_1" / "result.json").read_text())
     assert own["data"]["separation_mas"] == [80.0, 300.0]
-    table = Table.read(out / "summary.ecsv")
+    table = Table.read(out / "survey.ecsv")
     assert list(table["status"]) == ["done", "done", "failed", "failed"]
     assert table["separation_mas"].mask.tolist() == [False, False, True, True]
     assert str(table["separation_mas"].unit) == "mas"
-    assert np.array(Image.open(out / "summary.png")).std() > 1
+    assert np.array(Image.open(out / "survey.png")).std() > 1
 
 
 def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
@@ -77,19 +77,19 @@ def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
     words = ("limits", "--batch", survey, *CLOSED, "--quiet")
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert run(*words, "--out", whole) == 4
-    expected = (whole / "summary.json").read_bytes()
+    expected = (whole / "survey.json").read_bytes()
     shutil.copytree(whole, cut)
     # As a killed run leaves it: the second target begun, nothing of it told.
     content = json.loads(expected)
     for entry in content["targets"][1:]:
         entry["status"] = "pending"
-    (cut / "summary.json").write_text(json.dumps(content))
+    (cut / "survey.json").write_text(json.dumps(content))
     before = (cut / "HD_1" / "limits.json").stat().st_mtime_ns
     (cut / "single" / "limits.json").unlink()
     assert run(*words, "--out", cut) == 2
     assert run(*words, "--out", cut, "--resume") == 4
-    assert (cut / "summary.json").read_bytes() == expected
-    assert (cut / "summary.ecsv").read_bytes() == (whole / "summary.ecsv").read_bytes()
+    assert (cut / "survey.json").read_bytes() == expected
+    assert (cut / "survey.ecsv").read_bytes() == (whole / "survey.ecsv").read_bytes()
     assert (cut / "HD_1" / "limits.json").stat().st_mtime_ns == before
     assert (cut / "single" / "limits.json").is_file()
     # Other data under the same name are not taken for finished.
@@ -172,12 +172,12 @@ def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert run("limits", "--batch", survey, "--out", out, *CLOSED) == 4
     assert "limits" in capsys.readouterr().out
-    summary = json.loads((out / "summary.json").read_text())
+    summary = json.loads((out / "survey.json").read_text())
     first, second, third, _ = summary["targets"]
     assert [e["status"] for e in (first, second, third)] == ["done", "done", "failed"]
     assert first["limits"]["separation_mas"] == pytest.approx(np.linspace(80, 300, 5))
     curve = first["limits"]["delta_mag"]
     assert first["limit_delta_mag_best"] == max(curve)
     assert first["limit_delta_mag_worst"] == min(curve)
-    assert Table.read(out / "summary.ecsv")["limit_delta_mag"].unit == "mag"
-    assert (out / "summary.png").is_file()
+    assert Table.read(out / "survey.ecsv")["limit_delta_mag"].unit == "mag"
+    assert (out / "survey.png").is_file()

@@ -36,6 +36,7 @@ LAYERS = [
     "posterior",
     "limits",
     "comparison",
+    "survey",
     "pipeline",
     "validation",
     "plots",

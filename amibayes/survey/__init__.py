@@ -1,0 +1,1 @@
+"""What many searches mean together: false alarms, completeness, frequency of companions."""
