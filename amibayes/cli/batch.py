@@ -8,7 +8,7 @@ import importlib
 import logging
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -50,6 +50,24 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
+
+
+def add_picture_option(group: argparse._ActionsContainer) -> None:
+    """Add ``--no-pictures``."""
+    group.add_argument(
+        "--no-pictures",
+        action="store_true",
+        help="write no pictures, which take most of the time of a short run",
+    )
+
+
+def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -> Any:
+    """Let pictures be drawn: here, or for a target of a table in a process of their own."""
+    if not getattr(arguments, "in_batch", False):
+        return save(*of)
+    from amibayes.parallel import run_apart
+
+    return run_apart(save, *of)
 
 
 def refuse_none(arguments: argparse.Namespace) -> None:
@@ -287,7 +305,7 @@ def _carry_out(arguments: argparse.Namespace, jobs: list[Job]) -> Iterator[tuple
     from amibayes.survey.rows import Outcome
 
     def lost(index: int, error: AmibayesError) -> Outcome:
-        return Outcome(jobs[index].name, "failed", str(error), facts=jobs[index].facts)
+        return Outcome(jobs[index].name, "failed", error.command_line, facts=jobs[index].facts)
 
     with (
         common.executor_of(arguments) as executor,

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from amibayes.errors import UsageError
 from amibayes.support.options import (
@@ -171,24 +171,6 @@ def add_parallel_options(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="a dask scheduler, tcp://host:port, or mpi for the ranks of this run",
     )
-
-
-def add_picture_option(group: argparse._ActionsContainer) -> None:
-    """Add ``--no-pictures``."""
-    group.add_argument(
-        "--no-pictures",
-        action="store_true",
-        help="write no pictures, which take most of the time of a short run",
-    )
-
-
-def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -> Any:
-    """Let pictures be drawn: here, or for a target of a table in a process of their own."""
-    if not getattr(arguments, "in_batch", False):
-        return save(*of)
-    from amibayes.parallel import run_apart
-
-    return run_apart(save, *of)
 
 
 def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:

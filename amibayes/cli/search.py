@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fit N times to exposures drawn anew, for intervals beside the posterior's",
     )
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
-    common.add_picture_option(stages)
+    batch.add_picture_option(stages)
     stages.add_argument(
         "--resume",
         action="store_true",
@@ -201,7 +201,7 @@ def _write(
 
     if report.calibration is not None:
         write_observables(folder / CALIBRATED, report.observables)
-    drawn = [] if arguments.no_pictures else common.draw(arguments, save_pictures, report, folder)
+    drawn = [] if arguments.no_pictures else batch.draw(arguments, save_pictures, report, folder)
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
     write_page(folder / REPORT, search_page(content, figures, common.command_line(arguments)))
