@@ -35,6 +35,10 @@ from .errors import (
     UsageError as UsageError,
 )
 from .extraction import extract as extract
+from .imaging import (
+    ReconstructedImage as ReconstructedImage,
+    reconstruct_image as reconstruct_image,
+)
 from .instrument import (
     Instrument as Instrument,
     instrument_names as instrument_names,

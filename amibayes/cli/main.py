@@ -24,6 +24,7 @@ COMMANDS = {
     "calibrate": "divide the instrument out of a target's data with calibrators",
     "vet": "keep or drop each calibrator, with the numbers",
     "extract": "measure V² and closure phases in image cubes",
+    "image": "reconstruct an image from a target's data, for looking",
     "audit": "list what is wrong or doubtful in OIFITS files",
     "export": "write one merged file for a program of image reconstruction",
     "simulate": "make the images that the telescope would record of a scene",

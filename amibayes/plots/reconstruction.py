@@ -1,0 +1,138 @@
+"""A reconstructed image: as it is, with the beam, as the points show it, and what is left."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import CenteredNorm, PowerNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from amibayes.imaging import ReconstructedImage
+from amibayes.imaging.data_term import DataTerm
+from amibayes.models.uv_sums import phase_sums
+from amibayes.plots.style import (
+    BLACK,
+    BLUE,
+    DIVERGING,
+    GREY,
+    LIGHT_GREY,
+    SEQUENTIAL,
+    VERMILLION,
+    new_figure,
+    styled,
+)
+from amibayes.units import FloatArray
+
+
+@styled()
+def image_plot(image: ReconstructedImage) -> Figure:
+    """Draw the image, the image with a Gaussian beam, the dirty image, residuals and the choice.
+
+    Parameters
+    ----------
+    image : ReconstructedImage
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Six panels. The dirty image is what the sampled points make of the image, without its
+        star; back-projected residuals beyond ±4 σ are structure that the image has not.
+    """
+    figure = new_figure(11.6, 7.4)
+    axes = figure.subplots(3, 2, height_ratios=[1.35, 1.35, 1.0])
+    top = float(image.light.max()) or 1.0
+    blurred, dirty = image.convolved(), image.dirty_image()
+    norm = PowerNorm(0.5, 0.0, top)
+    _sky(figure, axes[0, 0], image, image.light, "Flux per pixel", cmap=SEQUENTIAL, norm=norm)
+    axes[0, 0].set_title("Reconstruction")
+    norm = PowerNorm(0.5, 0.0, float(blurred.max()) or 1.0)
+    _sky(figure, axes[0, 1], image, blurred, "Flux per pixel", cmap=SEQUENTIAL, norm=norm)
+    axes[0, 1].set_title("with a beam of λ/2B")
+    reach = 0.5 * image.grid.n * image.grid.pixel_mas
+    place, radius = (0.82 * reach, -0.82 * reach), 0.5 * image.beam_mas
+    axes[0, 1].add_patch(Circle(place, radius, fill=False, ec="white", lw=1.5))
+    symmetric: dict[str, Any] = {"cmap": DIVERGING, "norm": CenteredNorm()}
+    _sky(figure, axes[1, 0], image, dirty, "Flux per dirty beam", **symmetric)
+    axes[1, 0].set_title("Dirty image of it")
+    back = {"cmap": DIVERGING, "norm": CenteredNorm(halfrange=max(4.0, _most(image)))}
+    _sky(figure, axes[1, 1], image, image.back_projected, "σ", **back)
+    axes[1, 1].set_title("Residuals, projected back")
+    _residuals(axes[2, 0], image)
+    _choice(axes[2, 1], image)
+    star = f", star apart, {image.flux:.3g} of its flux around" if image.star else ""
+    figure.suptitle(
+        f"For looking: {'total variation' if image.regulariser == 'tv' else 'maximum entropy'}, "
+        f"weight {image.weight:.3g}{star}\nχ² {image.chi2:.4g} of {image.n_independent} numbers"
+    )
+    return figure
+
+
+def _most(image: ReconstructedImage) -> float:
+    return float(np.abs(image.back_projected).max())
+
+
+def _sky(
+    figure: Figure,
+    ax: Axes,
+    image: ReconstructedImage,
+    values: FloatArray,
+    label: str,
+    **style: Any,
+) -> None:
+    """Draw an image with east to the left and the star's place."""
+    reach = 0.5 * image.grid.n * image.grid.pixel_mas
+    drawn = ax.imshow(
+        values[:, ::-1], origin="lower", extent=(reach, -reach, -reach, reach), **style
+    )
+    if image.star:
+        ax.plot(0.0, 0.0, "*", color="white", mec=BLACK, ms=11)
+    ax.set_xlabel("East (mas)")
+    ax.set_ylabel("North (mas)")
+    bar = figure.colorbar(drawn, ax=ax, label=label, location="bottom", shrink=0.7, aspect=30)
+    bar.locator = MaxNLocator(3)
+    bar.formatter = FuncFormatter(lambda value, _: f"{value:.2g}".replace("-", "−"))
+    bar.update_ticks()
+
+
+def _residuals(ax: Axes, image: ReconstructedImage) -> None:
+    """Residuals in units of each datum's own error against the baseline."""
+    data = image.observables
+    left = DataTerm.of(data, image.samples).residual(image.visibility)
+    sigma, n = np.sqrt(data.covariance.variance), data.n_vis2
+    white = left / sigma
+    length = np.hypot(data.vis2.u_m, data.vis2.v_m)[:, 0] / data.vis2.wavelength_m / 1e6
+    ax.axhspan(-1.0, 1.0, color=LIGHT_GREY, alpha=0.5, lw=0, zorder=0)
+    ax.axhline(0.0, color=GREY, lw=0.8, zorder=0)
+    if n:
+        ax.plot(length, white[:n], "o", color=BLUE, ms=4, label="V²")
+    if len(white) > n:
+        sums = phase_sums(data)
+        longest = np.zeros(len(white) - n)
+        wavelength = data.closure_phase.wavelength_m[sums.owner]
+        reach = np.hypot(sums.u_m, sums.v_m) / wavelength / 1e6
+        np.maximum.at(longest, sums.row, reach[sums.column])
+        ax.plot(longest, white[n:], "x", color=VERMILLION, ms=5, label=f"{data.phase_name}s")
+    ax.set_xlabel("(Longest) baseline (Mλ)")
+    ax.set_ylabel("Residual (σ)")
+    most = 1.1 * max(float(np.abs(white).max(initial=0.0)), 2.0)
+    ax.set_ylim(-most, 1.35 * most)
+    ax.legend(loc="upper left", ncols=2, fontsize=8)
+
+
+def _choice(ax: Axes, image: ReconstructedImage) -> None:
+    """Deviance of data left out against the weight of the regulariser."""
+    if not len(image.weights):
+        ax.axis("off")
+        ax.text(0.5, 0.5, "weight given", ha="center", transform=ax.transAxes)
+        return
+    ax.errorbar(image.weights, image.scores, image.score_errors, fmt="o-", color=BLACK, ms=4)
+    ax.axvline(image.weight, color=VERMILLION, ls="--", label="chosen")
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel("Weight of the regulariser")
+    ax.set_ylabel("χ² per datum left out")
+    ax.legend(fontsize=8)
