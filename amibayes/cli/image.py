@@ -72,7 +72,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the star, a uniform disc; it is not fitted here (default: 0)",
     )
     common.add_seed_option(group)
-    data = parser.add_argument_group("data")
+    _add_data(parser.add_argument_group("data"))
+    common.add_image_options(parser)
+    common.add_output_options(parser, "image")
+
+
+def _add_data(data: argparse._ArgumentGroup) -> None:
     data_options.add_observables(data, OBSERVABLES, "which to use (default: both)")
     data_options.add_reduction(data)
     data_options.add_closure_covariance(data)
@@ -83,8 +88,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     data_options.add_insname(data)
     data.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
-    common.add_image_options(parser)
-    common.add_output_options(parser, "image")
 
 
 def run(arguments: argparse.Namespace) -> int:

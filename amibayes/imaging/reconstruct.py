@@ -157,10 +157,10 @@ def reconstruct_image(
     ----------
     observables : Observables
     regulariser : {"tv", "entropy"}
-        Total variation keeps edges; maximum entropy is smooth and near a round Gaussian.
+        Total variation keeps edges; maximum entropy is smooth.
     weight : float, optional
-        Of the regulariser against χ²; by default the one that predicts best the data left out,
-        within one standard error, on the smooth side.
+        Of the regulariser; by default the largest whose image predicts data left out as well as
+        the best, within one standard error.
     field_mas : float, optional
         Side of the image, by default twice λ/2 of the shortest baseline.
     pixel_mas : float, optional
@@ -169,13 +169,9 @@ def reconstruct_image(
         A point, or a disc of ``diameter_mas``, of flux 1 stands in the middle beside the image.
     diameter_mas : float
     rng : numpy.random.Generator, optional
-        How the data are split, with a fixed seed by default.
+        How the data are split.
     progress : callable, optional
         Called with (done, expected).
-
-    Returns
-    -------
-    ReconstructedImage
 
     Raises
     ------
