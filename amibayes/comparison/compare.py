@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.parallel import Executor, Journal, Progress
 from amibayes.posterior.priors import Prior, PriorSetting
 from amibayes.posterior.sampler import Draws, draw_posterior
 from amibayes.support.options import CONFUSION_DRAWS, DEFAULT_SKY_MODELS, SAMPLERS
@@ -154,7 +155,9 @@ def compare_sky_models(
     method: str = "direct",
     default_field: tuple[float, float] | None = None,
     confusion_draws: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    executor: Executor | None = None,
+    journal: Journal | None = None,
+    progress: Progress | None = None,
 ) -> ModelComparison:
     """Compare models of the sky by evidence, and measure how often they are confused.
 
@@ -164,26 +167,21 @@ def compare_sky_models(
         Of a companion: every model begins with its star, noise and solutions.
     prior : Prior
         Of companions and star.
-    rng : numpy.random.Generator
     models : sequence of str
         Of `amibayes.support.options.SKY_MODELS`, or several joined by ``+``.
     stated : Observables, optional
         The data with the stated errors, to which noise is fitted at the best of all models.
-    noise : NoiseSetting, optional
     settings : sequence of PriorSetting
         Ranges of parameters of extended light.
     method : {"direct", "nested"}
         Importance sampling, or one of `amibayes.support.options.SAMPLERS`.
     default_field : (inner, outer), optional
-        Where the search went farther than that: separations that companions are in, unless one
-        farther out fits better than any model with other light.
+        Separations of companions where the search went farther, unless one farther out fits best.
     confusion_draws : int, optional
         Data sets simulated of each model, 0 for none; by default fewer where data are many.
-    progress : callable, optional
+    executor, journal, progress : optional
+        Of the confusion matrix; see `amibayes.comparison.confusion.measure_confusion`.
 
-    Raises
-    ------
-    UsageError
     """
     asked, streams = hypotheses(models), rng.spawn(4)
     setting = noise or NoiseSetting()
@@ -196,8 +194,9 @@ def compare_sky_models(
     confusion = None
     if wanted and len(fits) > 1:
         confusion = measure_confusion(
-            fits, wanted, streams[2], log_prior=log_prior, progress=progress
-        )
+            fits, wanted, streams[2],
+            log_prior=log_prior, executor=executor, journal=journal, progress=progress,
+        )  # fmt: skip
     log_z = np.array([c.log_z for c in compared])
     small = is_degenerate(compared[int(np.argmax(log_z))])
     statement = choose(asked, log_z, log_prior, confusion, degenerate=small)

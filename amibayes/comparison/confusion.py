@@ -7,7 +7,8 @@ for these data, with their baselines, errors and correlations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from amibayes.comparison.fit_models import ModelFit, embedded
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.integral import Effort, PriorDraws, integrate, log_z_laplace
 from amibayes.comparison.verdict import Confusion
+from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
 
 RANDOM_STARTS, KNOWN_STARTS = 8, 4
@@ -33,7 +35,9 @@ HOPELESS = 15.0
 """A model whose largest ln L, which no evidence exceeds, is so far below another's evidence has
 odds below 1e-6: its own evidence is not measured, and that bound stands for it."""
 
-Progress = Callable[[int, int], None]
+PIECE = 8
+"""Simulated data sets that are compared together: fits of several share their arithmetic, and a
+run that was cut off loses no more than these."""
 
 
 def measure_confusion(
@@ -42,6 +46,8 @@ def measure_confusion(
     rng: np.random.Generator,
     *,
     log_prior: FloatArray,
+    executor: Executor | None = None,
+    journal: Journal | None = None,
     progress: Progress | None = None,
 ) -> Confusion:
     """Simulate data sets from the best fit of each model and compare the models on each.
@@ -54,21 +60,38 @@ def measure_confusion(
         Data sets of each model.
     rng : numpy.random.Generator
     log_prior : (n_models,) float array
+    executor : Executor, optional
+        Where data sets are compared; the result does not depend on it.
+    journal : Journal, optional
+        Where finished pieces are kept.
     progress : callable, optional
     """
     prior = [
         PriorDraws.of(f.model, QUICK.prior, child) if f.model.n_dim else None
         for f, child in zip(fits, rng.spawn(len(fits)), strict=True)
     ]
-    found = []
-    for k, (truth, child) in enumerate(zip(fits, rng.spawn(len(fits)), strict=True)):
-        noise = truth.model.likelihood.noise.draw(n_draws, child)
-        data = truth.model.predict(truth.cube[:1]) + noise
-        found.append(evidences(fits, data, child, prior))
-        if progress:
-            progress(k + 1, len(fits))
+    sizes = [part.stop - part.start for part in slices(n_draws, PIECE)]
+    jobs = [(k, size) for k in range(len(fits)) for size in sizes]
+    pieces = [(k, size, seed) for (k, size), seed in zip(jobs, spawn(rng, len(jobs)), strict=True)]
+    work = partial(_piece, tuple(fits), prior)
+    where = executor or SerialExecutor()
+    done = [p["log_z"] for p in run_job(work, pieces, where, journal=journal, progress=progress)]
     models = tuple(f.hypothesis for f in fits)
-    return Confusion(models, np.array(found), np.asarray(log_prior))
+    found = np.concatenate(done).reshape(len(fits), n_draws, len(fits))
+    return Confusion(models, found, np.asarray(log_prior))
+
+
+def _piece(
+    fits: Sequence[ModelFit],
+    prior: Sequence[PriorDraws | None],
+    piece: tuple[int, int, np.random.SeedSequence],
+) -> dict[str, FloatArray]:
+    """Evidences (n, n_models) of some data sets simulated from one model."""
+    k, n_draws, seed = piece
+    rng, truth = np.random.default_rng(seed), fits[k]
+    noise = truth.model.likelihood.noise.draw(n_draws, rng)
+    data = truth.model.predict(truth.cube[:1]) + noise
+    return {"log_z": evidences(fits, data, rng, prior)}
 
 
 def evidences(

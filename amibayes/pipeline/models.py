@@ -53,6 +53,8 @@ def compare_stage(
             settings=extended_settings(options)[1],
             method=method,
             default_field=_default_field(found, options),
+            executor=run.executor,
+            journal=run.journal("confusion"),
             progress=run.progress,
         )
 
