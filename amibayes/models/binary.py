@@ -184,11 +184,11 @@ class BinaryModel:
         alone = replace(self, companions=0)
         sources = alone._sources(samples, np.atleast_2d(nuisance), slopes=False)
         light, total = _mixed(samples, sources, CENTRED)
-        scale = 1.0 / float(np.ravel(total)[0])
+        one = np.ones(len(samples))
+        scale = 1.0 / (np.asarray(total).reshape(-1) * one)
         point = self._companion(1)
         rest = np.zeros((len(point.shapes), 1))
         colour, disc = point.colour(samples, rest)[0], point.disc(samples, rest)[0]
-        one = np.ones(len(samples))
         return LinearResponse(
             np.asarray(light[:, 0].real * scale),
             scale * (one if colour is None else np.broadcast_to(colour, (len(one), 1))[:, 0]),
@@ -272,7 +272,7 @@ OPEN: Through = ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 def _lit(source: Source, through: Through) -> tuple[Any, Any]:
     """Light and flux of a source, as the extraction lets them through."""
     fringe, flux = through
-    return source.flux * (source.wave * fringe[0]), source.flux * flux[0]
+    return source.flux * (source.wave * fringe[0]), source.flux * (source.share * flux[0])
 
 
 def _by_place(source: Source, through: Through) -> list[tuple[Any, Any]]:
@@ -287,7 +287,10 @@ def _by_parameter(source: Source, slope: Slope, through: Through) -> tuple[Any, 
     light: Any = 0.0
     total: Any = 0.0
     if slope.flux is not None:
-        light, total = slope.flux * (source.wave * fringe[0]), slope.flux * flux[0]
+        light = slope.flux * (source.wave * fringe[0])
+        total = slope.flux * (source.share * flux[0])
+    if slope.share is not None:
+        total = total + source.flux * slope.share
     if slope.wave is not None:
         light = light + source.flux * (slope.wave * fringe[0])
     if slope.place is not None and through is not OPEN:

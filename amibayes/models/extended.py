@@ -25,6 +25,7 @@ from scipy.special import j0, j1
 from amibayes.models.companion import MAX_SLOPE
 from amibayes.models.parameters import Parameter
 from amibayes.models.projection import Projection
+from amibayes.models.response_waves import ResponseWaves
 from amibayes.models.source import Slope, Source
 from amibayes.models.uv_points import UVPoints
 from amibayes.units import MAS, ComplexArray, FloatArray
@@ -119,10 +120,26 @@ class Extended:
     def source(self, samples: UVPoints, values: FloatArray, *, slopes: bool = False) -> Source:
         """Make the source of ``values`` (n_parameters, n)."""
         of = self.named(values)
-        flux, colour, log = self._flux(samples, of)
+        if samples.response_waves is not None:
+            return self._seen(samples, samples.response_waves, of, slopes=slopes)
         wave, rows = self._averaged(samples, of, slopes=slopes)
+        return self._source(samples, of, wave, rows, slopes=slopes)
+
+    def _source(
+        self,
+        samples: UVPoints,
+        of: dict[str, FloatArray],
+        wave: ComplexArray,
+        rows: Rows,
+        *,
+        slopes: bool,
+        share: Any = 1.0,
+        shares: Rows | None = None,
+    ) -> Source:
+        """Put fringes and their derivatives, and those of the share that is seen, together."""
+        flux, colour, log = self._flux(samples, of)
         if not slopes:
-            return Source(flux, wave, None)
+            return Source(flux, wave, None, share=share)
         found = []
         for name in (p.name.removeprefix(f"{self.name}_") for p in self.parameters):
             if name == "flux":
@@ -130,8 +147,25 @@ class Extended:
             elif name == "slope":
                 found.append(Slope(flux=flux * log))
             else:
-                found.append(Slope(wave=rows[name]))
-        return Source(flux, wave, None, found)
+                found.append(Slope(wave=rows[name], share=(shares or {}).get(name)))
+        return Source(flux, wave, None, found, share)
+
+    def _seen(
+        self, samples: UVPoints, through: ResponseWaves, of: dict[str, FloatArray], *, slopes: bool
+    ) -> Source:
+        """What an extraction sees of it: each wave of the response shifts the frequency."""
+        wave: Any = 0.0
+        share: Any = 0.0
+        rows: Rows = {}
+        shares: Rows = {}
+        for (p, q), fringe, flux in zip(through.shift, through.fringe, through.flux, strict=True):
+            value, slope = self._at(samples.u + p, samples.v + q, of, slopes=slopes)
+            whole, by_whole = self._at(np.full(1, p), np.full(1, q), of, slopes=slopes)
+            wave, share = wave + fringe * value, share + (flux * whole).real
+            for name in slope:
+                rows[name] = rows.get(name, 0.0) + fringe * slope[name]
+                shares[name] = shares.get(name, 0.0) + (flux * by_whole[name]).real
+        return self._source(samples, of, wave, rows, slopes=slopes, share=share, shares=shares)
 
     def named(self, values: FloatArray) -> dict[str, FloatArray]:
         """Values by name, with those that are fixed."""

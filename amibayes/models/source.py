@@ -22,18 +22,21 @@ class Slope:
     """How one parameter changes a source: derivatives of its flux, its fringes and its place.
 
     A derivative of the place does not repeat what ``wave`` has: it is how the response of
-    the extraction, which goes with the place, changes. ``None`` stands for 0.
+    the extraction, which goes with the place, changes. ``share`` is that of `Source.share`.
+    ``None`` stands for 0.
     """
 
     flux: Any = None
     wave: Any = None
     place: tuple[Any, Any] | None = None
+    share: Any = None
 
     def times(self, factor: Any) -> Slope:
         """The slope by a parameter that moves this one's so many times as far."""
-        flux, wave = (None if x is None else factor * x for x in (self.flux, self.wave))
+        each = (self.flux, self.wave, self.share)
+        flux, wave, share = (None if x is None else factor * x for x in each)
         place = self.place and (factor * self.place[0], factor * self.place[1])
-        return Slope(flux, wave, place)
+        return Slope(flux, wave, place, share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +52,8 @@ class Source:
         over-resolved.
     place : (east, north) in mas, optional
         None where the response off the axis does not apply.
+    share : float or (n_samples, n) array
+        Of its flux that the extraction lets through, where ``wave`` is as seen through it.
     slopes : sequence of Slope
         By each of its parameters; empty where they were not asked for.
     """
@@ -57,6 +62,7 @@ class Source:
     wave: Any
     place: Place | None = CENTRED
     slopes: Sequence[Slope] = ()
+    share: Any = 1.0
 
 
 class Component(Protocol):

@@ -13,8 +13,9 @@ from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
 from amibayes.models.off_axis import OffAxis, off_axis_of
+from amibayes.models.response_waves import ResponseWaves, response_waves
 from amibayes.models.uv_sums import phase_sums
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import MAS, FloatArray, IntArray
 
 YEAR_DAYS = 365.25
 
@@ -73,6 +74,13 @@ class UVPoints:
     def from_legs(self) -> csr_array:
         """Transpose of ``legs``, (n, n_closure)."""
         return self.legs.T.tocsr()
+
+    @cached_property
+    def response_waves(self) -> ResponseWaves | None:
+        """The response off the axis for extended light, out to λ/2B of the shortest baseline."""
+        if self.off_axis is None:
+            return None
+        return response_waves(self.off_axis, 0.5 / float(self.frequency.min()) / MAS)
 
     @property
     def band(self) -> IntArray:

@@ -99,13 +99,6 @@ def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:
     if found is None:
         return ()
     warnings = []
-    around = any(m.fit.hypothesis.surroundings for m in found.models)
-    if around and found.best.fit.model.likelihood.samples.off_axis is not None:
-        warnings.append(
-            "these images were extracted with a response that falls off the axis: it is known for "
-            "companions, while discs and rings are taken as seen without it (2 % at 150 mas, 10 % "
-            "at 300 mas)"
-        )
     if found.best.p_fit < REJECTED:
         warnings.append(
             f"the most probable model of the sky, {found.best.name}, does not fit: chi2 is "

@@ -9,8 +9,10 @@ import pytest
 from helpers import niriss, simulated
 from scipy import ndimage
 
+from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.companion import point_visibility
 from amibayes.models.extended import Extended
 from amibayes.models.light_points import light_points
 from amibayes.models.uv_points import uv_points_of
@@ -164,3 +166,45 @@ def test_points_have_the_same_transform(component, theta) -> None:
     expected = np.exp(-2j * np.pi * turns) @ light / values[0]
     found = component.source(samples, values[:, None]).wave[:, 0]
     np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def through_a_window() -> Likelihood:
+    """NIRISS data whose response falls to 0.6 at 450 mas, and turns phases a little."""
+    data = niriss()
+    x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 27)] * 2, indexing="ij")  # to 520 mas
+    lean = np.random.default_rng(4).normal(0.0, 0.05, (2, 7, 7, 1, 1))
+    response = np.exp(-0.6 * (x**2 + y**2) + 1j * (lean[0] * x + lean[1] * y**3))
+    response[np.arange(7), np.arange(7)] = np.exp(-0.8 * x**2 - 0.7 * y**2)
+    lower = np.tril_indices(7, -1)
+    response[lower] = response.conj()[lower[::-1]]
+    lattice = OffAxisResponse(response, np.diag([-1.0, 1.0]) / (40.0 * MAS), np.zeros(2))
+    return Likelihood(replace(data, setups=(replace(data.setups[0], response=lattice),)))
+
+
+@pytest.mark.parametrize(("component", "theta"), CASES[:5])
+def test_seen_through_a_response_off_the_axis(component: Extended, theta: list[float]) -> None:
+    """Against the sum over points of light, each with the response at its place."""
+    samples = through_a_window().samples
+    larger = [
+        2.0 * t if p.unit == "mas" else t for t, p in zip(theta, component.parameters, strict=True)
+    ]
+    east, north, light = light_points(component, np.array(larger))
+    fringe, flux = samples.off_axis.at((east, north))
+    wave = point_visibility(samples, east, north)
+    truth = (1.0 + (wave * fringe) @ light) / (1.0 + flux @ light)
+    without = (1.0 + wave @ light) / (1.0 + light.sum())
+    model = BinaryModel(0, surroundings=(component,))
+    found = model.visibility(samples, np.array([larger]))[:, 0]
+    assert np.abs(found - truth).max() < 2.5e-3
+    assert np.abs(found - truth).max() < 0.3 * np.abs(without - truth).max()
+
+
+def test_slopes_through_a_response_off_the_axis() -> None:
+    component, theta = CASES[4]
+    likelihood = through_a_window().with_model(BinaryModel(0, surroundings=(component,)))
+    at = np.array(theta)
+    gradient = likelihood.log_prob_and_gradient(at[None])[1][0]
+    for k, step in enumerate(1e-5 * np.maximum(at, 0.1)):
+        ends = [at + s * step * np.eye(len(at))[k] for s in (1.0, -1.0)]
+        high, low = likelihood.log_prob(np.array(ends))
+        assert (high - low) / (2.0 * step) == pytest.approx(gradient[k], rel=1e-4, abs=1e-6)
