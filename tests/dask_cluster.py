@@ -19,8 +19,9 @@ def start_dask(program: str, *words: str) -> subprocess.Popen[bytes]:
     return start(f"distributed.cli.{program}", *words, start_new_session=True, **silent)
 
 
-def start_worker(address: str) -> subprocess.Popen[bytes]:
-    return start_dask("dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+def start_worker(address: str, threads: int = 1) -> subprocess.Popen[bytes]:
+    words = ("--nthreads", str(threads), "--no-dashboard", "--no-nanny")
+    return start_dask("dask_worker", address, *words)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:

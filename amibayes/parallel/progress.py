@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,9 @@ def _report(line: str) -> None:
 
 LINE_EVERY_S = 60.0
 """Off a terminal a stage reports with a line of its own, as often as that."""
+
+_LOCK = threading.RLock()
+"""Bars are of one process: tqdm's own lock is a semaphore that a killed worker would leave."""
 
 Progress = Callable[[int, int], None]
 """Called with (pieces done, pieces in all); the first call gives where the run starts."""
@@ -56,6 +60,7 @@ class StageBars:
     def __init__(
         self, unit: str, scale: float, *, quiet: bool, leave: bool, verbose: bool = False
     ) -> None:
+        tqdm.set_lock(_LOCK)
         self._unit, self._scale, self._quiet, self._leave = unit, scale, quiet, leave
         self._verbose, self._begun = verbose, 0.0
         self._name, self._counts = "", False
