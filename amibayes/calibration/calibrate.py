@@ -11,6 +11,7 @@ from amibayes.calibration.applying import apply_response
 from amibayes.calibration.freedom import response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, foreign, keys_of
+from amibayes.calibration.population import population_response
 from amibayes.calibration.transfer import (
     Diameter,
     Transfer,
@@ -61,7 +62,7 @@ class Calibration(Shown):
     ----------
     observables : Observables
         All targets together, with the covariance that shared calibrators give them.
-    method : {"hierarchical", "weighted"}
+    method : {"hierarchical", "weighted", "population"}
     calibrators : tuple of CalibratorUse
         In the order given.
     tau_vis2, tau_closure_phase_rad : float, optional
@@ -143,9 +144,11 @@ def calibrate(
     targets : Observables, or a sequence of them
         Several keep the covariance that the calibrators they share give them.
     calibrators : sequence of Observables
-    method : {"hierarchical", "weighted"}, optional
-        Inverse-variance means, with the scatter where it is larger than the errors; or random
-        effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline.
+    method : {"hierarchical", "weighted", "population"}, optional
+        Inverse-variance means, with the scatter where it is larger than the errors; random
+        effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline; or
+        the principal components of many, whose amplitudes drift
+        (`amibayes.calibration.population`), for calibrators of many nights.
     clip : float, optional
         Leave out values that differ from the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (diameter, error), optional
@@ -171,8 +174,13 @@ def calibrate(
     chosen = _method(method, target, [seen[j] for j in serving])
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     used = [calibrators[j] for j in serving]
+    # Outliers of a drifting population are its extremes, and tell most of its components.
+    clip = None if chosen == "population" else clip
     kept = _consistent([seen[j] for j in serving], keys, clip)
-    response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate)
+    response = _response(
+        chosen, kept, keys, rng or np.random.default_rng(1), covariate,
+        np.array([mean_mjd(c) for c in (target, *used)]),
+    )  # fmt: skip
     response = replace(response, freedom=response_freedom(used, kept))
     notes = tuple(note for calibrator in used if (note := foreign(calibrator, keys)))
     return Calibration(
@@ -183,6 +191,12 @@ def calibrate(
         tuple(len(p.setups) for p in parts),
         response.tau,
     )
+
+
+def mean_mjd(observables: Observables) -> float:
+    """Mean date of the data that are not flagged."""
+    parts = [m.mjd[~m.flag] for m in (observables.vis2, observables.closure_phase)]
+    return float(np.concatenate(parts).mean())
 
 
 def _method(
@@ -262,7 +276,10 @@ def _response(
     keys: Keys,
     rng: np.random.Generator,
     covariate: FloatArray | None,
+    mjd: FloatArray,
 ) -> TransferFunction:
+    if method == "population":
+        return population_response(kept, keys, mjd[1:], float(mjd[0]))
     if method == "weighted":
         return weighted_response(kept, keys)
     return hierarchical_response(kept, keys, rng, covariate)
@@ -314,7 +331,7 @@ def _covariate(
     """Charge levels less that of the target, on the scale of the largest difference."""
     if charge_levels is None:
         return None
-    if method == "weighted":
+    if method != "hierarchical":
         raise DataError(
             "charge levels are for the hierarchical method", remedy="use it or leave them out"
         )

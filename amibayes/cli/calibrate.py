@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from amibayes.cli import common, data_options
+from amibayes.errors import UsageError
 from amibayes.support.terminal import row, shortened
 
 if TYPE_CHECKING:
     from amibayes.calibration import Calibration
+    from amibayes.calibration.transfer import Diameter
     from amibayes.data.observables import Observables
     from amibayes.extraction.reading import ImageOptions
 
@@ -31,9 +34,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "targets", nargs="+", metavar="TARGET", help="OIFITS file(s) or image cube(s)"
     )
     parser.add_argument(
-        "--cal", nargs="+", required=True, metavar="CAL", help="calibrators, any order"
+        "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
     )
     _add_method(parser.add_argument_group("calibration"))
+    parser.add_argument(
+        "--add-to-library",
+        type=Path,
+        metavar="FILE",
+        help="keep the calibrators in this library of their instrument and filter",
+    )
     _add_data(parser.add_argument_group("data"))
     common.add_image_options(parser)
     common.add_output_options(parser, "calibrate")
@@ -69,6 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Calibrate and write the file."""
     common.configure_logging(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
+    if not arguments.cal and arguments.library is None:
+        raise UsageError("no calibrator given", remedy="give --cal FILES, or --library FILE")
     import numpy as np
 
     from amibayes.calibration import calibrate, diameters_of
@@ -81,20 +92,58 @@ def run(arguments: argparse.Namespace) -> int:
     calibrators = _prepared(arguments.cal, arguments, images, target=None, one_star=False)
     targets = _prepared(arguments.targets, arguments, images, target=arguments.target)
     folder = output_folder(arguments.out, [RESULT], overwrite=arguments.overwrite)
+    diameters = diameters_of(arguments.calibrator_diameters, calibrators)
+    serving, sizes, method = _with_library(arguments, targets, calibrators, diameters)
     found = calibrate(
         targets,
-        calibrators,
-        method=arguments.calibration,
+        serving,
+        method=method,
         clip=arguments.clip,
-        diameters_mas=diameters_of(arguments.calibrator_diameters, calibrators),
+        diameters_mas=sizes,
         window_days=arguments.time_window,
         charge_levels=arguments.charge_levels,
         rng=np.random.default_rng(arguments.seed),
     )
     write_observables(folder / RESULT, found.observables)
+    if arguments.add_to_library is not None:
+        _keep(arguments, calibrators, diameters)
     content = _json(arguments, found, folder)
     common.finish(arguments, content, lambda: _summary(found, folder))
     return 0
+
+
+def _with_library(
+    arguments: argparse.Namespace,
+    targets: list[Observables],
+    calibrators: list[Observables],
+    diameters: Sequence[Diameter] | None,
+) -> tuple[list[Observables], Sequence[Diameter] | None, Any]:
+    """Give calibrators, their diameters and the method, with those of a library."""
+    if arguments.library is None:
+        return calibrators, diameters, arguments.calibration
+    from amibayes.calibration.library import read_library
+
+    stored = read_library(arguments.library).without([*calibrators, *targets])
+    sizes = [*(diameters or [(0.0, 0.0)] * len(calibrators)), *stored.diameters_mas]
+    return [*calibrators, *stored.observables], sizes, arguments.calibration or "population"
+
+
+def _keep(
+    arguments: argparse.Namespace,
+    calibrators: list[Observables],
+    diameters: Sequence[Diameter] | None,
+) -> None:
+    """Add the calibrators to a library, with what the command line has of them."""
+    from amibayes.calibration.calibrate import mean_mjd
+    from amibayes.calibration.library import StarFacts, add_to_library
+
+    levels = (arguments.charge_levels or [])[1:] or [float("nan")] * len(calibrators)
+    sizes = diameters or [(0.0, 0.0)] * len(calibrators)
+    facts = [
+        StarFacts(Path(c.source).name, mean_mjd(c), level, "", "", *size)
+        for c, level, size in zip(calibrators, levels, sizes, strict=True)
+    ]
+    add_to_library(arguments.add_to_library, calibrators, facts)
 
 
 def _prepared(

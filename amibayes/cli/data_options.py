@@ -24,8 +24,15 @@ def add_calibration(group: argparse._ActionsContainer) -> None:
     group.add_argument(
         "--calibration",
         choices=choices(CalibrationMethod),
-        help="how calibrators are combined (default: hierarchical where 3 or more "
-        "share a baseline)",
+        help="how calibrators are combined (default: population with --library, else hierarchical "
+        "where 3 or more share a baseline)",
+    )
+    group.add_argument(
+        "--library",
+        type=Path,
+        metavar="FILE",
+        help="calibrators of other nights that are used beside --cal, as calibrate "
+        "--add-to-library keeps them",
     )
     group.add_argument(
         "--clip",
@@ -228,7 +235,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """
     if arguments.fastest and not arguments.motion:
         raise UsageError("needs a motion", source="--fastest", remedy="give --motion")
-    if arguments.calibration and not arguments.cal:
+    if arguments.calibration and not (arguments.cal or arguments.library):
         raise UsageError("needs calibrators", source="--calibration", remedy="give --cal FILES")
     if arguments.calibrator_diameters and not arguments.cal:
         raise UsageError(
@@ -250,6 +257,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "smearing": arguments.smearing,
         "closure_covariance": arguments.closure_covariance,
         "calibration": arguments.calibration,
+        "library": arguments.library,
         "clip": arguments.clip,
         "keep_all": arguments.keep_all,
         "insname": arguments.insname,

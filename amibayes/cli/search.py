@@ -141,7 +141,7 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
 
     names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated, several=several)]
     names += [CHAIN] if options.posterior else []
-    return [*names, CALIBRATED] if calibrated else names
+    return [*names, CALIBRATED] if calibrated or options.library else names
 
 
 def request(arguments: argparse.Namespace) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -60,8 +61,12 @@ class SearchOptions:
     smearing : bool
     closure_covariance : {"assumed", "diagonal"}
         For files that give errors and no correlations.
-    calibration : {"hierarchical", "weighted"}, optional
-        By default hierarchical where 3 calibrators or more share a baseline.
+    calibration : {"hierarchical", "weighted", "population"}, optional
+        By default population with a library, else hierarchical where 3 calibrators or more share
+        a baseline.
+    library : Path, optional
+        Calibrators of other nights that are used beside those that are given
+        (`amibayes.calibration.library`).
     clip : float
         Sigma clipping of the calibrators.
     keep_all : bool
@@ -134,6 +139,7 @@ class SearchOptions:
     smearing: bool = True
     closure_covariance: ClosureCovariance = "assumed"
     calibration: CalibrationMethod | None = None
+    library: Path | None = None
     clip: float = CLIP_CALIBRATORS
     keep_all: bool = False
     insname: str | None = None

@@ -15,6 +15,7 @@ from amibayes.calibration import (
     reduce_data,
     without_disc,
 )
+from amibayes.calibration.library import read_library
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
@@ -125,7 +126,7 @@ def _calibrated(
     run: Run,
 ) -> tuple[Vetting | None, Calibration | None, Observables]:
     """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
-    if not references:
+    if not references and options.library is None:
         return None, None, join(parts)
     vetting, serving = None, references
     diameters = diameters_of(options.calibrator_diameters, references)
@@ -142,14 +143,15 @@ def _calibrated(
             )
             serving = _kept(references, vetting)
     kept = {id(reference) for reference in serving}
+    sizes = [d for r, d in zip(references, sizes, strict=True) if id(r) in kept]
+    method = options.calibration
+    if options.library is not None:
+        stored = read_library(options.library).without([*references, *parts])
+        serving, sizes = [*serving, *stored.observables], [*sizes, *stored.diameters_mas]
+        method = method or "population"
     with run.stage("calibrate"):
         calibration = calibrate(
-            parts,
-            serving,
-            method=options.calibration,
-            clip=options.clip,
-            diameters_mas=[d for r, d in zip(references, sizes, strict=True) if id(r) in kept],
-            rng=rng,
+            parts, serving, method=method, clip=options.clip, diameters_mas=sizes, rng=rng
         )
     return vetting, calibration, calibration.observables
 

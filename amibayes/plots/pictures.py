@@ -79,7 +79,7 @@ class Stages:
         """Those of a run that has ended."""
         return cls(
             len(report.targets) > 1,
-            report.calibration is not None,
+            bool(report.calibrators),
             report.significance is not None,
             report.posterior is not None,
             report.limits is not None,

@@ -358,12 +358,20 @@ def _limits(report: SearchReport) -> Json | None:
     return limits_json(report.limits) | companion | {"completeness_map": map_json(report.limits)}
 
 
+def _n_own(report: SearchReport) -> int:
+    """Number of calibrators that calibration was given, but for those of a library."""
+    vetting = report.vetting
+    return len(report.calibrators) if vetting is None else sum(v.kept for v in vetting.calibrators)
+
+
 def _calibration(report: SearchReport) -> Json | None:
     calibration = report.calibration
     if calibration is None:
         return None
     return {
         "method": calibration.method,
+        "library": None if report.options.library is None else report.options.library.name,
+        "n_of_library": sum(c.kept for c in calibration.calibrators[_n_own(report) :]),
         "calibrators": calibrator_verdicts(report),
         "tau": {
             "vis2": calibration.tau_vis2,

@@ -29,7 +29,7 @@ ExtractionCovariance = Literal["shrunk", "scatter", "physical"]
 Geometry = Literal["fitted", "stated"]
 """Scale and rotation of the mask, where the image determines them."""
 
-CalibrationMethod = Literal["hierarchical", "weighted"]
+CalibrationMethod = Literal["hierarchical", "weighted", "population"]
 """How calibrators are combined; unless given, by how many share a baseline."""
 
 ClosureCovariance = Literal["assumed", "diagonal"]

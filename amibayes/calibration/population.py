@@ -1,0 +1,264 @@
+"""Calibrators as a population whose transfer functions drift: a library of many stars and dates.
+
+What the instrument does to a point source changes from star to star and with time, in few ways:
+the principal components of the transfer functions of a library. Calibrator j at time t_j sees
+
+    z_j = μ + Σ_k u_k a_k(t_j) + δ_j + n_j,
+
+with amplitudes a_k of mean 0 and variance σ_k² whose covariance between two dates is
+σ_k² (ρ exp(−|Δt|/ℓ) + 1 − ρ if they are one), a scatter δ_j of τ² times the errors, and the
+errors n_j. The target is one more draw: amplitudes at its date come from the calibrators near to it
+(kriging with an unknown mean), and what is left of their variance is put into its
+covariance, so that a fit does not rest on the combinations of V² and closure phases that drift.
+ρ and ℓ are averaged over a grid by their likelihood.
+
+The number of components is that of singular values above the threshold of Gavish & Donoho
+(2014, IEEE Trans. Inf. Theory 60, 5040) for unknown noise; their variances are corrected for what
+noise adds to the largest eigenvalues (Baik & Silverstein 2006). Each calibrator predicted
+from the others tells whether the stated covariance of a prediction is right, and scales it up
+where it is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from amibayes.calibration.matching import Keys
+from amibayes.calibration.transfer import Transfer, closure_sets
+from amibayes.calibration.weighted import TransferFunction
+from amibayes.errors import DataError
+from amibayes.units import BoolArray, FloatArray
+
+MIN_MEMBERS = 6
+"""Below it a covariance of components means nothing: hierarchical calibration serves better."""
+
+CORRELATED = np.array([0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.995])
+"""ρ, the share of a component's variance that goes with time."""
+
+N_TIMES = 12
+"""Correlation times ℓ, from the shortest interval between calibrators to ten times the span."""
+
+MAX_LEFT_OUT = 20
+"""Calibrators that are predicted from the others: the mean of their χ² is then known to a
+twentieth, since each is of many data."""
+
+UNKNOWN_MEAN = 100.0
+"""Variance of the mean amplitude in units of the component's: as good as no knowledge."""
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """The population, in units of the median error of every combination of the data.
+
+    Parameters
+    ----------
+    mean : (q,) float array
+    modes : (q, k) float array
+        Orthonormal.
+    variance : (k,) float array
+        Of the amplitudes.
+    scatter : float
+        τ²: variance of what neither components nor errors explain.
+    """
+
+    mean: FloatArray
+    modes: FloatArray
+    variance: FloatArray
+    scatter: float
+
+
+def components(data: FloatArray, noise: FloatArray) -> Components:
+    """Find the principal components of transfer functions.
+
+    Parameters
+    ----------
+    data : (n, q) float array
+        Of n calibrators, in units of the typical error.
+    noise : (n,) float array
+        Variance of the errors of each, in these units.
+    """
+    n, q = data.shape
+    mean = data.mean(axis=0)
+    _, singular, rows = np.linalg.svd((data - mean) / np.sqrt(n - 1), full_matrices=False)
+    singular, rows = singular[: n - 1], rows[: n - 1]  # the mean took one direction
+    n_modes = int((singular > _threshold(n - 1, q) * np.median(singular)).sum())
+    n_modes = min(n_modes, n - 3, q - 1)
+    eigen = singular**2
+    free = (q - n_modes) * (1.0 - n_modes / (n - 1))
+    bulk = float(eigen[n_modes:].sum()) / max(free, 1.0)
+    variance = _debiased(eigen[:n_modes], bulk, q / (n - 1))
+    scatter = max(bulk - float(noise.mean()), 0.0)
+    return Components(mean, rows[:n_modes].T, variance, scatter)
+
+
+def _threshold(n: int, q: int) -> float:
+    """Gavish & Donoho's threshold in units of the median singular value, to 0.02."""
+    ratio = min(n, q) / max(n, q)
+    return float(0.56 * ratio**3 - 0.95 * ratio**2 + 1.82 * ratio + 1.43)
+
+
+def _debiased(eigen: FloatArray, bulk: float, ratio: float) -> FloatArray:
+    """Variance of a component beyond the bulk, from its eigenvalue in a sample."""
+    total = eigen + bulk - ratio * bulk
+    root = np.sqrt(np.maximum(total**2 - 4.0 * eigen * bulk, 0.0))
+    return np.asarray(np.maximum(0.5 * (total + root) - bulk, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Mean (q,) and covariance (q, q) of the transfer function at a date."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def predict(
+    found: Components, data: FloatArray, noise: FloatArray, days: FloatArray, at: float
+) -> Prediction:
+    """Predict the transfer function of one more star at a date.
+
+    Parameters
+    ----------
+    found : Components
+    data : (n, q) float array
+    noise : (n,) float array
+    days : (n,) float array
+        Dates of the calibrators.
+    at : float
+        Date of the target.
+    """
+    n, q = data.shape
+    amplitude = (data - found.mean) @ found.modes
+    own = noise + found.scatter
+    apart, gap = np.abs(days[:, None] - days), np.abs(days - at)
+    settings = [
+        _krige(amplitude, found.variance, own, rho * np.exp(-apart / time), 1.0 - rho,
+               rho * np.exp(-gap / time))
+        for rho, time in _grid(days)
+    ]  # fmt: skip
+    log_likelihood = np.array([s[0] for s in settings])
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    means = np.array([s[1] for s in settings])
+    centre = weight @ means
+    variance = weight @ (np.array([s[2] for s in settings]) + (means - centre) ** 2)
+    outside = np.eye(q) - found.modes @ found.modes.T
+    covariance = found.scatter * np.eye(q) + float(own.mean()) / n * outside
+    covariance = covariance + (found.modes * variance) @ found.modes.T
+    return Prediction(found.mean + found.modes @ centre, covariance)
+
+
+def _grid(days: FloatArray) -> list[tuple[float, float]]:
+    """Shares and times of the correlation; one setting where all have one date."""
+    steps = np.diff(np.unique(days))
+    if not len(steps):
+        return [(0.0, 1.0)]
+    times = np.geomspace(max(steps.min(), 1e-4 * np.ptp(days)), 10.0 * np.ptp(days), N_TIMES)
+    return [(0.0, 1.0), *((rho, time) for rho in CORRELATED[1:] for time in times)]
+
+
+def _krige(
+    amplitude: FloatArray,
+    variance: FloatArray,
+    own: FloatArray,
+    together: FloatArray,
+    alone: float,
+    near: FloatArray,
+) -> tuple[float, FloatArray, FloatArray]:
+    """Likelihood of the amplitudes, and mean and variance of the target's, (k,) each."""
+    log_likelihood, means, variances = 0.0, [], []
+    for a, v in zip(amplitude.T, variance, strict=True):
+        matrix = v * (together + UNKNOWN_MEAN) + np.diag(v * alone + own)
+        lower = np.linalg.cholesky(matrix)
+        white = np.linalg.solve(lower, np.stack([a, v * (near + UNKNOWN_MEAN)], axis=1))
+        log_likelihood -= 0.5 * float(white[:, 0] @ white[:, 0])
+        log_likelihood -= float(np.log(np.diagonal(lower)).sum())
+        means.append(float(white[:, 1] @ white[:, 0]))
+        variances.append(v * (1.0 + UNKNOWN_MEAN) - float(white[:, 1] @ white[:, 1]))
+    return log_likelihood, np.array(means), np.array(variances)
+
+
+def inflation(data: FloatArray, noise: FloatArray, days: FloatArray) -> float:
+    """Mean χ² per number of each calibrator predicted from the others, at least 1."""
+    chi2 = []
+    for j in np.unique(np.linspace(0, len(data) - 1, MAX_LEFT_OUT).astype(int)):
+        rest = np.arange(len(data)) != j
+        found = components(data[rest], noise[rest])
+        made = predict(found, data[rest], noise[rest], days[rest], float(days[j]))
+        residual = data[j] - made.mean
+        total = made.covariance + noise[j] * np.eye(len(residual))
+        chi2.append(float(residual @ np.linalg.solve(total, residual)) / len(residual))
+    return max(float(np.mean(chi2)), 1.0)
+
+
+def population_response(
+    transfers: Sequence[Transfer], keys: Keys, days: FloatArray, at: float
+) -> TransferFunction:
+    """Response of the instrument for a target at a date, from a library of calibrators.
+
+    Parameters
+    ----------
+    transfers : sequence of Transfer
+    keys : Keys
+        Of the target.
+    days : (n,) float array
+        Date of each calibrator, MJD.
+    at : float
+        Date of the target, MJD.
+
+    Raises
+    ------
+    DataError
+        Where fewer than `MIN_MEMBERS` calibrators see all that most of them see.
+    """
+    seen = np.array([t.seen for t in transfers])
+    known = np.asarray(seen.mean(axis=0) >= 0.5)
+    members = np.flatnonzero((seen | ~known).all(axis=1)).tolist()
+    if len(members) < MIN_MEMBERS:
+        raise DataError(
+            f"{len(members)} calibrators of the library see all baselines of the target, and a "
+            f"population takes {MIN_MEMBERS}",
+            remedy="use a library of this instrument and filter, or --calibration hierarchical",
+        )
+    basis = _basis(keys, known)
+    data = np.array([basis.T @ transfers[j].value for j in members])
+    errors = [basis.T @ _covariance(transfers[j]) @ basis for j in members]
+    lower = np.linalg.cholesky(np.median(errors, axis=0) + _ridge(errors))
+    inverse = np.linalg.inv(lower)
+    white = data @ inverse.T
+    noise = np.array([np.trace(inverse @ e @ inverse.T) / len(lower) for e in errors])
+    found = components(white, noise)
+    made = predict(found, white, noise, np.asarray(days)[members], at)
+    scale = inflation(white, noise, np.asarray(days)[members])
+    back = basis @ lower
+    covariance = csr_array(back @ (scale * made.covariance) @ back.T)
+    return TransferFunction(back @ made.mean, covariance, known)
+
+
+def _covariance(transfer: Transfer) -> FloatArray:
+    covariance = transfer.covariance
+    if transfer.shared is not None:  # one constant of the detector for all: part of the errors
+        covariance = transfer.shared.added(covariance)
+    return np.asarray(covariance.toarray())
+
+
+def _ridge(errors: Sequence[FloatArray]) -> FloatArray:
+    """Keep the median of covariances, which is none itself, above zero."""
+    middle = np.median([np.diagonal(e) for e in errors], axis=0)
+    lowest = float(np.linalg.eigvalsh(np.median(errors, axis=0))[0])
+    return np.diag(np.full(len(middle), max(1e-6 * middle.min() - lowest, 0.0)))
+
+
+def _basis(keys: Keys, known: BoolArray) -> FloatArray:
+    """From V² and kernel phases to keys, (n_keys, q), orthonormal."""
+    vis2 = np.flatnonzero(known[: keys.n_vis2])
+    columns = [np.eye(len(keys))[:, vis2]]
+    for closures in closure_sets(keys, known):
+        column = np.zeros((len(keys), closures.basis.shape[1]))
+        column[closures.keys] = closures.basis
+        columns.append(column)
+    return np.concatenate(columns, axis=1)
