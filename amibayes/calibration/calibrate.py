@@ -145,10 +145,8 @@ def calibrate(
         Several keep the covariance that the calibrators they share give them.
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted", "population"}, optional
-        Inverse-variance means, with the scatter where it is larger than the errors; random
-        effects (`amibayes.calibration.hierarchical`), the default where 3 share a baseline; or
-        the principal components of many, whose amplitudes drift
-        (`amibayes.calibration.population`), for calibrators of many nights.
+        Inverse-variance means; random effects (`amibayes.calibration.hierarchical`), the default
+        where 3 share a baseline; or many that drift (`amibayes.calibration.population`).
     clip : float, optional
         Leave out values that differ from the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (diameter, error), optional
@@ -174,13 +172,9 @@ def calibrate(
     chosen = _method(method, target, [seen[j] for j in serving])
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     used = [calibrators[j] for j in serving]
-    # Outliers of a drifting population are its extremes, and tell most of its components.
-    clip = None if chosen == "population" else clip
-    kept = _consistent([seen[j] for j in serving], keys, clip)
-    response = _response(
-        chosen, kept, keys, rng or np.random.default_rng(1), covariate,
-        np.array([mean_mjd(c) for c in (target, *used)]),
-    )  # fmt: skip
+    kept = _consistent([seen[j] for j in serving], keys, clip if chosen != "population" else None)
+    mjd = np.array([mean_mjd(c) for c in (target, *used)])
+    response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response = replace(response, freedom=response_freedom(used, kept))
     notes = tuple(note for calibrator in used if (note := foreign(calibrator, keys)))
     return Calibration(
@@ -265,7 +259,10 @@ def _transfers(
 
 
 def _consistent(serving: list[Transfer], keys: Keys, clip: float | None) -> list[Transfer]:
-    """Calibrators with closure phases on one branch, without outliers."""
+    """Calibrators with closure phases on one branch, without outliers.
+
+    Those of a drifting population are its extremes, and tell most of its components: none goes.
+    """
     kept = on_one_branch(serving, keys)
     return kept if clip is None else clipped(kept, keys, clip)
 
