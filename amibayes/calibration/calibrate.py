@@ -142,7 +142,7 @@ def calibrate(
     Parameters
     ----------
     targets : Observables, or a sequence of them
-        Several keep the covariance that the calibrators they share give them.
+        Several keep the covariance that shared calibrators give them.
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted", "population"}, optional
         Inverse-variance means; random effects (`amibayes.calibration.hierarchical`), the default
@@ -154,14 +154,13 @@ def calibrate(
     window_days : float, optional
         Use only calibrators observed within this time of each epoch of the target.
     charge_levels : sequence of float, optional
-        Of the target, then of each calibrator: the response may depend on them linearly.
+        Of target, then calibrators: the response may depend on them linearly.
     rng : numpy.random.Generator, with a fixed seed by default
 
     Raises
     ------
     UsageError, DataError
-        For an unknown method; where calibrators are none, too few, the target itself, extracted
-        by another method, or have nothing in common.
+        For an unknown method; for calibrators that are none, too few or do not belong here.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
     _refuse_same(parts, calibrators := list(calibrators))
@@ -172,11 +171,11 @@ def calibrate(
     chosen = _method(method, target, [seen[j] for j in serving])
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     used = [calibrators[j] for j in serving]
-    kept = _consistent([seen[j] for j in serving], keys, clip if chosen != "population" else None)
-    mjd = np.array([mean_mjd(c) for c in (target, *used)])
+    kept = _consistent([seen[j] for j in serving], keys, None if chosen == "population" else clip)
+    mjd = [mean_mjd(c) for c in (target, *used)]
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response = replace(response, freedom=response_freedom(used, kept))
-    notes = tuple(note for calibrator in used if (note := foreign(calibrator, keys)))
+    notes = tuple(note for c in used if (note := foreign(c, keys)))
     return Calibration(
         apply_response(target, keys, response, calibrators, notes),
         chosen,
@@ -273,10 +272,10 @@ def _response(
     keys: Keys,
     rng: np.random.Generator,
     covariate: FloatArray | None,
-    mjd: FloatArray,
+    mjd: Sequence[float],
 ) -> TransferFunction:
     if method == "population":
-        return population_response(kept, keys, mjd[1:], float(mjd[0]))
+        return population_response(kept, keys, np.array(mjd[1:]), mjd[0])
     if method == "weighted":
         return weighted_response(kept, keys)
     return hierarchical_response(kept, keys, rng, covariate)
