@@ -12,6 +12,7 @@ from amibayes.support.options import (
     CLIP_CALIBRATORS,
     NOISE_PRIOR,
     NULL_DRAWS,
+    SKY_MODELS,
     CalibrationMethod,
     ClosureCovariance,
     ContrastSharing,
@@ -286,6 +287,17 @@ def add_observables(
         default=default,
         metavar="vis2,cp",
         help=explained,
+    )
+
+
+def add_models(group: argparse._ActionsContainer, otherwise: str) -> None:
+    """Add ``--models``; ``otherwise`` is what is done without."""
+    group.add_argument(
+        "--models",
+        type=common.sky_models,
+        metavar="LIST",
+        help="models of the sky that are compared, with the confusion matrix of the data: out of "
+        f"{', '.join(SKY_MODELS)}, or some joined as ring+companion ({otherwise})",
     )
 
 

@@ -94,6 +94,9 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         action="store_true",
         help="go on with a run that was cut off; with --batch, leave finished targets",
     )
+    data_options.add_models(
+        group, "then also the limit beside the disc or ring that is stated; default: none"
+    )
     common.add_seed_option(group)
 
 
@@ -206,6 +209,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
     search = SearchOptions(
         **data_options.search_settings(arguments),
         null_draws=_null_draws(arguments),
+        models=arguments.models,
     )
     return LimitsOptions(
         search=search,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amibayes.cli import batch, common, data_options
-from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS, SKY_MODELS
+from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS
 
 if TYPE_CHECKING:
     from amibayes.parallel import Journals
@@ -81,14 +81,7 @@ def _add_comparison(group: argparse._ArgumentGroup) -> None:
         help="numbers of companions whose evidences are compared; 2 searches for a second one and "
         "fits both (default: 0,1 with the posterior)",
     )
-    group.add_argument(
-        "--models",
-        type=common.sky_models,
-        metavar="LIST",
-        help="models of the sky that are compared, with the confusion matrix of the data: out of "
-        f"{', '.join(SKY_MODELS)}, or some joined as ring+companion (default: star,companion, "
-        "without the confusion matrix)",
-    )
+    data_options.add_models(group, "default: star,companion, without the confusion matrix")
     group.add_argument(
         "--evidence-method",
         choices=(*EVIDENCE_METHODS[:2], *SAMPLERS),

@@ -11,6 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
+from amibayes.comparison.compare import ModelComparison
+from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, draws_needed, reachable
 from amibayes.errors import DataError, UsageError
@@ -21,11 +23,13 @@ from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm
-from amibayes.pipeline.field import search_field
+from amibayes.pipeline.field import FieldSearch, search_field
+from amibayes.pipeline.models import compare_stage, limits_stage, models_warnings
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.run import Announce, Run, silent
 from amibayes.pipeline.warnings import search_warnings
+from amibayes.posterior.priors import default_prior
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import Rows, Shown
 from amibayes.support.options import (
@@ -107,6 +111,8 @@ class LimitsReport(Shown):
     limits: tuple[MeasuredLimit, ...]
     warnings: tuple[str, ...]
     timing_s: dict[str, float] = field(default_factory=dict)
+    models: ModelComparison | None = None
+    beside: LimitsBeside | None = None
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
@@ -164,6 +170,9 @@ def measure_limits(
         rng = np.random.default_rng(seeds[3])
         ready = prepare(targets, calibrators, options.search, rng, run)
         limits, notes = _all_limits(ready, options, seeds[5:], run)
+        models, beside = beside_models(
+            ready.observables, limits[0], options.search, np.random.default_rng(seeds[4]), run
+        )
     return LimitsReport(
         options,
         tuple(str(p) for p in targets),
@@ -171,9 +180,29 @@ def measure_limits(
         ready.observables,
         ready.calibration,
         limits,
-        (*ready.warnings, *notes),
+        (*ready.warnings, *notes, *models_warnings(models)),
         run.seconds,
+        models,
+        beside,
     )
+
+
+def beside_models(
+    data: Observables,
+    main: MeasuredLimit,
+    search: SearchOptions,
+    rng: np.random.Generator,
+    run: Run,
+) -> tuple[ModelComparison | None, LimitsBeside | None]:
+    """Compare models of the sky where they were asked for, and limits beside a stated disc."""
+    if search.models is None:
+        return None, None
+    found = FieldSearch(main.result, main.noise, ())
+    search = replace(search, observables=main.observables)
+    grid = main.result.grid
+    prior = default_prior(main.result.likelihood, grid.inner_mas, grid.outer_mas)
+    models = compare_stage(data, found, prior, search, rng, run)
+    return models, limits_stage(models, found, search, rng, run)
 
 
 def _refuse(options: LimitsOptions) -> None:

@@ -12,6 +12,7 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
+from amibayes.report.models import models_json
 from amibayes.support.atomic_files import atomic_path
 from amibayes.support.terminal import row, with_warnings
 from amibayes.units import contrast_to_delta_mag
@@ -54,8 +55,18 @@ def limits_report_json(report: LimitsReport, request: str = "") -> Json:
         **_curve(main, report),
         "curves": [_curve(limit, report) for limit in report.limits],
         "completeness_map": map_json(main.limit),
+        **beside_json(report),
         "warnings": list(report.warnings),
     }
+
+
+def beside_json(report: LimitsReport) -> Json:
+    """Comparison of models and the limit beside a stated disc; empty where none were asked for."""
+    if report.models is None:
+        return {}
+    beside = report.beside
+    limit = None if beside is None else {"model": beside.model, **limits_json(beside.limit)}
+    return models_json(report.models, None) | {"limits_beside": limit}
 
 
 def _curve(measured: MeasuredLimit, report: LimitsReport) -> Json:
@@ -132,8 +143,22 @@ def limits_summary(content: Json, folder: Path) -> list[str]:
         *_rate_lines(content),
         *(_curve_line(curve) for curve in content["curves"]),
         *_marked_lines(content),
+        *_beside_lines(content),
     ]
     return with_warnings(lines, content["warnings"], row("written to", str(folder)), "limits.json")
+
+
+def _beside_lines(content: Json) -> list[str]:
+    """The statement among models, and the limit beside the disc that is stated."""
+    if "limits_beside" not in content:
+        return []
+    line = f"models      {content['model_verdict']['statement']}"
+    beside = content["limits_beside"]
+    if beside is None:
+        return [f"{line}: no limit beside a disc or a ring, of which none is stated"]
+    known = [m for m in beside["delta_mag"] if m is not None]
+    span = f"{min(known):.2f} to {max(known):.2f}" if known else "none in this field"
+    return [f"{line}; delta mag of companions beside it {span}"]
 
 
 def _rate_lines(content: Json) -> list[str]:

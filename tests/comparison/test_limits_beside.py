@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from scenes import disc, observed
 
+from amibayes.cli import main
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.search import search
 from amibayes.comparison.compare import compare_sky_models
@@ -15,6 +19,7 @@ from amibayes.comparison.hypotheses import Hypothesis
 from amibayes.comparison.limits import limits_beside
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.oifits import write_oifits
 from amibayes.posterior.priors import Prior
 
 FIELD = (94.0, 300.0)
@@ -83,3 +88,21 @@ def limits_beside_nothing(star) -> np.ndarray:
     rng = np.random.default_rng(4)
     tested = significance(statistic_of(result, stated_errors=True), 2000, rng, 0.01)
     return detection_limit(result, tested, rng).delta_mag
+
+
+@pytest.mark.slow
+def test_limits_command_gives_the_limit_beside_a_stated_disc(tmp_path: Path) -> None:
+    """Light of a disc hides companions of a star alone; with the disc in the model they are seen."""
+    path = tmp_path / "disc.oifits"
+    write_oifits(path, observed(niriss(0.003, 0.1), disc(), np.random.default_rng(3)))
+    words = ["--models", "star,disc", "--separation", "94:350", "--criterion", "candid"]
+    words += ["--null-draws", "3000", "--separations", "4", "--quiet"]
+    assert main(["limits", str(path), "--out", str(tmp_path / "out"), *words]) == 0
+    content = json.loads((tmp_path / "out" / "limits.json").read_text())
+    assert content["model_verdict"]["statement"] == "disc"
+    assert content["limits_beside"]["model"] == "disc"
+    alone, beside = (
+        np.nanmedian(np.array(c["delta_mag"], dtype=float))
+        for c in (content, content["limits_beside"])
+    )
+    assert beside > alone + 0.5
