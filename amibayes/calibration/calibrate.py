@@ -360,7 +360,8 @@ def _uses(
     for j, (calibrator, transfer) in enumerate(zip(calibrators, seen, strict=True)):
         n = int(transfer.seen.sum())
         used = int(kept[j].seen.sum()) if j in kept else 0
-        reason = "" if used == n else f"{n - used} of {n} values are outliers among the calibrators"
+        what = "is an outlier" if n - used == 1 else "are outliers"
+        reason = "" if used == n else f"{n - used} of {n} values {what} among the calibrators"
         if not n:
             reason = "no baseline at the same wavelength and time in common with the target"
         uses.append(CalibratorUse(calibrator.source, used > 0, reason, used, n - used))

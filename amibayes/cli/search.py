@@ -189,7 +189,7 @@ def _write(
     """Write everything but the chain; the result last: where it is, the run is finished."""
     from amibayes.kpfits import write_observables
     from amibayes.plots.pictures import save_pictures
-    from amibayes.report import captioned, result_json, search_page, write_page
+    from amibayes.report import captioned, explorer_data, result_json, search_page, write_page
     from amibayes.support.atomic_files import write_json
 
     if report.calibration is not None:
@@ -197,7 +197,8 @@ def _write(
     drawn = [] if arguments.no_pictures else batch.draw(arguments, save_pictures, report, folder)
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
-    write_page(folder / REPORT, search_page(content, figures, common.command_line(arguments)))
+    words = common.command_line(arguments)
+    write_page(folder / REPORT, search_page(content, figures, words, explorer_data(report)))
     write_json(folder / RESULT, content)
     return content
 

@@ -130,13 +130,14 @@ def completeness_map(
     for i, (row, found) in enumerate(zip(rows, fraction, strict=True)):
         cells = np.ma.masked_invalid(found[:, None])
         mesh = ax.pcolormesh(sides[i : i + 2], row, cells, cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
-    for values, dash, name in [(c50, "-", "50 % found"), (c95, "--", "95 % found")]:
+    # As in `limits_plot` of a search: the limit itself is the solid line.
+    for values, dash, name in [(c95, "-", "95 % recovered"), (c50, "--", "50 % recovered")]:
         if values is not None:
             ax.plot(separation_mas, values, color="white", lw=4.0)
             ax.plot(separation_mas, values, color=BLACK, ls=dash, lw=2.0, label=name)
     magnitude_axis(ax, limits=(float(np.min(rows)), float(np.max(rows))))
     figure.colorbar(
-        mesh, ax=ax, label="Share of injected companions found", location="top", aspect=35
+        mesh, ax=ax, label="Share of injected companions recovered", location="top", aspect=35
     )
     handles, labels = ax.get_legend_handles_labels()
     if handles:
@@ -280,7 +281,9 @@ def limits_picture(report: LimitsReport) -> Figure:
     for measured in report.limits:
         limit = measured.limit
         low, _, high = contrast_to_delta_mag(limit.spread).T
-        curves[f"{NAMES[measured.observables]}, {limit.method}"] = Curve(
+        share = limit.facts()["completeness"]
+        told = limit.method if share is None else f"{100.0 * share:.0f} % recovered"
+        curves[f"{NAMES[measured.observables]}, {told}"] = Curve(
             limit.delta_mag, low, high, limit.by_detection
         )
     tested, main = report.main.significance, report.main.result

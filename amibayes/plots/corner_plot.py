@@ -126,10 +126,10 @@ def _ranges(draws: FloatArray) -> list[tuple[float, float]]:
 
 
 def _density(n: int) -> dict[str, object]:
-    """Contours hold 39 and 86 % of two dimensions (1 and 2σ); few samples show as points."""
+    """Contours hold 68 and 95 % of two dimensions; few samples show as points."""
     many = n >= CONTOUR_POINTS
     return {
-        "levels": (0.393, 0.865),
+        "levels": (0.68, 0.95),
         "smooth": 1.0,
         "plot_datapoints": not many,
         "plot_contours": n >= 200,

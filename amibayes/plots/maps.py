@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from astropy.io import fits
 from matplotlib.axes import Axes
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
@@ -16,12 +18,14 @@ from matplotlib.patheffects import withStroke
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult
+from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import (
     BLACK,
     DIVERGING,
     GREY,
+    ORANGE,
     SEQUENTIAL,
     VERMILLION,
     new_figure,
@@ -37,9 +41,6 @@ MAP_TITLES = {
     "sqrt_delta_chi2": "√Δχ² of the best companion at each position",
     "delta_chi2": "Δχ² of the best companion at each position",
 }
-
-MIN_SHOWN = 1e-12
-"""Probabilities below this have one colour."""
 
 HALO = [withStroke(linewidth=3.5, foreground="white")]
 """Markers that can be seen on dark and on bright parts of a map."""
@@ -112,7 +113,7 @@ def sky_map(
 
 @styled()
 def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
-    """Draw the false-alarm probability of every position: there alone, and anywhere.
+    """Draw the probability that noise reaches the statistic of each position, anywhere.
 
     Parameters
     ----------
@@ -123,23 +124,39 @@ def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Above the local probability (noise reaches this statistic at this position), below the
-        global one (anywhere in the field). What lies within the white line is extrapolated
-        past the null draws.
+        The global probability: grey down to the threshold of a detection, coloured below it, and
+        of one colour below `told_by_draws`. The local one, of a position
+        by itself, is small at some of thousands of positions whatever the data are: it would
+        look like detections, and is in ``maps.fits`` only.
     """
-    figure = new_figure(11.6)
-    axes = figure.subplots(2, 1)
-    for ax, (name, p) in zip(axes, probability_maps(tested).items(), strict=True):
-        value = np.log10(np.maximum(p, MIN_SHOWN))
-        low = min(float(value.min()), -2.0)
-        label = f"{name.capitalize()} false-alarm probability (power of ten)"
-        _paint(figure, ax, result.grid, value, label, cmap=f"{SEQUENTIAL}_r", vmin=low, vmax=0.0)
-        _mark(ax, result)
-    _outline_extrapolation(axes[1], result.grid, tested)
+    figure = new_figure(6.1)
+    ax = figure.subplots()
+    lowest = told_by_draws(tested)
+    value = np.log10(np.maximum(probability_maps(tested)["global"], lowest))
+    low = float(np.log10(lowest))
+    label = "False-alarm probability anywhere in the field"
+    colours = _chance_colours(low, float(np.log10(tested.alpha)))
+    style: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": 0.0, "extend": "min"}
+    bar = _paint(figure, ax, result.grid, value, label, **style)
+    powers = np.arange(np.ceil(low), 1.0)
+    bar.set_ticks([low, *powers[powers > low + 0.3]])
+    bar.set_ticklabels([f"≤ {lowest:.2g}", *(f"{10.0**p:g}" for p in powers[powers > low + 0.3])])
+    _mark(ax, result)
     figure.suptitle(_headline(result))
-    handles, labels = axes[1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def _chance_colours(low: float, threshold: float) -> LinearSegmentedColormap:
+    """Grey down to the threshold of a detection, orange to red below it, by powers of ten."""
+    edge = float(np.clip(1.0 - threshold / low, 0.01, 0.99))
+    marks = [(0.0, VERMILLION), (edge, ORANGE), (edge, "#8a8a8a"), (1.0, "#f2f2f2")]
+    return LinearSegmentedColormap.from_list("chance", marks)
+
+
+def told_by_draws(tested: Significance) -> float:
+    """Smallest probability that so many null draws can tell, with 95 % confidence."""
+    return clopper_pearson(0, tested.n_draws)[1]
 
 
 def probability_maps(tested: Significance) -> dict[str, FloatArray]:
@@ -158,18 +175,6 @@ def probability_maps(tested: Significance) -> dict[str, FloatArray]:
     }
 
 
-def _outline_extrapolation(ax: Axes, grid: Grid, tested: Significance) -> None:
-    """Draw where the statistic is larger than the null draws reach."""
-    beyond = np.asarray(tested.field) > tested.reach
-    if not beyond.any():
-        return
-    axis = np.arange(-grid.half_width, grid.half_width + 1) * grid.step_mas
-    inside = np.nan_to_num(grid.image(beyond.astype(float)))
-    ax.contour(axis, axis, inside, levels=[0.5], colors="white", linewidths=1.6)
-    ax.contour(axis, axis, inside, levels=[0.5], colors=BLACK, linewidths=0.8)
-    ax.plot([], [], color=BLACK, lw=0.8, label="inside: past the null draws, extrapolated")
-
-
 def _headline(result: SearchResult) -> str:
     c = result.companion
     return (
@@ -180,7 +185,7 @@ def _headline(result: SearchResult) -> str:
 
 def _paint(
     figure: Figure, ax: Axes, grid: Grid, values: FloatArray, label: str, **options: Any
-) -> None:
+) -> Colorbar:
     """Show values over the grid with a colour bar; the first column is the westernmost."""
     extend = options.pop("extend", "neither")
     edge = (grid.half_width + 0.5) * grid.step_mas
@@ -192,7 +197,7 @@ def _paint(
     ax.set_ylim(-reach, reach)
     ax.set_xlabel("East offset (mas)")
     ax.set_ylabel("North offset (mas)")
-    figure.colorbar(image, ax=ax, label=label, extend=extend, shrink=0.85, pad=0.02)
+    return figure.colorbar(image, ax=ax, label=label, extend=extend, shrink=0.85, pad=0.02)
 
 
 def _paint_contrast(figure: Figure, ax: Axes, result: SearchResult, kind: ContrastKind) -> None:

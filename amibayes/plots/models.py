@@ -17,6 +17,7 @@ from amibayes.plots.style import (
     BLACK,
     GREY,
     LIGHT_GREY,
+    PALE,
     SEQUENTIAL,
     marker_of,
     new_figure,
@@ -89,8 +90,8 @@ def model_images(found: ModelComparison) -> Figure:
         ax.plot(0.0, 0.0, "*", **drawn_over)
         if extent > 1.2 * reach:
             far = f"light out to {extent:.0f} mas"
-            ax.text(0.5, 0.9, far, color="white", ha="center", transform=ax.transAxes)
-        ax.add_patch(Circle((0.8 * reach, -0.8 * reach), 0.5 * beam, fill=False, ec="white"))
+            ax.text(0.5, 0.9, far, color=PALE, ha="center", transform=ax.transAxes)
+        ax.add_patch(Circle((0.8 * reach, -0.8 * reach), 0.5 * beam, fill=False, ec=PALE))
         ax.set_title(f"{model.name}: {_percent(share)}\nχ² {model.chi2:.4g}, {model.ndof} dof")
     for ax in axes[-1]:
         ax.set_xlabel("East (mas)")
@@ -222,7 +223,7 @@ def model_odds(found: ModelComparison) -> Figure:
     columns, share = confusion.taken_for()
     drawn = lower.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
     for (i, j), value in np.ndenumerate(share):
-        colour = "white" if value > 0.6 else BLACK
+        colour = PALE if value > 0.6 else BLACK
         lower.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour)
     lower.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
     lower.set_yticks(range(len(names)), names)

@@ -218,10 +218,10 @@ def _limits(report: SearchReport) -> Figure:
     assert limits is not None
     middle = contrast_to_delta_mag(limits.contrast_50)
     curves = {
-        f"{limits.completeness:.0%} recovered": Curve(
+        f"{100.0 * limits.completeness:.0f} % recovered": Curve(
             limits.delta_mag, by_detection=limits.by_detection
         ),
-        "50% recovered": Curve(middle, by_detection=limits.by_detection),
+        "50 % recovered": Curve(middle, by_detection=limits.by_detection),
     }
     tested = report.significance
     found = report.result.companion if tested is not None and tested.detected else None
@@ -300,8 +300,9 @@ PICTURES = (
     Picture(
         "false_alarm",
         "False-alarm probability",
-        "Probability that noise alone gives as good a companion at each position, and "
-        "anywhere in the field.",
+        "Probability that noise alone gives a companion as good as that of each position, anywhere "
+        "in the field: grey where it is no detection, coloured below the threshold, and of one "
+        "colour from where the null draws tell no more.",
         "significance",
         _false_alarm,
         lambda run: run.significance,
@@ -317,7 +318,8 @@ PICTURES = (
     Picture(
         "corner",
         "Posterior",
-        "Marginal distributions of every parameter and of every pair, with the best fit marked.",
+        "Marginal distributions of every parameter, with lines at the median and the 68 % "
+        "interval, and of every pair, with contours that hold 68 and 95 %; the best fit is marked.",
         "posterior",
         _corner,
         lambda run: run.posterior,

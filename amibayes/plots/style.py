@@ -23,6 +23,9 @@ WIDTH_IN = 6.4
 DPI = 160
 
 BLACK, GREY, LIGHT_GREY = "#000000", "#6e6e6e", "#c8c8c8"
+PALE = "#fff3a0"
+"""Text on dark colours; a report in dark mode turns what is grey, white included, and not this."""
+
 BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY = (
     "#0072b2",
     "#d55e00",

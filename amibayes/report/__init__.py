@@ -1,6 +1,7 @@
 """What a run writes: ``result.json``, ``limits.json``, summaries, and ``report.html``."""
 
 from amibayes.report.common import Json, number
+from amibayes.report.explorer import explorer_data
 from amibayes.report.limits import (
     limits_json,
     limits_report_json,
@@ -23,6 +24,7 @@ __all__ = [
     "Statement",
     "Table",
     "captioned",
+    "explorer_data",
     "limits_json",
     "limits_report_json",
     "limits_summary",

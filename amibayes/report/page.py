@@ -1,21 +1,29 @@
 """A self-contained HTML page: words, numbers, tables and pictures in one file.
 
 A page is data: `Page` holds a statement and sections, `page_html` turns it into one file
-that needs nothing else (no script, no font, no picture from anywhere), and every text in it
-is escaped. Any command can make a page of its own result this way.
+that needs nothing else (no font, no picture, no script from anywhere), and every text in it
+is escaped. Its one script is named by its digest, so that no other can run; without scripts the
+pictures stay as they are, and what a reader could move over is left out. Any command can make
+a page of its own result this way.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import json
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import resources
+from itertools import zip_longest
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from amibayes import __version__
 from amibayes.errors import DataError
@@ -26,6 +34,9 @@ Kind = Literal["found", "none", "open"]
 
 MAX_ON_A_TELEPHONE = 4
 """Columns of named rows that fit beside each other on a telephone."""
+
+SCRIPTS = ("pictures.js", "explorer.js")
+"""Files of `templates` that are the page's script: dark pictures, then maps to hover over."""
 
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
@@ -94,6 +105,11 @@ class Figure:
     height: int
     section: str = ""
 
+    @property
+    def aspect(self) -> float:
+        """Width by height."""
+        return self.width / self.height
+
 
 @dataclass(frozen=True)
 class Mark:
@@ -128,7 +144,7 @@ class Sky:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what is under it, in this order."""
+    """A heading and what is under it, in this order; an explorer comes before the tables."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -137,6 +153,13 @@ class Section:
     code: str = ""
     notes: tuple[str, ...] = ()
     figures: tuple[Figure, ...] = ()
+    explorer: Mapping[str, Any] | None = None
+
+    @property
+    def rows(self) -> tuple[tuple[Figure, ...], ...]:
+        """Pictures two by two; a row is as high as both, whose widths go with their shapes."""
+        pairs = zip_longest(self.figures[::2], self.figures[1::2])
+        return tuple(tuple(f for f in pair if f is not None) for pair in pairs)
 
     @property
     def anchor(self) -> str:
@@ -194,13 +217,31 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals["pairs"] = zip
+    environment.filters["embedded"] = _embedded
     return environment
 
 
 def page_html(page: Page) -> str:
     """Turn a page into the text of one HTML file."""
     template = environment().get_template("page.html")
-    return template.render(page=page, version=__version__) + "\n"
+    script = _script()
+    # Only this very text may run: nothing that a file's name brings in is a script.
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    settings = {"version": __version__, "script": Markup(script), "digest": digest}
+    return template.render(page=page, **settings) + "\n"
+
+
+@cache
+def _script() -> str:
+    """Text of the page's script."""
+    parts = resources.files("amibayes.report") / "templates"
+    return "\n".join((parts / name).read_text(encoding="utf-8") for name in SCRIPTS)
+
+
+def _embedded(content: Mapping[str, Any]) -> Markup:
+    """JSON that can stand in a page: nothing in it ends the element that holds it."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    return Markup(text.replace("<", "\\u003c"))
 
 
 def write_page(path: str | Path, page: Page) -> None:

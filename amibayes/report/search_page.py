@@ -35,7 +35,12 @@ COVARIANCE = {
 }
 
 
-def search_page(content: Json, figures: Sequence[Figure] = (), command: str = "") -> Page:
+def search_page(
+    content: Json,
+    figures: Sequence[Figure] = (),
+    command: str = "",
+    explored: Json | None = None,
+) -> Page:
     """Lay a search out so that a referee can follow it.
 
     Parameters
@@ -45,6 +50,8 @@ def search_page(content: Json, figures: Sequence[Figure] = (), command: str = ""
     figures : sequence of Figure
     command : str
         The command line that gives the same result again.
+    explored : dict, optional
+        What a reader can move over, from `amibayes.report.explorer.explorer_data`.
     """
     names = content["data"].get("targets") or [
         Path(i["path"]).name for i in content["inputs"] if i["role"] == "target"
@@ -55,6 +62,7 @@ def search_page(content: Json, figures: Sequence[Figure] = (), command: str = ""
         for name, section in found.items()
         if section is not None
     ]
+    sections[0] = replace(sections[0], explorer=explored)
     return Page(
         "amibayes search",
         ", ".join(names),
@@ -152,7 +160,7 @@ def _data(content: Json) -> Section:
         f"{COVARIANCE[data['covariance']]} ({data['covariance']} covariance)."
     ]
     calibration = content["calibration"]
-    tables = [_inputs(content)]
+    tables = []
     if calibration is None:
         text.append("No calibrators were given: the data were taken as calibrated.")
     else:
@@ -215,19 +223,20 @@ def _calibrators(calibration: Json) -> Table:
 
 
 SECTIONS: dict[str, Callable[[Json], Section | None]] = {
-    "data": _data,
     "search": fit_sections.search,
-    "noise": noise,
     "significance": fit_sections.significance,
     "posterior": fit_sections.posterior,
     "evidence": fit_sections.evidence,
     "models": models_section,
     "limits": fit_sections.limits,
+    "noise": noise,
+    "data": _data,
 }
 """The sections of the report in their order, by the name that `Picture.section` gives.
 
 A function makes a section of the content of ``result.json``, or None where there is nothing
-to show; its pictures are put in afterwards. A new section is one more line.
+to show; its pictures are put in afterwards. The answer comes before what it was made from. A new
+section is one more line.
 """
 
 
@@ -240,6 +249,7 @@ def _again(content: Json, command: str) -> Section:
             "number of workers.",
         ),
         code=command,
+        tables=(_inputs(content),),
         notes=(
             f"amibayes {content['amibayes']}, seed {content['seed']}, field {field(content)}; "
             f"Python {platform.python_version()}, {packages}. Every number of this page is "

@@ -377,7 +377,7 @@ def test_outlier_is_clipped(instrument: Instrument) -> None:
     cals[2] = with_values(cals[2], vis2, cals[2].closure_phase.value, "c2")
     found = calibrate(target, cals, method="weighted", clip=5.0)
     assert [u.n_clipped for u in found.calibrators] == [0, 0, 1, 0]
-    assert found.calibrators[2].reason == "1 of 56 values are outliers among the calibrators"
+    assert found.calibrators[2].reason == "1 of 56 values is an outlier among the calibrators"
     assert found.calibrators[2].kept
     kept = np.mean([c.vis2.value[5] for i, c in enumerate(cals) if i != 2])
     np.testing.assert_allclose(found.observables.vis2.value[5], target.vis2.value[5] / kept)

@@ -51,8 +51,7 @@ from amibayes.support.atomic_files import short_names
 TRUTH = (90.0, 110.0, 0.01)
 UNITS = ("(mas)", "(m)", "(Mλ)", "(°)", "(σ)", "(%)", "(µm)", "(flux ratio)")
 PURE_NUMBERS = (
-    "Local",
-    "Global",
+    "False-alarm probability",
     "V²",
     "σ of V²",
     "Δχ²",

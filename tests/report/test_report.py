@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import base64
 import copy
+import hashlib
 import json
 import math
 import re
-import shutil
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browser import DESKTOP, PHONE, browser, shown
 from helpers import niriss, simulated
 from trial_answers import PLAN, answers
 
@@ -32,6 +33,8 @@ from amibayes.report.statement import statement_of
 from amibayes.report.validation import validation_page, validation_pictures
 from amibayes.report.words import chance, count, measured, plain
 from amibayes.validation.tally import tally
+
+__all__ = ["browser"]
 
 HOSTILE = "<b>bold</b>&\"'<img src=x onerror=alert(1)>.oifits".replace("/", "")
 TRUTH = [110.0, -75.0, 0.02]
@@ -72,7 +75,7 @@ class Reader(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
         self.tags.add(tag)
-        self._silent = tag == "style"
+        self._silent = tag in ("style", "script")
         if values.get("id"):
             self.ids.append(str(values["id"]))
         if tag == "a":
@@ -145,7 +148,8 @@ def test_the_answer_stands_in_words(page: Reader, content) -> None:
 
 def test_the_page_is_whole_and_safe(page: Reader, folder: Path) -> None:
     text = (folder / "report.html").read_text()
-    assert not page.tags & {"b", "script", "iframe", "object", "embed"}
+    assert not page.tags & {"b", "iframe", "object", "embed"}
+    runs_only_its_own_script(text)
     assert not re.search(r"(?:src|href)=\"(?!data:|#)", text)
     assert "url(" not in text
     assert "@import" not in text
@@ -158,6 +162,17 @@ def test_the_page_is_whole_and_safe(page: Reader, folder: Path) -> None:
     )
     assert all(str(i["src"]).startswith("data:image/png;base64,") for i in page.images)
     assert all(i["alt"] and int(str(i["width"])) > 300 for i in page.images)
+
+
+def runs_only_its_own_script(text: str) -> None:
+    """One script, named by its digest in the policy of the page; JSON beside it is never run."""
+    (policy,) = re.findall(r"script-src 'sha256-([^']*)'", text)
+    scripts = re.findall(r"<script( type=\"application/json\")?>(.*?)</script>", text, re.DOTALL)
+    (script,) = [content for is_data, content in scripts if not is_data]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert policy == digest
+    assert "unsafe-eval" not in text
+    assert "http" not in script
 
 
 def test_every_picture_stands_in_a_section_and_is_drawn_by_some_run() -> None:
@@ -260,7 +275,8 @@ def test_any_command_can_make_a_page() -> None:
     page = Page("amibayes validate", "Validation", "", Statement("open", "l", "<b>h</b>"),
                 sections=(Section("A & B", ("<script>",), tables=(table,)),))  # fmt: skip
     reader = Reader(page_html(page))
-    assert not reader.tags & {"i", "u", "b", "script"}
+    assert not reader.tags & {"i", "u", "b"}
+    runs_only_its_own_script(page_html(page))
     assert "a-b" in reader.ids
     assert "Warnings" not in reader.said
     with pytest.raises(ValueError, match="one text for each column"):
@@ -278,42 +294,6 @@ def test_pictures_that_are_none_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("outer", "bar"), [(752.6, 200.0), (1.2, 0.5), (50.0, 20.0), (9.0, 2.0)])
 def test_scale_bar_is_a_round_number(outer: float, bar: float) -> None:
     assert Sky(0.1, outer, (), "").bar_mas == pytest.approx(bar)
-
-
-PHONE, DESKTOP = (390, 844), (1280, 900)
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A headless Chromium; skips where there is none."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    driver = shutil.which("chromedriver")
-    if not chromium or not driver:
-        pytest.skip("no chromium with chromedriver on this machine: pages not seen in a browser")
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for word in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
-        options.add_argument(word)
-    options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('profile')}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driven = webdriver.Chrome(options=options, service=Service(driver))
-    yield driven
-    driven.quit()
-
-
-def shown(browser: Any, path: Path, size: tuple[int, int], scheme: str = "light") -> None:
-    """Open a page on a screen of this size."""
-    browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride",
-        {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size[0] < 500},
-    )
-    scheme_now = [{"name": "prefers-color-scheme", "value": scheme}]
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": scheme_now})
-    browser.get_log("browser")
-    browser.get(path.as_uri())
 
 
 @pytest.mark.parametrize("size", [PHONE, DESKTOP])
@@ -401,8 +381,6 @@ def test_a_link_leads_to_its_section(browser: Any, folder: Path) -> None:
 
 
 def test_it_prints(browser: Any, folder: Path) -> None:
-    import base64
-
     shown(browser, folder / "report.html", DESKTOP)
     pdf = base64.b64decode(browser.execute_cdp_cmd("Page.printToPDF", {})["data"])
     assert pdf.startswith(b"%PDF")
