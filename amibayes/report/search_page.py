@@ -10,9 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from amibayes.plots.pictures import PICTURES
-from amibayes.report import fit_sections
 from amibayes.report.models import models_section
-from amibayes.report.noise_section import noise
 from amibayes.report.page import (
     Column,
     Fact,
@@ -22,6 +20,8 @@ from amibayes.report.page import (
     Table,
     read_figure,
 )
+from amibayes.report.sections import fit as fit_sections
+from amibayes.report.sections.noise import noise
 from amibayes.report.statement import false_alarm, field, sky_of, statement_of
 from amibayes.report.words import chance, count, fixed, measured, plain, sentence
 

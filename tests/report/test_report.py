@@ -26,9 +26,9 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.plots.pictures import PICTURES, Stages, picture_names
 from amibayes.plots.style import save
 from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
-from amibayes.report.joint_sections import RESIDUALS
 from amibayes.report.page import Sky, page_html, read_figure
 from amibayes.report.search_page import SECTIONS
+from amibayes.report.sections.joint import RESIDUALS
 from amibayes.report.statement import statement_of
 from amibayes.report.validation import validation_page, validation_pictures
 from amibayes.report.words import chance, count, measured, plain

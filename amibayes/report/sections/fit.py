@@ -6,8 +6,8 @@ from typing import Any
 
 from amibayes.detection.tails import MIN_PROBABILITY
 from amibayes.models.bands import band_name
-from amibayes.report.joint_sections import joint_tables
 from amibayes.report.page import Column, Fact, Section, Table
+from amibayes.report.sections.joint import joint_tables
 from amibayes.report.statement import false_alarm, field
 from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
 

@@ -1,0 +1,1 @@
+"""Sections of `report.html`, each made of the content of ``result.json``."""
