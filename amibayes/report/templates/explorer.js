@@ -397,7 +397,8 @@
   pickData.onchange = () => { chosen = -1; drawData(); };
 
   const draw = () => { drawMap(); drawData(); };
-  let wide = 0;
+  let wide = root.clientWidth;
+  draw();
   new ResizeObserver(() => { if (root.clientWidth !== wide) { wide = root.clientWidth; draw(); } }).observe(root);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 })();
