@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -25,11 +25,14 @@ if TYPE_CHECKING:
 
 NOT_OF_A_ROW = {
     "--batch", "--cal", "--debug", "--help", "--json", "--out", "--overwrite", "--quiet",
-    "--resume", "--scheduler", "--verbose", "--workers",
+    "--cal-pool", "--resume", "--scheduler", "--verbose", "--workers",
 }  # fmt: skip
 """Options of the whole run, which no row can set for itself."""
 
 SOME_FAILED = 4
+
+CALIBRATORS_OF_POOL = 4
+"""Three tell their scatter, and one more may be dropped."""
 
 WRITE_EVERY_S, WRITE_SHARE = 20.0, 0.02
 """While targets are done the survey's table is written this often, and in at most this share of
@@ -49,6 +52,19 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--cal", nargs="+", default=[], metavar="CAL", help="calibrators, any order"
+    )
+    parser.add_argument(
+        "--cal-pool",
+        metavar="TABLE",
+        help="with --batch: choose calibrators for rows without cal out of a table of them, those "
+        "nearest in date (mjd), magnitude and spectral_type",
+    )
+    parser.add_argument(
+        "--cal-number",
+        type=common.positive_integer,
+        default=CALIBRATORS_OF_POOL,
+        metavar="N",
+        help="how many are chosen out of the pool (default: %(default)s)",
     )
 
 
@@ -71,7 +87,7 @@ def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -
 
 
 def refuse_none(arguments: argparse.Namespace) -> None:
-    """Refuse a command without targets.
+    """Refuse a command without targets, and a pool without a table.
 
     Raises
     ------
@@ -79,6 +95,8 @@ def refuse_none(arguments: argparse.Namespace) -> None:
     """
     if not arguments.targets:
         raise UsageError("no target given", remedy="name at least one file, or --batch TABLE")
+    if arguments.cal_pool is not None and not getattr(arguments, "in_batch", False):
+        raise UsageError("needs a table of targets", source="--cal-pool", remedy="give --batch")
 
 
 @dataclass(frozen=True)
@@ -89,6 +107,27 @@ class Job:
     arguments: argparse.Namespace | None
     error: str = ""
     facts: Mapping[str, Any] = field(default_factory=dict)
+    chosen: str = ""
+
+    def with_calibrators(self) -> Job:
+        """Choose calibrators out of the pool, where the row has none of its own.
+
+        Raises
+        ------
+        DataError
+        """
+        own = self.arguments
+        if own is None or own.cal_pool is None or own.cal:
+            return self
+        from amibayes.pipeline.calibrator_pool import nearest, read_pool, star_of
+
+        target = star_of(own.targets, dict(self.facts))
+        found = nearest(read_pool(own.cal_pool), target, own.cal_number)
+        changed = copy.copy(own)
+        changed.cal = [file for chosen in found for file in chosen.star.files]
+        place = 1 + len(own.targets)
+        changed.words = [*own.words[:place], "--cal", *changed.cal, *own.words[place:]]
+        return replace(self, arguments=changed, chosen="; ".join(c.words() for c in found))
 
     @property
     def command(self) -> Any:
@@ -319,17 +358,21 @@ def _one(job: Job) -> Outcome:
     from amibayes.support.request import answers, read_answer
     from amibayes.survey.rows import Outcome, detection_of, row_of
 
+    try:
+        job = job.with_calibrators()
+    except AmibayesError as error:
+        return Outcome(job.name, "failed", error.command_line, facts=job.facts)
     if job.arguments is None:
         return Outcome(job.name, "failed", job.error, facts=job.facts)
     key = job.request()
     content = answers(job.result, key) if job.arguments.resume else None
     if content is None:
-        error = _performed(job)
-        if error:
-            return Outcome(job.name, "failed", error, key, facts=job.facts)
+        fault = _performed(job)
+        if fault:
+            return Outcome(job.name, "failed", fault, key, facts=job.facts, chosen=job.chosen)
         content = read_answer(job.result) or {}
     row, detection = row_of(content), detection_of(content)
-    return Outcome(job.name, "done", "", key, row, job.facts, detection)
+    return Outcome(job.name, "done", "", key, row, job.facts, detection, job.chosen)
 
 
 def _performed(job: Job) -> str:

@@ -181,7 +181,8 @@ def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executo
 
 
 OF_THE_RUN = {
-    "--out": 1, "--batch": 1, "--workers": 1, "--scheduler": 1, "--overwrite": 0, "--resume": 0,
+    "--out": 1, "--batch": 1, "--cal-pool": 1, "--cal-number": 1, "--workers": 1, "--scheduler": 1,
+    "--overwrite": 0, "--resume": 0,
     "--json": 0, "--quiet": 0, "--verbose": 0, "--debug": 0, "--no-pictures": 0,
 }  # fmt: skip
 """Options that leave the numbers of a result alone, and how many words follow each."""

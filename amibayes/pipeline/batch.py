@@ -16,8 +16,8 @@ from amibayes.errors import DataError
 
 FILES, CALIBRATORS, NAME = "target", "cal", "name"
 
-FACTS = ("distance_pc", "primary_magnitude", "mass_table")
-"""Columns of what is known of a star, which the survey's statistics use."""
+FACTS = ("distance_pc", "primary_magnitude", "mass_table", "mjd", "magnitude", "spectral_type")
+"""Columns of what is known of a star, for the survey's statistics and the choice of calibrators."""
 
 Value = str | bool | int | float
 
@@ -54,7 +54,7 @@ class SurveyTarget:
             Where a distance or magnitude is no number.
         """
         found = {name: self.options[name] for name in FACTS if name in self.options}
-        for name in ("distance_pc", "primary_magnitude"):
+        for name in ("distance_pc", "primary_magnitude", "mjd", "magnitude"):
             if name in found:
                 found[name] = self._number(name, found[name])
         if "mass_table" in found and (self.beside / str(found["mass_table"])).is_file():

@@ -40,7 +40,12 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 TOGETHER = ("false_discovery_rate", "survey_wide_false_alarm")
 """Columns that depend on the other targets, after the false-alarm probability."""
 
-FACTS = {"distance_pc": "pc", "primary_magnitude": "mag"}
+FACTS = {
+    "distance_pc": "pc",
+    "primary_magnitude": "mag",
+    "magnitude": "mag",
+    "spectral_type": "",
+}
 """Columns of the survey's table that are known of a star, and their units."""
 
 UNITS = (
@@ -50,7 +55,7 @@ UNITS = (
         "limit_delta_mag_best": "mag",
         "limit_delta_mag_worst": "mag",
     }
-    | FACTS
+    | {name: unit for name, unit in FACTS.items() if unit}
 )
 
 CURVE = (
@@ -87,6 +92,8 @@ class Outcome:
         ``mass_table``.
     detection : DetectionProbability, optional
         Where limits by injection were measured.
+    chosen : str
+        Calibrators that were chosen from a pool, and how near they are.
     """
 
     name: str
@@ -96,12 +103,14 @@ class Outcome:
     row: Json = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
     detection: DetectionProbability | None = None
+    chosen: str = ""
 
     def entry(self) -> Json:
         """Give its entry in ``survey.json``."""
         head: Json = {"name": self.name, "status": self.status, "error": self.error or None}
         facts = {name: self.facts[name] for name in FACTS if name in self.facts}
-        return head | {"key": self.key} | facts | self.row
+        chosen = {"chosen_calibrators": self.chosen} if self.chosen else {}
+        return head | {"key": self.key} | facts | chosen | self.row
 
 
 def row_of(content: Json) -> Json:
@@ -196,7 +205,7 @@ def _limit_numbers(content: Json) -> Json:
 def table_of(entries: Sequence[Json], meta: Json) -> Table:
     """Lay entries out as a table; what a target lacks is masked."""
     found = {key for entry in entries for key in entry}
-    names = ["name", "status", "error", *FACTS]
+    names = ["name", "status", "error", *FACTS, "chosen_calibrators"]
     for name, _, _ in COLUMNS:
         names += [name, *(TOGETHER if name == "false_alarm_probability" else ())]
     names += [name for name in UNITS if name.startswith("limit")]
