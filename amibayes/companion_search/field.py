@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.grid import Grid, make_grid
+from amibayes.companion_search.modes import innermost_first
 from amibayes.companion_search.optimise import fit_single, refine_at
-from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.result import RIVAL, SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.extra_noise import NoisePrior, with_noise
@@ -20,6 +21,9 @@ from amibayes.units import MAS, FloatArray
 
 SURELY_NOT_NOISE = 30.0
 """Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
+
+SURELY_ONE_PLACE = 1000.0
+"""Δχ² with which another place that fits to within 9 predicts the same data to 1 %: an alias."""
 
 MAX_LOOKED_AT = 40_000
 """Positions of the look around the field."""
@@ -69,22 +73,66 @@ def look_inside(result: SearchResult) -> float | None:
     within = make_grid(nearest, inner, step)
     if not len(within):
         return None
-    gain, place = _best_on(within, result)
+    bank = _bank(within, result)
+    place, gain = _best_of(bank, result)
     # A peak falls between the positions of either grid, which costs it up to 5 %.
     as_good = 0.95 * float(result.bank_gain.max()) - MODE_LIMIT
-    return place if gain >= max(as_good, SURELY_NOT_NOISE) else None
+    return float(np.hypot(*place)) if gain >= max(as_good, SURELY_NOT_NOISE) else None
 
 
-def _best_on(grid: Grid, result: SearchResult) -> tuple[float, float]:
-    """Largest gain in χ² at the positions of a grid, and the separation where it is, mas."""
-    likelihood = result.likelihood
+def look_outside(result: SearchResult) -> float | None:
+    """Find where farther out than the field a companion would fit as well.
+
+    As far as the channels allow, within `MAX_LOOKED_AT` and `MAX_WORK`. An alias of
+    what was found is left out: it fits as well by the geometry alone.
+
+    Returns
+    -------
+    float or None
+        Its separation in mas; None where nothing outside is as good.
+    """
+    likelihood, outer = result.likelihood, result.grid.outer_mas
+    fringe = resolution_mas(likelihood)
+    step = fringe / COARSE_STEPS_PER_FRINGE
+    positions = min(MAX_LOOKED_AT, MAX_WORK / (len(likelihood.samples) + WORK_PER_POSITION))
+    reach = np.hypot(outer, step * np.sqrt(positions / np.pi))
+    beyond = make_grid(outer, float(min(outermost(likelihood), reach)), step)
+    if not SURELY_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE or not len(beyond):
+        return None
+    bank = _bank(beyond, result)
+    place, gain = _best_of(bank, result)
+    # Half a step of this grid beside a peak costs it up to 20 %.
+    if gain < 0.8 * float(result.bank_gain.max()) - RIVAL:
+        return None
+    tail = bank.matched_filter(_residuals(result))(place)[0]
+    box, single = Box(outer, np.inf, fringe), result.single_theta
+    alone = float(likelihood.deviance(np.array([result.chi2_single]))[0])
+    found = refine_at(likelihood, place, tail, single, box, alone)
+    best = result.modes[0]
+    modes = sorted((best, found), key=lambda m: -m.delta_chi2)
+    aliases = innermost_first(likelihood, modes, single, fringe)[1]
+    if aliases or found.delta_chi2 < best.delta_chi2 - RIVAL:
+        return None
+    return found.companion.separation_mas
+
+
+def _residuals(result: SearchResult) -> FloatArray:
+    """Whitened residuals of the star alone, (n_data,)."""
+    return single_likelihood(result.likelihood).residuals(result.single_theta)[:, 0]
+
+
+def _bank(grid: Grid, result: SearchResult) -> TemplateBank:
     # A moving companion is looked for at rest there: a first look has no time for more.
+    likelihood = result.likelihood
     still = likelihood.with_model(replace(likelihood.model, fastest_mas_yr=0.0))
-    bank = TemplateBank(still, grid, result.single_theta)
-    residuals = single_likelihood(likelihood).residuals(result.single_theta)[:, 0]
-    gain = bank.survey(residuals).gain
+    return TemplateBank(still, grid, result.single_theta)
+
+
+def _best_of(bank: TemplateBank, result: SearchResult) -> tuple[FloatArray, float]:
+    """Place (2,), mas, of the largest gain in χ² of a bank, and the gain."""
+    gain = bank.survey(_residuals(result)).gain
     best = int(gain.argmax())
-    return float(gain[best]), float(np.hypot(grid.east_mas[best], grid.north_mas[best]))
+    return np.array([bank.grid.east_mas[best], bank.grid.north_mas[best]]), float(gain[best])
 
 
 def resolves_stars(likelihood: Likelihood) -> bool:

@@ -63,9 +63,12 @@ SHAPE_START, LARGE_DISC = 0.4, 1.3
 and a disc beyond its first null is another minimum."""
 
 
-STAR_STARTS = (0.0, 0.15, 0.5)
-"""Limb darkening and background, as parts of their ranges, at which fits of a star's diameter
-begin: with more of them, the diameters of the minima are others."""
+STAR_STARTS, STAR_FITS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5), 3
+"""Limb darkening and background, as parts of their ranges, at which diameters are tried (with more
+of them, the diameters of the minima are others), and how many of the best are fitted to the end."""
+
+POOR, SIMPLEX_EVALUATIONS = 2.0, 400
+"""χ² per datum of a star alone from which it is fitted without gradients too, and how often."""
 
 FINEST_STEP = 0.0025
 """Scale of a star's parameters in their fit, as a part of their ranges."""
@@ -84,13 +87,19 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
     scale = np.maximum(lower + FINEST_STEP * width, 1e-6)
     objective = _objective(without, scale)
     disc = np.array([name == "diameter_mas" for name in without.parameters.names])
-    fits = []
-    for rest in STAR_STARTS if disc.any() and not disc.all() else STAR_STARTS[:1]:
+    several = disc.any() and not disc.all()
+    starts = []
+    for rest in STAR_STARTS if several else STAR_STARTS[:1]:
         # A disc has lobes: a fit starts from the best of a ladder of diameters.
         part = np.where(disc | ~disc.any(), np.linspace(0.0, 1.0, 201)[:, None] ** 2, rest)
         ladder = lower + part * width
-        start = ladder[np.argmin(without.chi2(ladder))]
-        fits.append(_minimise(objective, start, scale, bounds))
+        chi2 = without.chi2(ladder)
+        starts.append((float(chi2.min()), ladder[np.argmin(chi2)]))
+    starts = sorted(starts, key=lambda start: start[0])[:STAR_FITS]
+    fits = [_minimise(objective, start, scale, bounds) for _, start in starts]
+    least = min(fits, key=lambda fit: fit[1])[0]
+    if several and without.chi2(least[None])[0] > POOR * likelihood.n_independent:
+        fits += [_across_walls(objective, theta, scale, bounds) for theta, _ in fits]
     if known is not None:
         fits.append(_minimise(objective, known, scale, bounds))
     if likelihood.model.surroundings:
@@ -100,6 +109,25 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
         best = np.argsort(without.chi2(spread), kind="stable")[:BEST_STARTS]
         fits += [_minimise(objective, spread[k], scale, bounds) for k in best]
     return min(fits, key=lambda fit: fit[1])
+
+
+def _across_walls(
+    objective: Objective, start: FloatArray, scale: FloatArray, bounds: FloatArray
+) -> tuple[FloatArray, float]:
+    """Minimise without gradients, (θ, deviance).
+
+    Where a baseline is at a null of the star its closure phases turn by 180° at once: χ² has
+    walls there, at which a fit by gradients ends.
+    """
+    optimiser = nlopt.opt(nlopt.LN_SBPLX, len(start))
+    optimiser.set_lower_bounds(bounds[:, 0] / scale)
+    optimiser.set_upper_bounds(bounds[:, 1] / scale)
+    optimiser.set_min_objective(objective)
+    optimiser.set_initial_step(np.maximum(0.02 * start / scale, 0.1))
+    optimiser.set_ftol_rel(1e-6)
+    optimiser.set_maxeval(SIMPLEX_EVALUATIONS)
+    found = optimiser.optimize(np.clip(start / scale, *(bounds.T / scale)))
+    return found * scale, float(optimiser.last_optimum_value())
 
 
 def starting_points(

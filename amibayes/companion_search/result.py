@@ -28,6 +28,9 @@ from amibayes.units import (
     separation,
 )
 
+RIVAL = 9.0
+"""Δχ² within which another position is a rival: three standard deviations."""
+
 
 @checks_arguments
 @dataclass(frozen=True)
@@ -203,6 +206,12 @@ class SearchResult:
     robustness: Robustness | None = None
     joint_gain: FloatArray | None = None
     aliases: tuple[Mode, ...] = ()
+
+    @property
+    def rivals(self) -> tuple[Mode, ...]:
+        """Other positions, no aliases of the first mode, that fit nearly as well as it."""
+        others = [m for m in self.modes[1:] if m not in self.aliases]
+        return tuple(m for m in others if m.delta_chi2 > self.modes[0].delta_chi2 - RIVAL)
 
     @property
     def delta_chi2(self) -> float:

@@ -8,11 +8,11 @@ import numpy as np
 
 from amibayes.companion_search.field import default_separation, resolution_mas
 from amibayes.companion_search.grid import Grid, make_grid
+from amibayes.companion_search.modes import distinct_modes, innermost_first
 from amibayes.companion_search.optimise import fit_single, global_check
-from amibayes.companion_search.result import Mode, SearchResult, companions_of, is_opposite
+from amibayes.companion_search.result import RIVAL, Mode, SearchResult, companions_of, is_opposite
 from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.seeds import (
-    MODE_LIMIT,
     NOT_FAINT,
     bright_seeds,
     coarse_likelihood,
@@ -89,7 +89,7 @@ def search(
     found = _fits(likelihood, grid, survey, single, box, deviance_single, known)
     check = _checked(likelihood, bank, box, single, deviance_single)
     every = distinct_modes([*found, check], box.fringe_mas)
-    modes, aliases = innermost_first(likelihood, every, single)
+    modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
     theta = np.array(modes[0].theta)
     covariance = _errors(likelihood, theta)
     return SearchResult(
@@ -230,53 +230,6 @@ def _is_new(likelihood: Likelihood, nuisance: FloatArray, tried: list[FloatArray
     return True
 
 
-def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]:
-    """Modes within `MODE_LIMIT` of the best, each at least λ/4B from a better one."""
-    kept: list[Mode] = []
-    for mode in sorted(modes, key=lambda m: -m.delta_chi2):
-        near = [np.hypot(*np.subtract(mode.place, k.place)) < 0.25 * fringe_mas for k in kept]
-        if not any(near) and (not kept or mode.delta_chi2 > kept[0].delta_chi2 - MODE_LIMIT):
-            kept.append(mode)
-    return tuple(kept)
-
-
-AS_GOOD = 1.0
-"""Δχ² within which one of two positions does not fit better: one standard deviation."""
-
-
-def innermost_first(
-    likelihood: Likelihood, modes: Sequence[Mode], single: FloatArray
-) -> tuple[tuple[Mode, ...], tuple[Mode, ...]]:
-    """Put the innermost of the positions that the data cannot tell from the best one first.
-
-    A mask on a regular lattice (NIRISS) repeats itself on the sky: far positions predict
-    the same data as near ones but for the width of the band. Two modes are aliases where
-    their predictions differ by less than 3σ over all data, and by less than half of the
-    signal itself, and neither fits notably better, though they are more than λ/B_max apart.
-
-    Returns
-    -------
-    modes : tuple of Mode
-    aliases : tuple of Mode
-        Those that fit as well as the first one.
-    """
-    thetas = np.array([m.theta for m in modes])
-    data = likelihood.noise.whiten(likelihood.predict(thetas))
-    none = single_likelihood(likelihood).predict(np.atleast_2d(single))
-    signal = data - likelihood.noise.whiten(none)
-    apart = ((signal - signal[:, :1]) ** 2).sum(axis=0)
-    alike = apart < np.minimum(9.0, 0.25 * (signal[:, 0] ** 2).sum())
-    alike &= np.array([m.delta_chi2 for m in modes]) > modes[0].delta_chi2 - AS_GOOD
-    places = thetas[:, likelihood.parameters.place()]
-    distance = np.hypot(*(places - places[0]).T)
-    alike &= distance > resolution_mas(likelihood)
-    alike[0] = True
-    group = [m for m, same in zip(modes, alike, strict=True) if same]
-    first = min(group, key=lambda m: m.companion.separation_mas)
-    rest = [m for m in modes if m is not first]
-    return (first, *rest), tuple(m for m in group if m is not first)
-
-
 def _warnings(
     modes: Sequence[Mode], aliases: Sequence[Mode], found: Sequence[Mode], check: Mode
 ) -> tuple[str, ...]:
@@ -287,7 +240,7 @@ def _warnings(
             f"the global optimiser found a better solution than the grid "
             f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
         )
-    if aliases:
+    if aliases and modes[0].delta_chi2 > RIVAL:
         here = np.array(modes[0].place)
         opposite = [m for m in aliases if is_opposite(m, here)]
         repeated = [m for m in aliases if m not in opposite]
@@ -300,8 +253,4 @@ def _warnings(
                 f"beyond {ends:.0f} mas the sky repeats itself for these baselines: "
                 f"{', '.join(far)} mas would fit as well; the innermost is reported"
             )
-    rivals = [m for m in modes[1:] if m not in aliases and m.delta_chi2 > modes[0].delta_chi2 - 9]
-    if rivals:
-        others = "position fits" if len(rivals) == 1 else "positions fit"
-        warnings.append(f"{len(rivals)} other {others} within Δχ² 9: it is not unique")
     return tuple(warnings)

@@ -18,6 +18,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
+from amibayes.detection.statistic import pieces_of
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
@@ -196,14 +197,16 @@ def compare(
     each = own or [_selected(data, model, mask) for mask in masks]
     made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
     ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
-    noise = likelihood.noise.draw(simulations, rng)
-    for one, mask in zip(own or (), masks, strict=False):
-        noise[mask] = one.noise.draw(simulations, rng)
-    drawn, by_noise = _apart(made, noise)
-    # What a part cannot explain by itself is no excuse for going apart, once its noise is known.
-    above = (by_noise >= gain[0]) if own else (drawn >= ratio[0])
-    p = (1 + int(above.sum())) / (1 + simulations)
-    return Consistency(split, tuple(parts), float(gain[0]), p)
+    above = 0
+    for n in pieces_of(simulations, len(data.data)):
+        noise = likelihood.noise.draw(n, rng)
+        for one, mask in zip(own or (), masks, strict=False):
+            noise[mask] = one.noise.draw(n, rng)
+        drawn, by_noise = _apart(made, noise)
+        # What a part cannot explain by itself is no excuse for going apart, once its noise is
+        # known.
+        above += int(((by_noise >= gain[0]) if own else (drawn >= ratio[0])).sum())
+    return Consistency(split, tuple(parts), float(gain[0]), (1 + above) / (1 + simulations))
 
 
 def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,12 +9,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
+from amibayes.data.covariance import Covariance
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.statistic import BankStatistic
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.residuals import files_of
+from amibayes.units import FloatArray, IntArray
 
 Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
 
@@ -57,6 +59,7 @@ def verdict(
     splits: Sequence[Consistency],
     *,
     structured: bool = True,
+    shape: float = 0.0,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -73,6 +76,8 @@ def verdict(
     structured : bool
         Whether that structure is more than what the calibration of the instrument may leave: see
         `within_calibration`. Structure that is not does not speak against the model.
+    shape : float
+        Of `fit_probability`: `SHAPE` where noise was fitted.
 
     Notes
     -----
@@ -81,7 +86,7 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    fit = fit_probability(result)
+    fit = fit_probability(result, shape=shape)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     for split in apart:
@@ -98,8 +103,16 @@ def verdict(
     return Verdict("no companion", _nothing(tested) + left, p_model)
 
 
-def fit_probability(result: SearchResult) -> float:
+SHAPE = 0.1
+"""Relative error of a χ² by extra noise, which is fitted with one size for all data of a kind: real
+noise differs between baselines and channels. It matters from some hundred data on."""
+
+
+def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
     """Probability of a χ² as large as that of the best fit, with the noise that was fitted.
+
+    A ``shape`` is the standard deviation of ln χ² by noise of another shape: the probability is
+    the mean over it.
 
     Noise is fitted to each kind of observable of each file where its χ² asks for it: their
     probabilities count, the smallest times their number. That of all data together would refuse
@@ -108,15 +121,30 @@ def fit_probability(result: SearchResult) -> float:
     likelihood = result.likelihood
     difference = likelihood.difference(np.atleast_2d(result.theta))[:, 0]
     covariance, share = likelihood.noise.covariance, result.ndof / likelihood.n_independent
+    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
+    factors, weights = np.exp(shape * nodes), weights / weights.sum()
     masks = [f.of_kind(kind) for f in files_of(likelihood.observables) for kind in ("vis2", "cp")]
     found = []
     for at in (np.flatnonzero(mask) for mask in masks):
         if not len(at):
             continue
-        part = covariance.select(at)
-        chi2 = float((part.whiten(difference[at]) ** 2).sum())
-        found.append(chi2_survival(chi2, share * part.rank, likelihood.degrees))
+        chi2, rank = _chi2_of(covariance, at, difference)
+        each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
+        found.append(float(weights @ each))
     return min(1.0, len(found) * min(found))
+
+
+def _chi2_of(covariance: Covariance, at: IntArray, difference: FloatArray) -> tuple[float, int]:
+    """χ² of the data ``at`` some places, and the number of independent ones among them."""
+    outside = np.ones(covariance.size)
+    outside[at] = 0.0
+    size = abs(covariance.whitening)
+    inside, beyond = size @ (1.0 - outside) > 0.0, size @ outside > 0.0
+    if not (inside & beyond).any():
+        # No error is shared with other data: their part of the whitened data is all of it.
+        return float((covariance.whiten(difference)[inside] ** 2).sum()), int(inside.sum())
+    part = covariance.select(at)
+    return float((part.whiten(difference[at]) ** 2).sum()), part.rank
 
 
 def within_calibration(test: BankStatistic) -> bool:

@@ -26,14 +26,10 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 
-from amibayes.data.blocks import orthonormal
-from amibayes.data.covariance import (
-    BlockCovariance,
-    Covariance,
-    DiagonalCovariance,
-    dense_covariance,
-)
+from amibayes.data.blocks import Block, BlockCovariance, orthonormal
+from amibayes.data.covariance import Covariance, DiagonalCovariance
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
@@ -144,8 +140,19 @@ class ChannelCovariance:
 
     def select(self, keep: IntArray) -> Covariance:
         """Covariance of the entries ``keep``, in that order."""
-        colour = csr_array(self._colouring)[keep].toarray()
-        return dense_covariance(colour @ colour.T, orthonormal(colour))
+        colour = csr_array(csr_array(self._colouring)[keep])
+        shared = csr_array(abs(colour) @ abs(colour).T)
+        count, label = connected_components(shared, directed=False)
+        order = np.argsort(label, kind="stable")
+        blocks = np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1])
+        return BlockCovariance(len(keep), [_block(colour, at) for at in blocks])
+
+
+def _block(colouring: csr_array, at: IntArray) -> Block:
+    """The entries ``at`` of a covariance A Aᵀ that share no noise with the others."""
+    rows = csr_array(colouring[at])
+    dense = csr_array(rows[:, np.unique(rows.indices)]).toarray()
+    return Block(at, dense @ dense.T, orthonormal(dense))
 
 
 def _colouring(covariance: Covariance) -> Any:

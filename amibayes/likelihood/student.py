@@ -16,13 +16,8 @@ from functools import cache, cached_property
 import numpy as np
 from scipy.sparse import csr_array, eye_array
 
-from amibayes.data.covariance import (
-    Block,
-    BlockCovariance,
-    Covariance,
-    DiagonalCovariance,
-    as_blocks,
-)
+from amibayes.data.blocks import Block, BlockCovariance, Stack
+from amibayes.data.covariance import Covariance, DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.likelihood.noise import FittedNoise, GaussianNoise
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -110,23 +105,27 @@ def symmetric_whitening(observables: Observables) -> SymmetricWhitening:
         return SymmetricWhitening(
             csr_array(eye_array(covariance.size)), np.ones(covariance.size), vis2
         )
-    white = covariance.whitening
-    parts = [_symmetric(white, b) for b in as_blocks(covariance)]
-    rows = np.concatenate([np.repeat(b, len(w)) for b, w, _ in parts])
-    columns = np.concatenate([np.tile(w, len(b)) for b, w, _ in parts])
-    values = np.concatenate([q.ravel() for _, _, q in parts])
-    frame = csr_array((values, (rows, columns)), shape=(covariance.size, covariance.rank))
+    stacks = covariance.stacks if isinstance(covariance, BlockCovariance) else ()
+    values, rows, columns, first = list[FloatArray](), list[IntArray](), list[IntArray](), 0
+    for stack in stacks:
+        turned = _symmetric(stack)
+        g, _, r = turned.shape
+        white = first + np.arange(g * r).reshape(g, 1, r)
+        rows.append(np.broadcast_to(stack.index[:, :, None], turned.shape).ravel())
+        columns.append(np.broadcast_to(white, turned.shape).ravel())
+        values.append(turned.ravel())
+        first += g * r
+    where = np.concatenate(rows), np.concatenate(columns)
+    frame = csr_array((np.concatenate(values), where), shape=(covariance.size, covariance.rank))
     return SymmetricWhitening(frame, np.asarray((frame**2).sum(axis=1)).ravel(), vis2)
 
 
-def _symmetric(whitening: csr_array, block: Block) -> tuple[IntArray, IntArray, FloatArray]:
-    """Data, whitened rows, and Q = A (AᵀA)^{-1/2} of a block, A the standardised colouring."""
-    part = whitening[:, block.index]
-    used = np.flatnonzero(np.diff(part.indptr))
-    colour = block.matrix @ part[used].toarray().T
-    standard = colour / np.sqrt(np.diag(block.matrix))[:, None]
-    left, _, right = np.linalg.svd(standard, full_matrices=False)
-    return block.index, used, left @ right
+def _symmetric(stack: Stack) -> FloatArray:
+    """Q = A (AᵀA)^{-1/2} of every block, (g, m, r), A its standardised colouring."""
+    _, colouring = stack.factors()
+    errors = np.sqrt(np.einsum("gmm->gm", stack.matrix))
+    left, _, right = np.linalg.svd(colouring / errors[:, :, None], full_matrices=False)
+    return np.asarray(left @ right)
 
 
 @dataclass(frozen=True, eq=False)

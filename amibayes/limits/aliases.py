@@ -28,7 +28,7 @@ def ambiguous(nearer: FloatArray, gain: FloatArray) -> BoolArray:
         From `nearer_alias`.
     gain : (n,) float array
         In χ². Fits that differ by less than 9 over all the data are alike to
-        `amibayes.companion_search.search.innermost_first`, and so are any whose difference is less
+        `amibayes.companion_search.modes.innermost_first`, and so are any whose difference is less
         than half of the signal.
     """
     alike = np.minimum(1.0 - ALIKE, 9.0 / np.maximum(gain, 1e-30))

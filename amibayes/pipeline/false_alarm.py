@@ -12,7 +12,7 @@ from amibayes.detection.consistency import Consistency, consistency
 from amibayes.detection.false_alarm import Significance, draws_needed, significance
 from amibayes.detection.randomised import Randomised, randomised
 from amibayes.detection.statistic import BankStatistic, statistic_of
-from amibayes.detection.verdict import Verdict, verdict, within_calibration
+from amibayes.detection.verdict import SHAPE, Verdict, verdict, within_calibration
 from amibayes.detection.whiteness import correlated
 from amibayes.parallel import Executor, Journal, Progress, spawn
 from amibayes.pipeline.field import noise_prior
@@ -142,4 +142,5 @@ def verdict_of(
     test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
     rest = structure(test, options, rng, executor)
     structured = rest.probability > options.alpha or not within_calibration(test)
-    return verdict(result, tested, rest, splits, structured=structured), splits
+    shape = SHAPE if options.extra_noise else 0.0
+    return verdict(result, tested, rest, splits, structured=structured, shape=shape), splits

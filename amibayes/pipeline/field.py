@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.companion_search.field import (
+    MARGIN,
     SURELY_NOT_NOISE,
     choose_field,
     look_inside,
+    look_outside,
     notices_disc,
     resolution_mas,
 )
@@ -78,9 +80,20 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     if options.companion_diameter is None and shows_disc(likelihood, first):
         first = _search_for_disc(likelihood, first)
     result, noise = _searched(first, options)
-    if options.separation_mas:
-        warnings = _beyond(result)
+    warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings))
+
+
+def _rival_outside(result: SearchResult) -> list[str]:
+    """Warn where a companion outside the default field fits as well."""
+    place = look_outside(result)
+    if place is None:
+        return []
+    wider = f"{result.grid.inner_mas:.3g}:{MARGIN * place:.3g}"
+    return [
+        f"outside the field, near {place:.1f} mas, a companion fits as well: the position is not "
+        f"certain (--separation {wider} searches there too)"
+    ]
 
 
 def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihood, SearchResult]:

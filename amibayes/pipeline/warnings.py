@@ -93,8 +93,10 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
     which = "the errors, with the noise that was added," if noise.any else "the stated errors"
+    if noise.floors:
+        which = "the errors, with the calibration errors of the instrument,"
     return [
-        f"{which} are far too large: chi2 is {result.chi2_binary:.2g} for {result.ndof} degrees "
+        f"{which} are far too large: chi2 is {result.chi2_binary:.0f} for {result.ndof} degrees "
         "of freedom with the companion; CANDID's n_sigma, a ratio of two such chi2, means nothing"
     ]
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from amibayes.companion_search.result import RIVAL, SearchResult
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.tails import MIN_PROBABILITY
 from amibayes.limits.limit import DetectionLimit
@@ -77,11 +78,25 @@ def _best_fit(report: SearchReport) -> list[str]:
         return [row("best fit", "no companion improves the fit"), contrast]
     places = max(0, places_of(c.separation_error_mas)) if c.separation_error_mas > 0.0 else 2
     angle = with_error(c.position_angle_deg, c.position_angle_error_deg, " deg", LARGEST_ANGLE_DEG)
-    place = (
+    tested = report.significance
+    # What noise alone gives has many places: that says nothing.
+    rivals = "" if tested is not None and tested.detected is False else _rivals(report.result)
+    place = rivals + (
         f"{with_error(c.separation_mas, c.separation_error_mas, ' mas', c.separation_mas)}, "
         f"PA {angle} (E {c.east_mas:.{places}f}, N {c.north_mas:.{places}f} mas)"
     )
     return [row("best fit", place), contrast]
+
+
+def _rivals(result: SearchResult) -> str:
+    """Where else a companion fits nearly as well: the errors of one position are not all."""
+    places = [m.companion.separation_mas for m in (result.modes[0], *result.rivals)]
+    if len(places) == 1:
+        return ""
+    return (
+        f"not unique, {len(places)} positions at {min(places):.3g} to {max(places):.3g} mas "
+        f"within Δχ² {RIVAL:.0f} (result.json, modes); the best: "
+    )
 
 
 def with_error(value: float, error: float, unit: str = "", largest: float = np.inf) -> str:

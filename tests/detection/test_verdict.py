@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 from helpers import niriss
 from scipy.special import j0, j1
+from scipy.stats import chi2
 
+from amibayes.companion_search.search import search
 from amibayes.data.observables import Measurements, Observables, join
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.statistic import statistic_of
-from amibayes.detection.verdict import Verdict, within_calibration
+from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, within_calibration
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
 from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
@@ -154,6 +158,26 @@ def test_structure_counts_where_it_exceeds_the_calibration_errors_of_the_table(
     test = statistic_of(search_field(data, OPTIONS).result, beside=True)
     assert within_calibration(test) is within
     assert test.strongest[0, 2] < 2.0 * second or second < 0.01
+
+
+@pytest.mark.parametrize(
+    ("excess", "low", "high"), [(1.0, 0.2, 1.0), (1.1, 0.05, 0.4), (1.6, 0.0, 1e-3)]
+)
+def test_noise_of_another_shape_may_change_chi2_by_a_tenth(
+    excess: float, low: float, high: float
+) -> None:
+    """4200 V²: a χ² too large by 10 % is 4.6 standard deviations, and no noise is known so well."""
+    one = niriss().only(("vis2",))
+    small = search(Likelihood(one, BinaryModel()), (100.0, 120.0))
+    data = join([one] * 200)
+    z = np.random.default_rng(5).standard_normal(len(data.vis2))
+    z *= np.sqrt(excess * len(z)) / np.linalg.norm(z)
+    noisy = replace(data.vis2, value=1.0 + z * np.sqrt(data.covariance.variance))
+    likelihood = Likelihood(replace(data, vis2=noisy), BinaryModel())
+    result = replace(small, likelihood=likelihood, theta=np.zeros(3), ndof=len(z))
+    assert low <= fit_probability(result, shape=SHAPE) <= high
+    exact = chi2.sf(excess * len(z), len(z))
+    assert fit_probability(result) == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.release

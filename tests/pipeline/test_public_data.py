@@ -12,6 +12,8 @@ from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions
 
 
 def searched(
@@ -52,6 +54,15 @@ def test_ax_cir_without_smearing_and_with_closures_alone(data: Path) -> None:
     closures = searched(path, BinaryModel(), (0.6, 50.0), ("cp",), "diagonal")
     assert closures.companion.separation_mas == pytest.approx(6.5, abs=0.1)
     assert len(closures.modes) > 1
+
+
+def test_closures_of_ax_cir_fit_as_well_outside_the_field(data: Path) -> None:
+    """Its companion is at 29.2 mas, outside the default field; inside, 6.4 mas is a false peak."""
+    ax_cir = read_oifits(data / "oifits" / "axcir_pionier.oifits")
+    found = search_field(ax_cir, SearchOptions(observables=("cp",)))
+    assert found.result.companion.separation_mas == pytest.approx(6.4, abs=0.1)
+    assert len(found.result.rivals) >= 2
+    assert any("outside the field" in w and "not certain" in w for w in found.warnings)
 
 
 def test_ax_cir_with_the_covariances_of_the_file(data: Path) -> None:
