@@ -31,6 +31,12 @@ POOR = 0.2
 """Effort where the quick one leaves a large error of ln Z, and that error: where data are so strong
 that the posterior is small and bent, few draws find it, and the evidence comes out too small."""
 
+LARGE = 1000
+SMALL_EFFORT = Effort(prior=512, modes=256, repeats=0, centres=3, rounds=2)
+"""Points of the (u, v) plane from which on evidences of simulated data get this effort alone, and
+Laplace's approximation where it is poor: a draw costs as much as the data are many, and posteriors
+of so many data are compact."""
+
 HOPELESS = 15.0
 """A model whose largest ln L, which no evidence exceeds, is so far below another's evidence has
 odds below 1e-6: its own evidence is not measured, and that bound stands for it."""
@@ -66,8 +72,9 @@ def measure_confusion(
         Where finished pieces are kept.
     progress : callable, optional
     """
+    effort = efforts(fits[0])[0].prior
     prior = [
-        PriorDraws.of(f.model, QUICK.prior, child) if f.model.n_dim else None
+        PriorDraws.of(f.model, effort, child) if f.model.n_dim else None
         for f, child in zip(fits, rng.spawn(len(fits)), strict=True)
     ]
     sizes = [part.stop - part.start for part in slices(n_draws, PIECE)]
@@ -126,7 +133,7 @@ def _evidences_of(
         if out[k] < best - HOPELESS:
             break
         cube, chi2 = tried[k]
-        for effort in (QUICK, THOROUGH):
+        for effort in efforts(fits[k]):
             found = integrate(fits[k].model, data, cube, chi2, rng, prior=prior[k], effort=effort)
             if found.diagnostics["log_z_error"] < POOR:
                 break
@@ -137,6 +144,11 @@ def _evidences_of(
             out[k] = max(out[k], laplace)
         best = max(best, out[k])
     return out
+
+
+def efforts(fit: ModelFit) -> tuple[Effort, ...]:
+    """Efforts to try for the evidence of a simulated data set, the cheapest first."""
+    return (SMALL_EFFORT,) if len(fit.model.likelihood.samples) > LARGE else (QUICK, THOROUGH)
 
 
 def _fitted(
@@ -152,11 +164,12 @@ def _fitted(
     where models that this one holds have their best fits.
     """
     model, n = fit.model, data.shape[1]
+    n_random = RANDOM_STARTS if len(model.likelihood.samples) <= LARGE else RANDOM_STARTS // 4
     inner = [f for f in fits if f.hypothesis.name in tried and f.hypothesis.within(fit.hypothesis)]
     seeds = []
     for i, one in enumerate(data.T):
         starts = [bank.seeds(one) for bank in fit.banks]
-        starts.append(rng.random((RANDOM_STARTS if model.n_dim else 0, model.n_dim)))
+        starts.append(rng.random((n_random if model.n_dim else 0, model.n_dim)))
         for part in inner:
             cube, chi2 = tried[part.hypothesis.name]
             starts.append(embedded(model, part.model, cube[i, int(np.argmin(chi2[i]))])[None])

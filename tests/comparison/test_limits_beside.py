@@ -92,7 +92,7 @@ def limits_beside_nothing(star) -> np.ndarray:
 
 @pytest.mark.slow
 def test_limits_command_gives_the_limit_beside_a_stated_disc(tmp_path: Path) -> None:
-    """Light of a disc hides companions of a star alone; with the disc in the model they are seen."""
+    """A disc hides companions of a star alone; with the disc in the model they are seen."""
     path = tmp_path / "disc.oifits"
     write_oifits(path, observed(niriss(0.003, 0.1), disc(), np.random.default_rng(3)))
     words = ["--models", "star,disc", "--separation", "94:350", "--criterion", "candid"]
