@@ -28,9 +28,11 @@ from amibayes.oifits import OIFits, observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
     FITS_MODEL,
+    IMPLANEIA,
     Given,
     is_product_header,
     open_products,
+    product_of,
     read_products,
     refuse_calibrating_again,
     refuse_twice,
@@ -162,7 +164,9 @@ def _with_errors(oifits: OIFits, **options: Any) -> Observables:
 
 
 def _is_product(contents: Contents) -> bool:
-    return is_product_header(contents.header, contents.names)
+    if is_product_header(contents.header, contents.names):
+        return True
+    return IMPLANEIA in contents.columns and product_of(open_oifits(contents.path)) is not None
 
 
 def _products(

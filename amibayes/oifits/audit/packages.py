@@ -14,6 +14,7 @@ import numpy as np
 from amibayes.oifits.audit.finding import Finding, Findings, column, data_tables, radians, unflagged
 from amibayes.oifits.audit.values import value_and_error
 from amibayes.oifits.columns import same
+from amibayes.oifits.products import IMPLANEIA
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
 
@@ -125,4 +126,26 @@ def phase_errors_times_amplitude(oifits: OIFits) -> Findings:
             )
 
 
-CHECKS = (vis2_errors_divided_twice, exchanged_errors, phase_errors_times_amplitude)
+def scatter_of_integrations(oifits: OIFits) -> Findings:
+    """Averages of ImPlaneIA, whose errors are standard deviations over the integrations."""
+    if not any(IMPLANEIA in t.columns for t in oifits.named("OI_ARRAY")):
+        return
+    for table, kind in data_tables(oifits):
+        pair = value_and_error(table, kind)
+        if pair is not None and (pair[1] > 0.0).any():
+            yield Finding(
+                "warning",
+                "scatter-of-integrations",
+                table.label,
+                "written by ImPlaneIA, whose errors are the scatter of the integrations",
+                "the mean of N integrations is known better by √N, and N is not in the file",
+                "give the file of its integrations instead, whose covariance is measured",
+            )
+
+
+CHECKS = (
+    scatter_of_integrations,
+    vis2_errors_divided_twice,
+    exchanged_errors,
+    phase_errors_times_amplitude,
+)

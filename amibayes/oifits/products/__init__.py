@@ -8,6 +8,7 @@ from amibayes.oifits.products.reading import (
 )
 from amibayes.oifits.products.recognise import (
     FITS_MODEL,
+    IMPLANEIA,
     Product,
     exposure_of,
     is_product_header,
@@ -23,6 +24,7 @@ from amibayes.oifits.products.together import (
 
 __all__ = [
     "FITS_MODEL",
+    "IMPLANEIA",
     "Given",
     "Product",
     "Repair",

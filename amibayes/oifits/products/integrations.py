@@ -21,7 +21,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.outliers import outlying
 from amibayes.data.shrinkage import Shrunk, shrunk_covariance
 from amibayes.errors import DataError
-from amibayes.oifits.products.recognise import Product
+from amibayes.oifits.products.recognise import Product, by_implaneia
 from amibayes.oifits.products.repairs import with_columns
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits
@@ -84,8 +84,10 @@ def series_of(product: Product) -> Series:
         Where a column is missing or of another shape.
     """
     vis2 = _by_integration(product, "OI_VIS2", "VIS2DATA")
-    amplitude = _by_integration(product, "OI_T3", "T3AMP")
     phase = _by_integration(product, "OI_T3", "T3PHI")
+    # ImPlaneIA writes closure amplitudes of four holes there, as many as there are triangles.
+    own = not by_implaneia(product)
+    amplitude = _by_integration(product, "OI_T3", "T3AMP") if own else np.ones_like(phase)
     if not len(vis2) == len(amplitude) == len(phase):
         raise DataError("its tables have different numbers of integrations", source=_path(product))
     bispectrum = amplitude * np.exp(1j * np.radians(phase))

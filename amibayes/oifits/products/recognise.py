@@ -19,6 +19,10 @@ ProductKind = Literal["ami-oi", "amimulti-oi", "aminorm-oi"]
 DATA_MODEL = "AmiOIModel"
 """DATAMODL of every product of the jwst package in OIFITS form."""
 
+IMPLANEIA = "CTRS_EQT"
+"""Column of OI_ARRAY that ImPlaneIA writes, whose files of many integrations the pipeline's are
+descended from; its averages are plain OIFITS."""
+
 FITS_MODEL = "AmiLgFitModel"
 """DATAMODL of the images that `ami_analyze` fitted (``amilg``)."""
 
@@ -55,6 +59,8 @@ class Product:
     @property
     def label(self) -> str:
         """File and kind, for messages."""
+        if by_implaneia(self):
+            return f"{self.oifits.path}: integrations of ImPlaneIA"
         return f"{self.oifits.path}: jwst {self.name}"
 
     def table(self, name: str) -> OITable | None:
@@ -76,12 +82,22 @@ def is_product_header(header: Header, names: tuple[str, ...]) -> bool:
 
 def product_of(oifits: OIFits) -> Product | None:
     """Find which product a file is; None for any other file."""
-    if not is_product_header(oifits.header, tuple(t.name for t in oifits.tables)):
+    by_pipeline = is_product_header(oifits.header, tuple(t.name for t in oifits.tables))
+    if not by_pipeline and not any(IMPLANEIA in t.columns for t in oifits.named("OI_ARRAY")):
         return None
     if len(oifits.named("OI_VIS2")) != 1 or len(oifits.named("OI_T3")) != 1:
         return None
+    if not by_pipeline:
+        return Product(oifits, "amimulti-oi", 0) if _has_integrations(oifits) else None
     count = oifits.header.get("NINTS")
     return Product(oifits, _kind(oifits), count if isinstance(count, int) else 0)
+
+
+def by_implaneia(product: Product) -> bool:
+    """Whether integrations are ImPlaneIA's, whose T3AMP are no amplitudes of the triangles."""
+    return not is_product_header(
+        product.oifits.header, tuple(t.name for t in product.oifits.tables)
+    )
 
 
 def is_normalized(header: Header, columns: Collection[str]) -> bool:
