@@ -158,7 +158,9 @@ def report(cases: list[dict[str, object]]) -> list[str]:
         lines.append(f"{truth} ({len(mine)}) | " + " | ".join(str(s) for s in share))
     lines.append("stated: truth | " + " | ".join((*MODELS, "undecided")))
     for truth in TRUTHS:
-        mine = np.array([c["stated"] for c in cases if c["truth"] == truth and c["stated"]])
+        # Cases that other versions kept may have other columns.
+        every = [c["stated"] for c in cases if c["truth"] == truth]
+        mine = np.array([s for s in every if s and len(s) == len(every[-1])])
         if len(mine):
             lines.append(f"{truth} | " + " | ".join(f"{x:.2f}" for x in mine.mean(axis=0)))
     inside: dict[str, list[bool]] = defaultdict(list)
