@@ -156,7 +156,7 @@ def report(cases: list[dict[str, object]]) -> list[str]:
         mine = [c for c in cases if c["truth"] == truth]
         share = [sum(c["verdict"] == n for c in mine) for n in columns]
         lines.append(f"{truth} ({len(mine)}) | " + " | ".join(str(s) for s in share))
-    lines.append("stated: truth | " + " | ".join((*MODELS, "undecided")))
+    lines.append("stated: truth | " + " | ".join((*MODELS, "extended light", "undecided")))
     for truth in TRUTHS:
         # Cases that other versions kept may have other columns.
         every = [c["stated"] for c in cases if c["truth"] == truth]
