@@ -20,25 +20,35 @@ import argparse
 import contextlib
 import io
 import json
+import pickle
+import resource
+import subprocess
+import sys
+import tempfile
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from scipy import stats
 
 from amibayes.cli import main as amibayes
 from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.instrument import load_instrument
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.limits.logistic import fit_logistic
 from amibayes.oifits import write_oifits
+from amibayes.survey.completeness import DetectionProbability
+from amibayes.survey.rows import Outcome
 
 FIELD = (70.0, 400.0)
 """Separations that are searched and that companions are drawn from, mas."""
 
-DEPTHS = (2.0, 7.0)
-"""Magnitude differences of companions."""
+DEPTHS = (0.0, 8.0)
+"""Magnitude differences of companions: past what can be seen, so that a survey's box is inside."""
 
 QUICK = ("--no-posterior", "--no-pictures", "--separation", f"{FIELD[0]:g}:{FIELD[1]:g}", "--quiet")
 
@@ -110,20 +120,224 @@ def search(table: Path, out: Path, *words: object) -> dict[str, Any]:
     return content
 
 
+@dataclass(frozen=True)
+class Tried:
+    """One simulated survey and what was found: see `study`."""
+
+    listed: int
+    false: int
+    found: int
+    detected: int
+    nulls: list[float]
+    frequency: dict[str, Any]
+    truth: float
+
+
+def study(surveys: int, targets: int, share: float, seed: int, workers: int) -> list[Tried]:
+    """Search whole surveys of stars of which a share has companions, and compare with the truth."""
+    out = []
+    for k in range(surveys):
+        rng = np.random.default_rng([seed, k])
+        stars = simulated(targets, int(rng.binomial(targets, share)), rng)
+        with tempfile.TemporaryDirectory() as folder:
+            table = write(Path(folder), stars, rng)
+            content = search(table, Path(folder) / "out", "--seed", k + 1, "--workers", workers)
+        alarms, frequency = content["false_alarms"], content["companion_frequency"]
+        single = {s.name for s in stars if s.delta_mag is None}
+        listed = set(alarms["discovered"])
+        entries = content["targets"]
+        nulls = [e["false_alarm_probability"] for e in entries if e["name"] in single]
+        inside = (frequency["delta_mag"][1] - DEPTHS[0]) / (DEPTHS[1] - DEPTHS[0])
+        found = len(listed - single)
+        out.append(
+            Tried(len(listed), len(listed & single), found, alarms["n_detected"], nulls,
+                  frequency, share * inside)
+        )  # fmt: skip
+        print(f"survey {k + 1}: {found} companions and {len(listed & single)} others listed",
+              file=sys.stderr, flush=True)  # fmt: skip
+    return out
+
+
+def study_lines(tried: list[Tried], targets: int, share: float) -> str:
+    """Tell what came of `study`."""
+    false = np.array([t.false / max(t.listed, 1) for t in tried])
+    nulls = np.concatenate([t.nulls for t in tried])
+    medians = np.array([t.frequency["median"] for t in tried])
+    truth = np.mean([t.truth for t in tried])
+    small = ", ".join(f"{(nulls <= alpha).mean():.3f}" for alpha in (0.01, 0.05, 0.2))
+    table = {
+        "false discoveries at a stated rate of 0.05": _mean(false),
+        "listed: with companions, without": f"{sum(t.found for t in tried)}, "
+        f"{sum(t.false for t in tried)}",
+        "stars without: p below 0.01, 0.05, 0.2": f"{small} of {len(nulls)}",
+        "uniformity of their p": f"{stats.kstest(nulls, 'uniform').pvalue:.2f}",
+        "true frequency inside of the interval": f"{_covered(tried, 68)} (68 %), "
+        f"{_covered(tried, 95)} (95 %)",
+        "mean of the medians": f"{_mean(medians)}; truth {truth:.3f}",
+    }
+    head = (
+        f"{len(tried)} surveys of {targets} stars, {share:.0%} with companions at "
+        f"{FIELD[0]:g} to {FIELD[1]:g} mas and {DEPTHS[0]:g} to {DEPTHS[1]:g} mag:"
+    )
+    rows = [f"| {name} | {value} |" for name, value in table.items()]
+    return "\n".join([head, "", "| | |", "|---|---|", *rows])
+
+
+def _mean(values: np.ndarray) -> str:
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return f"{values.mean():.3f} ± {error:.3f}"
+
+
+def _covered(tried: list[Tried], level: int) -> str:
+    bounds = [t.frequency[f"interval_{level}"] for t in tried]
+    inside = sum(low <= t.truth <= high for t, (low, high) in zip(tried, bounds, strict=True))
+    return f"{inside} of {len(tried)}"
+
+
+def _cpu() -> float:
+    usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in usage)
+
+
+def _timed(words: list[object]) -> tuple[float, float, float]:
+    """CPU s, wall s and peak memory in MB of a command in a process of its own."""
+    before, begin, peak = _cpu(), time.perf_counter(), 0.0
+    command = [sys.executable, "-m", "amibayes", *map(str, words)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    while process.poll() is None:
+        peak = max(peak, _memory(process.pid))
+        time.sleep(0.2)
+    return _cpu() - before, time.perf_counter() - begin, peak
+
+
+def _memory(pid: int) -> float:
+    try:
+        text = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    return next(
+        (float(x.split()[1]) / 1e3 for x in text.splitlines() if x.startswith("VmRSS")), 0.0
+    )
+
+
+def cost(targets: int, seed: int) -> str:
+    """Measure what targets cost, and what a scheduler does with a task; model 10⁵ targets."""
+    rng = np.random.default_rng(seed)
+    rows, per = [], {}
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        whole = write(folder, simulated(targets, targets // 10, rng), rng)
+        Table.read(whole)[:2].write(folder / "few.ecsv")
+        for name, words in PARTS.items():
+            base = ["search", "--overwrite", *(w for w in QUICK if w not in DROP.get(name, ()))]
+            base += words
+            start = _timed([*base, "--batch", folder / "few.ecsv", "--out", folder / "few"])
+            full = _timed([*base, "--batch", whole, "--out", folder / "whole"])
+            per[name] = (full[0] - start[0]) / (targets - 2)
+            set_up = start[0] - 2 * per[name]
+            rows.append(f"| {name} | {per[name]:.2f} s | {set_up:.1f} s | {full[2]:.0f} MB |")
+        base = ["search", "--overwrite", *QUICK, "--no-limits", "--batch", whole]
+        base += ["--out", folder / "w", "--workers"]
+        one, two = (_timed([*base, n])[1] for n in (1, 2))
+    efficiency = (
+        f"{targets} targets took {one:.1f} s with one process and {two:.1f} s with two, set-up "
+        f"included: an efficiency of {one / two / 2:.0%}, on a machine with a load of "
+        f"{os.getloadavg()[0]:.1f} for {os.cpu_count()} cores."
+    )
+    heads = ["| a target of NIRISS, V² and closure phases | CPU | set-up of a process | memory |",
+             "|---|---|---|---|"]  # fmt: skip
+    return "\n".join([*heads, *rows, "", efficiency, *_model(per)])
+
+
+def _model(per: dict[str, float]) -> list[str]:
+    """Cost of 10⁵ targets on 1000 workers, from measured pieces."""
+    rate, request, answer = _scheduler()
+    return [
+        f"A dask scheduler with one worker does {rate:.0f} tasks a second; a target is {request} "
+        f"bytes of request and {answer} of answer.",
+        "",
+        "| 10⁵ targets on 1000 workers | computing | scheduler | the longer of both |",
+        "|---|---|---|---|",
+        *(
+            f"| {name} | {100 * t:.0f} s | {1e5 / rate:.0f} s | {max(100 * t, 1e5 / rate):.0f} s |"
+            for name, t in per.items()
+        ),
+    ]
+
+
+PARTS: dict[str, tuple[str, ...]] = {
+    "search, significance": ("--no-limits",),
+    "… and limits": (),
+    "… and pictures": (),
+}
+"""What is measured, with the words of the command beside `QUICK`."""
+
+DROP = {"… and pictures": ("--no-pictures",)}
+"""Words of `QUICK` that a part goes without."""
+
+
+def _nothing(piece: Any) -> Any:
+    return piece[1]
+
+
+def _scheduler() -> tuple[float, int, int]:
+    """Tasks per second of a dask scheduler, and bytes of a target's request and answer."""
+    from amibayes.cli.batch import Job
+    from amibayes.cli.main import build_parser
+    from amibayes.parallel import DaskExecutor
+
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from dask_cluster import end, free_port, start_dask, start_worker
+
+    arguments = build_parser("search").parse_args(["search", "star00001.oifits"])
+    arguments.words = ["search", "star00001.oifits"]
+    job = Job("star00001", arguments)
+    levels, counts = np.log(np.geomspace(1e-3, 1e-1, 14)), np.arange(14.0)
+    rings = tuple(fit_logistic(levels, counts, np.full(14, 14.0)) for _ in range(16))
+    row: dict[str, Any] = {f"number_{k}": 0.1 * k for k in range(25)}
+    row["limits"] = {"separation_mas": [1.0] * 16, "delta_mag": [1.0] * 16}
+    detection = DetectionProbability(np.arange(16.0), rings)
+    answer = Outcome("star00001", "done", row=row, detection=detection)
+    port = str(free_port())
+    words = ("--host", "127.0.0.1", "--port", port, "--no-dashboard")
+    processes = [start_dask("dask_scheduler", *words)]
+    processes.append(start_worker(f"tcp://127.0.0.1:{port}"))
+    try:
+        executor = DaskExecutor(f"tcp://127.0.0.1:{port}")
+        list(executor.map(_nothing, [(job, answer)] * 20))
+        begin = time.perf_counter()
+        list(executor.map(_nothing, [(job, answer)] * 1000))
+        took = time.perf_counter() - begin
+        executor.close()
+    finally:
+        for process in processes:
+            end(process)
+    return 1000 / took, len(pickle.dumps(job)), len(pickle.dumps(answer))
+
+
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("part", choices=("simulate",))
+    parser.add_argument("part", choices=("simulate", "study", "cost"))
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--targets", type=int, default=50)
+    parser.add_argument("--targets", type=int, default=24)
     parser.add_argument("--companions", type=int, default=5)
-    parser.add_argument("--surveys", type=int, default=20)
+    parser.add_argument("--share", type=float, default=0.3)
+    parser.add_argument("--surveys", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
-    rng = np.random.default_rng(arguments.seed)
-    write(arguments.folder, simulated(arguments.targets, arguments.companions, rng), rng)
+    if arguments.part == "cost":
+        print(cost(arguments.targets, arguments.seed))
+    elif arguments.part == "study":
+        numbers = arguments.surveys, arguments.targets, arguments.share
+        tried = study(*numbers, arguments.seed, arguments.workers)
+        print(study_lines(tried, arguments.targets, arguments.share))
+    else:
+        rng = np.random.default_rng(arguments.seed)
+        write(arguments.folder, simulated(arguments.targets, arguments.companions, rng), rng)
 
 
 if __name__ == "__main__":

@@ -170,6 +170,7 @@ def _measure(
 
     journals = Journals(folder / JOURNAL, request, resume=arguments.resume)
     with (
+        journals.telling(),
         common.executor_of(arguments) as executor,
         common.stages_of(arguments) as progress,
     ):

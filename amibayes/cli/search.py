@@ -120,7 +120,8 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     if arguments.resume and not arguments.overwrite:
         refuse_other(folder / RESULT, asked, folder / JOURNAL)
     journals = Journals(folder / JOURNAL, asked, resume=arguments.resume)
-    report = _search(arguments, options, folder, journals)
+    with journals.telling(folder / CHAIN):
+        report = _search(arguments, options, folder, journals)
     for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
         (folder / stale).unlink(missing_ok=True)
     content = _write(arguments, report, folder, asked)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import shutil
 import zipfile
-from collections.abc import Mapping
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amibayes.support.atomic_files import atomic_path, cannot_write
+
+NAMES = {"null": "the null searches", "limits": "the injections"}
+"""What the jobs of a search are called."""
 
 Columns = dict[str, NDArray[Any]]
 """What a journalled piece returns: named arrays."""
@@ -94,6 +98,32 @@ class Journals:
     def under(self, part: str) -> Journals:
         """Open the journals of a part of the run."""
         return Journals(self.path, part, resume=self._resume)
+
+    @contextmanager
+    def telling(self, chain: Path | None = None) -> Iterator[None]:
+        """Say what is kept where the run is interrupted.
+
+        Parameters
+        ----------
+        chain : Path, optional
+            Of a posterior, which is kept too.
+        """
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(self.kept(chain)) from None
+
+    def kept(self, chain: Path | None = None) -> str:
+        """Say in words what a run that is cut off leaves for `resume`."""
+        pieces = sorted(self.path.rglob("piece-*.npz"), reverse=True)  # null searches come first
+        folders = [path.relative_to(self.path).parts[:-1] for path in pieces]
+        stages = Counter(
+            next((NAMES[part] for part in parts if part in NAMES), parts[0]) for parts in folders
+        )
+        parts = [f"{n} piece{'' if n == 1 else 's'} of {name}" for name, n in stages.items()]
+        if chain is not None and chain.is_file():
+            parts.append("the chain so far")
+        return f"kept {', '.join(parts)}" if parts else "no stage that can be kept was begun"
 
     def remove(self) -> None:
         """Forget all jobs of this run; a folder of journals that is empty then goes too."""

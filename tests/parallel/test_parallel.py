@@ -23,6 +23,7 @@ import parallel_work as work
 from amibayes.errors import DataError, RunError, UsageError
 from amibayes.parallel import (
     Journal,
+    Journals,
     ProcessExecutor,
     SerialExecutor,
     child_seeds,
@@ -210,6 +211,22 @@ def test_journal_without_resume_starts_afresh(tmp_path: Path) -> None:
     Journal(tmp_path, "key", resume=False).write(0, {"x": 1})
     assert Journal(tmp_path, "key", resume=True).read(0) == {"x": 1}
     assert Journal(tmp_path, "key", resume=False).read(0) is None
+
+
+def test_an_interrupted_run_says_what_its_journals_keep(tmp_path: Path) -> None:
+    journals = Journals(tmp_path, "key", resume=False)
+    nothing = "no stage that can be kept was begun"
+    with pytest.raises(KeyboardInterrupt, match=nothing), journals.telling():
+        raise KeyboardInterrupt
+    null = journals.of("null")
+    for k in range(3):
+        null.write(k, {"x": 1})
+    journals.under("limits").of("aliases").write(0, {"x": 1})
+    (tmp_path / "chain.h5").touch()
+    told = r"kept 3 pieces of the null searches, 1 piece of the injections, the chain so far"
+    with pytest.raises(KeyboardInterrupt, match=told), journals.telling(tmp_path / "chain.h5"):
+        raise KeyboardInterrupt
+    assert not {"null", "limits"} - {p.name for p in journals.path.iterdir()}
 
 
 def test_unwritable_journal_is_one_line(tmp_path: Path) -> None:
