@@ -93,7 +93,8 @@ class Work:
 
     def __call__(self, n: int, executor: Executor) -> BoolArray:
         fringe = resolution_mas(self.test.likelihood)
-        nearer = nearer_aliases(self.test.bank, rings(), fringe, executor=executor).ravel()
+        places = rings().reshape(-1, 2)
+        nearer = nearer_aliases(self.test.bank, places, fringe, executor=executor)
         found = recover(
             self.test,
             companions(n),

@@ -168,7 +168,7 @@ def recovered_once(filter: str, with_vis2: bool) -> Limit:
     rng = np.random.default_rng(1)
     test = statistic_of(result, stated_errors=True)
     found = significance(test, NULL_DRAWS, rng, ALPHA)
-    limit = detection_limit(result, found, rng, n_separations=15, trials_per_cell=60)
+    limit = detection_limit(result, found, rng, n_separations=15)
     return Limit(limit.separation_mas, -2.5 * np.log10(limit.contrast_50))
 
 

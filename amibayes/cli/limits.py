@@ -12,7 +12,6 @@ from amibayes.support.options import (
     LIMITS_NULL_DRAWS,
     LIMITS_SEPARATIONS,
     LIMITS_TRIALS,
-    NULL_DRAWS,
     LimitCriterion,
     choices,
 )
@@ -67,15 +66,15 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         type=common.positive_integer,
         default=LIMITS_TRIALS,
         metavar="N",
-        help="injections per separation and contrast, on average (default: %(default)s)",
+        help="companions injected per separation (default: %(default)s)",
     )
     group.add_argument(
         "--null-draws",
         type=common.non_negative_integer,
         metavar="N",
         help="null searches for the false-alarm probability; 0: none (default: "
-        f"{LIMITS_NULL_DRAWS} for injection, else {NULL_DRAWS}, "
-        "which only decide whether a companion is taken out first)",
+        f"{LIMITS_NULL_DRAWS}, fewer where each is dear; closed criteria need them only to decide "
+        "whether a companion is taken out first)",
     )
     group.add_argument(
         "--mass-table",
@@ -209,7 +208,7 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
 
     search = SearchOptions(
         **data_options.search_settings(arguments),
-        null_draws=_null_draws(arguments),
+        null_draws=arguments.null_draws,
         models=arguments.models,
     )
     return LimitsOptions(
@@ -217,15 +216,9 @@ def _options(arguments: argparse.Namespace) -> LimitsOptions:
         criterion=arguments.criterion,
         observables=arguments.observables,
         n_separations=arguments.separations,
-        trials_per_cell=arguments.trials,
+        trials=arguments.trials,
         masses=_masses(arguments),
     )
-
-
-def _null_draws(arguments: argparse.Namespace) -> int:
-    if arguments.null_draws is not None:
-        return int(arguments.null_draws)
-    return LIMITS_NULL_DRAWS if arguments.criterion == "injection" else NULL_DRAWS
 
 
 def _masses(arguments: argparse.Namespace) -> Any:

@@ -44,26 +44,24 @@ class Rotations(ErrorTreatment):
         """Gain in χ² of one data set (n_data,) at every position, and its χ²."""
         return KnownErrors().field(bank, white)
 
+    def noise_of(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Means of other rotations, made of unit normals (n_data, n) and of what is no datum."""
+        return self.null.draw(normals, rng)
+
     def search_simulated(
-        self,
-        bank: TemplateBank,
-        normals: FloatArray,
-        rng: np.random.Generator,
-        signal: FloatArray | None = None,
+        self, bank: TemplateBank, noise: FloatArray, signal: FloatArray | None = None
     ) -> Searched:
-        """Search simulated data sets, each with a covariance estimated anew.
+        """Search simulated data sets, each with the covariance that goes with its mean.
 
         Parameters
         ----------
         bank : TemplateBank
-        normals : (n_data, n) float array
-            Independent unit normals.
-        rng : numpy.random.Generator
-            For the directions of the rotations that are no datum.
+        noise : (n_data, n) float array
+            From `noise_of`.
         signal : (n_data, n) float array, optional
             What is in the data beside noise, whitened by the bank's own covariance.
         """
-        drawn = bank.project(self.null.draw(normals, rng))
+        drawn = bank.project(noise)
         data = drawn if signal is None else drawn + bank.project(signal)
         inverse = _Inverse.of(self.null, drawn)
         weighted = inverse.solve(data)

@@ -123,8 +123,22 @@ class Statistic(Protocol):
         """Statistic of n data sets of noise alone, (n,)."""
         ...
 
-    def gain_at(self, threshold: float) -> float:
-        """Gain in χ², in units of the noise, that reaches a value of the statistic."""
+    def noise(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Noise of data sets (n_data, n) out of unit normals; ``rng`` for what else is drawn."""
+        ...
+
+    def hits_in(self, noise: FloatArray, signal: FloatArray) -> Hits:
+        """Search data sets of noise and a signal each, (n_data, n)."""
+        ...
+
+    def scatter_posterior(
+        self, n: int, rng: np.random.Generator, *, stated_probable: bool
+    ) -> FloatArray:
+        """Draw what scatter the noise may really have: (n_data, n) or (1, n) factors."""
+        ...
+
+    def gain_at(self, statistic: FloatArray) -> FloatArray:
+        """Gain in χ², in units of the noise, that reaches values of the statistic, any shape."""
         ...
 
     def contrast_error(self, places: FloatArray) -> FloatArray:
@@ -194,29 +208,31 @@ class BankStatistic:
         return float(self.evaluate(self.observed[:, None])[0])
 
     def field(self, white: FloatArray) -> FloatArray:
-        """Statistic of one data set (n_data,) at every position, (n_grid,).
-
-        Its maximum is that of `evaluate`.
-        """
+        """Statistic of one data set (n_data,) everywhere, (n_grid,); its maximum is `evaluate`'s."""
         return self.ratio(*self.treatment.field(self.bank, white))
 
     def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
-        """Draw n data sets with the noise of the data, and search them.
+        """Draw n data sets with the noise of the data, and search them; see `hits_in`.
 
-        Parameters
-        ----------
-        n : int
-        rng : numpy.random.Generator
-        signal : (n_data, n) float array, optional
-            What is in them beside noise, whitened; see `signal_of`.
-
-        Notes
-        -----
         Noise is drawn in single precision, as the products are done: a relative error of 1e-6
         of the statistic, against a scatter between draws of tens of per cent.
         """
         normals = rng.standard_normal((self.bank.n_data, n), dtype=np.float32).astype(float)
-        return self._hits(self.treatment.search_simulated(self.bank, normals, rng, signal))
+        return self.hits_in(self.noise(normals, rng), signal)
+
+    def noise(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Noise of data sets (n_data, n) out of unit normals; ``rng`` for what else is drawn."""
+        return self.treatment.noise_of(normals, rng)
+
+    def hits_in(self, noise: FloatArray, signal: FloatArray | None = None) -> Hits:
+        """Search data sets of `noise` (n_data, n) and of a whitened signal each."""
+        return self._hits(self.treatment.search_simulated(self.bank, noise, signal))
+
+    def scatter_posterior(
+        self, n: int, rng: np.random.Generator, *, stated_probable: bool
+    ) -> FloatArray:
+        """Draw what scatter the noise may really have: (n_data, n) or (1, n) factors."""
+        return self.treatment.scatter_posterior(n, rng, stated_probable=stated_probable)
 
     def _hits(self, found: Searched) -> Hits:
         return Hits(self.ratio(found.gain, found.chi2), found.gain, found.position)
@@ -224,10 +240,7 @@ class BankStatistic:
     def signal_of(self, companions: FloatArray) -> FloatArray:
         """Whitened change of the data (n_data, n) by companions on top of the fit without one.
 
-        Parameters
-        ----------
-        companions : (n, 3) float array
-            east_mas, north_mas, contrast (the same in every band, at rest).
+        ``companions`` (n, 3): east_mas, north_mas, contrast (the same in every band, at rest).
         """
         return self.likelihood.noise.whiten(self.change_by(companions))
 
@@ -261,12 +274,8 @@ class BankStatistic:
         ----------
         n : int
         rng : numpy.random.Generator
-        executor : Executor, optional
-            Where it is computed; the result does not depend on it.
-        progress : callable, optional
-            Told (pieces done, pieces in all).
-        journal : Journal, optional
-            Keeps finished pieces.
+        executor, progress, journal : optional
+            As in `amibayes.parallel.run_job`; the result does not depend on them.
         """
         sizes = pieces_of(n, self.bank.n_data)
         pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
@@ -274,9 +283,9 @@ class BankStatistic:
         done = run_job(work, pieces, where, journal=journal, progress=progress)
         return np.concatenate([piece["statistic"] for piece in done])
 
-    def gain_at(self, threshold: float) -> float:
-        """Gain in χ², in units of the noise, that reaches a value of the statistic."""
-        return self.ratio.gain_at(threshold)
+    def gain_at(self, statistic: FloatArray) -> FloatArray:
+        """Gain in χ², in units of the noise, that reaches values of the statistic, any shape."""
+        return self.ratio.gain_at(statistic)
 
     def contrast_error(self, places: FloatArray) -> FloatArray:
         """Error of a faint companion's contrast at places (n, 2), mas, (n,)."""

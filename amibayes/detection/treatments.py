@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 from amibayes.companion_search.scan import GroupWeights, ScaleGroups, weighted_gain
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.likelihood.noise_terms import MAX_INFLATION, PRIOR_STATED_ERRORS_CORRECT
 from amibayes.likelihood.student import SymmetricWhitening, scores
 from amibayes.units import FloatArray, IntArray
 
@@ -51,30 +52,45 @@ class ErrorTreatment(Protocol):
         ...
 
     def search_simulated(
-        self,
-        bank: TemplateBank,
-        normals: FloatArray,
-        rng: np.random.Generator,
-        signal: FloatArray | None = None,
+        self, bank: TemplateBank, noise: FloatArray, signal: FloatArray | None = None
     ) -> Searched:
         """Search simulated data sets.
 
         Parameters
         ----------
         bank : TemplateBank
-        normals : (n_data, n) float array
-            Independent unit normals, made into noise here.
-        rng : numpy.random.Generator
-            For what else is drawn.
+        noise : (n_data, n) float array
+            From `noise_of`.
         signal : (n_data, n) float array, optional
             What is in the data beside noise, whitened.
         """
-        noise = self.noise_of(normals)
         return self.search(bank, noise if signal is None else noise + signal)
 
-    def noise_of(self, normals: FloatArray) -> FloatArray:
-        """Noise of whitened data sets (n_data, n) out of unit normals: these as they are."""
+    def noise_of(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Make noise of whitened data sets (n_data, n) out of unit normals: these as they are.
+
+        ``rng`` is for what else is drawn.
+        """
         return normals
+
+    def scatter_posterior(
+        self, n: int, rng: np.random.Generator, *, stated_probable: bool
+    ) -> FloatArray:
+        """Draw what scatter the noise may really have, in units of that of `noise_of`.
+
+        Parameters
+        ----------
+        n : int
+        rng : numpy.random.Generator
+        stated_probable : bool
+            The errors are as stated, with the prior probability that the likelihood gives to it.
+
+        Returns
+        -------
+        (n_data, n) or (1, n) float array
+            Ones where the scatter is known, or drawn with the noise.
+        """
+        return np.ones((1, n))
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
         """Make the same with the noise of other whitened residuals (n_data,).
@@ -188,9 +204,27 @@ class FreeScale(ErrorTreatment):
         rows = weight[self.groups.label] * data
         return bank.project(rows), weight, (rows * data).sum(axis=0)
 
-    def noise_of(self, normals: FloatArray) -> FloatArray:
+    def noise_of(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Noise that scatters as the data do."""
         return normals * self.scale[:, None]
+
+    def scatter_posterior(
+        self, n: int, rng: np.random.Generator, *, stated_probable: bool
+    ) -> FloatArray:
+        """Draw the scatter of the groups from its posterior; see `ErrorTreatment`.
+
+        Each group's variance has Jeffreys' prior or, with the probability that the noise prior
+        gives to it, is as stated.
+        """
+        out = np.empty((len(self.groups.label), n))
+        for group in range(int(self.groups.label.max(initial=0)) + 1):
+            here = self.groups.label == group
+            measured = float(self.scale[here][0])
+            drawn = drawn_scale(
+                measured, self.groups.share * here.sum(), n, rng, stated_probable=stated_probable
+            )
+            out[here] = np.maximum(drawn, np.sqrt(self.least)) / measured
+        return out
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Self:
         """Measure the scatter in other residuals."""
@@ -206,6 +240,41 @@ class FreeScale(ErrorTreatment):
             for part in np.array_split(places, 1 + len(places) // PLACES_AT_ONCE)
         ]
         return np.asarray(sigma / np.sqrt(np.concatenate(square)))
+
+
+def drawn_scale(
+    measured: float, degrees: float, n: int, rng: np.random.Generator, *, stated_probable: bool
+) -> FloatArray:
+    """Draw standard deviations (n,) of normal data, in units of the stated ones.
+
+    Parameters
+    ----------
+    measured : float
+        Root mean square of the data.
+    degrees : float
+        Their degrees of freedom ν.
+    n : int
+    rng : numpy.random.Generator
+    stated_probable : bool
+        The variance v is 1 with probability `PRIOR_STATED_ERRORS_CORRECT`, else ln v is uniform
+        within twice ln `MAX_INFLATION` of 0; or the latter alone.
+
+    Notes
+    -----
+    v is ν·measured²/χ²_ν under Jeffreys' prior, whose share of the evidence is
+    Γ(ν/2)(ν·measured²/2)^(−ν/2) per unit of ln v. One draw from each n-th of the distribution.
+    """
+    sum_of_squares, half = degrees * measured**2, 0.5 * degrees
+    share = 0.0
+    if stated_probable:
+        odds = PRIOR_STATED_ERRORS_CORRECT / (1.0 - PRIOR_STATED_ERRORS_CORRECT)
+        log_free = special.gammaln(half) - half * np.log(0.5 * sum_of_squares)
+        log_free -= np.log(4.0 * np.log(MAX_INFLATION))
+        share = float(special.expit(np.log(odds) - 0.5 * sum_of_squares - log_free))
+    level = (rng.permutation(n) + rng.uniform(size=n)) / n
+    free = np.maximum(level - share, 0.0) / max(1.0 - share, 1e-300)
+    variance = sum_of_squares / stats.chi2.isf(np.clip(free, 1e-12, 1.0 - 1e-12), degrees)
+    return np.asarray(np.where(level < share, 1.0, np.sqrt(variance)))
 
 
 PLACES_AT_ONCE = 512
@@ -290,11 +359,11 @@ class Ratio:
         share = np.minimum(gain / (chi2 + self.added), 1.0 - 1e-15)
         return np.asarray(-self.count * np.log1p(-share))
 
-    def gain_at(self, statistic: float) -> float:
-        """Gain in χ² of that statistic, if what is left of χ² is its expectation."""
+    def gain_at(self, statistic: FloatArray) -> FloatArray:
+        """Gain in χ² of a statistic, any shape, if what is left of χ² is its expectation."""
         if not np.isfinite(self.count):
             return statistic
-        return float((self.n_free + self.added) * np.expm1(statistic / self.count))
+        return np.asarray((self.n_free + self.added) * np.expm1(statistic / self.count))
 
     def local_survival(self, statistic: FloatArray, n_contrasts: int = 1) -> FloatArray:
         """Probability that noise alone reaches the statistic at one given position, any shape.

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.parallel import Executor, Journal, SerialExecutor, run_job
+from amibayes.parallel import Executor, Journal, SerialExecutor, run_job, slices
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 ALIKE = 0.75
@@ -35,6 +35,10 @@ def ambiguous(nearer: FloatArray, gain: FloatArray) -> BoolArray:
     return np.asarray(1.0 - np.clip(nearer, 0.0, 1.0) ** 2 < alike)
 
 
+PLACES_AT_ONCE = 1024
+"""Places that share a look at the whole bank."""
+
+
 def nearer_aliases(
     bank: TemplateBank,
     places: FloatArray,
@@ -43,10 +47,11 @@ def nearer_aliases(
     executor: Executor | None = None,
     journal: Journal | None = None,
 ) -> FloatArray:
-    """`nearer_alias` of many places, (n_pieces, n, 2), as a job; (n_pieces, n)."""
+    """`nearer_alias` of many places (n, 2), as a job; (n,)."""
     work = partial(_alias_piece, bank, fringe_mas)
-    done = run_job(work, list(places), executor or SerialExecutor(), journal=journal)
-    return np.array([piece["correlation"] for piece in done])
+    pieces = [places[part] for part in slices(len(places), PLACES_AT_ONCE)]
+    done = run_job(work, pieces, executor or SerialExecutor(), journal=journal)
+    return np.concatenate([piece["correlation"] for piece in done])
 
 
 def _alias_piece(
@@ -89,12 +94,13 @@ def _best_inward(
     First among positions nearer to the star by a step of the lattice or more, then among
     those at the same separation within a step, of which the lattice cannot tell.
     """
-    own = bank.templates_at(*places.T)
+    # Single precision: what counts is looked at again between the lattice's points.
+    own = bank.templates_at(*places.T).astype(np.float32)
     radius, grid = np.hypot(*places.T)[:, None], bank.grid
     best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
     each = np.arange(len(places))
     for index, templates in bank.chunks():
-        match = own.T @ templates
+        match = own.T @ templates.astype(np.float32)
         east, north = grid.east_mas[index], grid.north_mas[index]
         match[_same_place(bank, fringe_mas, places, east, north)] = 0.0
         inward = (radius - np.hypot(east, north)) / grid.step_mas

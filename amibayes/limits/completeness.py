@@ -1,9 +1,9 @@
 """Detection limits by injection and recovery, by the criterion of the search itself.
 
-Companions are injected at rings of separations and levels of contrast, in rounds whose size
-is fixed beforehand: the first spreads evenly, the next go where the share of recovered ones
-is least certain. The limit of a ring is the contrast that a logistic fit gives to the wanted
-share.
+At rings of separations, at all position angles and for many draws of noise, the contrast is
+found from which on the search recovers a companion (`amibayes.limits.critical`). The limit of a
+ring is the contrast above which the wanted share of these numbers ends. Noise scatters as the
+data may truly scatter: its size is drawn from its posterior.
 """
 
 from __future__ import annotations
@@ -14,51 +14,54 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.statistic import Statistic
+from amibayes.detection.tails import pareto_quantile
 from amibayes.errors import UsageError
-from amibayes.limits.aliases import ambiguous, nearer_aliases
-from amibayes.limits.injection import (
-    InjectionSetup,
-    Trials,
-    inject,
-    spawned,
-)
-from amibayes.limits.limit import DetectionLimit
-from amibayes.limits.logistic import fit_logistic
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.limits.critical import CriticalContrasts, Draws, critical_contrasts
+from amibayes.limits.limit import SHARES, DetectionLimit
+from amibayes.limits.pooled import Pooled, quantiles
 from amibayes.limits.rings import Rings, make_rings
-from amibayes.parallel import Executor, Journals, Progress
+from amibayes.parallel import Executor, Journals, Progress, spawn
 from amibayes.support.arguments import checks_arguments, in_range
-from amibayes.units import FloatArray, IntArray
+from amibayes.support.options import LIMITS_TRIALS
+from amibayes.units import FloatArray
 
 N_SEPARATIONS = 16
 
+MOST_ANGLES = 120
+"""Position angles of a ring: the share of recovered companions is a mean over them, which the
+beams of the outermost ring need not be resolved for."""
 
-N_LEVELS = 14
+LEAST_PER_PLACE = 2
+"""Draws of noise at every place: their differences are the Monte Carlo error."""
 
-
-TRIALS_PER_CELL = 40
-
-
-LEVELS = (0.4, 4.0)
-"""Injected contrasts, in units of the one that linear theory detects half of the time."""
-
-
-BEYOND = 2.0
-"""Highest level in units of what the blindest direction that counts sees half of the time."""
-
+AFFORDABLE = 6e10
+"""Positions times data of all injected companions together: some four seconds of one core. Large
+data on wide fields get fewer companions."""
 
 COMPLETENESS = 0.95
-
 
 MAX_AMBIGUOUS = 0.5 * (1.0 - COMPLETENESS)
 """Share of directions with an alias nearer in, above which detection alone is counted."""
 
-
 SPREAD = (0.16, 0.5, 0.84)
 """Quantiles over the position angle."""
+
+N_LEVELS = 14
+
+LEVELS = (0.4, 4.0)
+"""Contrasts of the completeness map, in units of the one that linear theory detects half of the
+time."""
+
+NULL_DRAWS, FRESH_WORK = 20_000, 5e10
+"""Null searches from which the threshold is known to 0.01 mag, and positions times data of those
+that are added to the ones of the search: some two seconds of one core."""
+
+BOOTSTRAPS = 40
+"""Resampled thresholds: their error is then known to a tenth."""
 
 
 @checks_arguments
@@ -69,7 +72,8 @@ def detection_limit(
     *,
     n_separations: int = N_SEPARATIONS,
     separation_mas: Sequence[float] | None = None,
-    trials_per_cell: int = TRIALS_PER_CELL,
+    trials: int = LIMITS_TRIALS,
+    noise: ExtraNoise | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     journals: Journals | None = None,
@@ -87,12 +91,16 @@ def detection_limit(
         Rings from the inner to the outer edge of the field.
     separation_mas : sequence of float, optional
         These rings instead.
-    trials_per_cell : int
-        On average; there are `N_LEVELS` contrasts per ring.
+    trials : int
+        Companions that are injected per separation, each with noise and at a position angle of
+        its own; its contrast is found.
+    noise : ExtraNoise, optional
+        What the search fitted beside the stated errors; where there is any the errors are
+        not taken to be as stated.
     executor : Executor, optional
         Where it is computed; the result does not depend on it.
     progress : callable, optional
-        Told (trials done, trials in all).
+        Told (pieces done, pieces in all).
     journals : Journals, optional
         Keep finished pieces.
 
@@ -100,13 +108,16 @@ def detection_limit(
     -------
     DetectionLimit
     """
-    in_range("detection_limit", "trials_per_cell", trials_per_cell, 1)
-    rings = make_rings(result, n_separations, separation_mas)
-    test, threshold = _without_companion(result, significance, rng, executor, journals)
-    setting, lost, sigma = _prepared(test, threshold, rings, executor, journals)
-    trials = inject(setting, trials_per_cell, rng, progress)
-    false = _false_positives(setting, significance.n_draws, rng)
-    return _summarised(setting, trials, sigma, lost, significance.alpha, false)
+    in_range("detection_limit", "trials", trials, 1)
+    test, null = _without_companion(result, significance, rng, executor, journals)
+    rings, draws = _planned(result, test, n_separations, separation_mas, trials, noise, rng)
+    threshold = pareto_quantile(null.null, null.alpha)
+    typical = _root(test, threshold) + stats.norm.ppf(COMPLETENESS)
+    critical = critical_contrasts(
+        test, threshold, rings, draws, typical=typical**2, most_ambiguous=MAX_AMBIGUOUS,
+        executor=executor, progress=progress, journals=journals,
+    )  # fmt: skip
+    return _summarised(test, null, threshold, rings, critical)
 
 
 def _without_companion(
@@ -115,8 +126,8 @@ def _without_companion(
     rng: np.random.Generator,
     executor: Executor | None,
     journals: Journals | None,
-) -> tuple[Statistic, float]:
-    """Statistic and threshold as they were, had the companion that was detected not been there.
+) -> tuple[Statistic, Significance]:
+    """Statistic and null draws as they were, had the companion that was detected not been there.
 
     Noise that is measured in the residuals would hold the companion: right for the test
     whether there is one, not for what would be seen where there is none.
@@ -132,136 +143,114 @@ def _without_companion(
             f"of {significance.alpha:g}",
             remedy=f"draw {draws_needed(significance.alpha)} or more",
         )
-    if not significance.detected:
-        return test, significance.threshold()
-    test = test.with_noise_of(test.likelihood.residuals(result.theta)[:, 0])
-    if not test.null_rests_on_residuals:
-        return test, significance.threshold()
+    known = significance.null
+    if significance.detected:
+        test = test.with_noise_of(test.likelihood.residuals(result.theta)[:, 0])
+        known = known[:0] if test.null_rests_on_residuals else known
+    n = max(min(NULL_DRAWS - len(known), int(FRESH_WORK / test.bank.work)), 0)
+    n = max(n, draws_needed(significance.alpha) if not len(known) else 0)
+    own = np.random.default_rng(spawn(rng, 1)[0])
     journal = journals.of("threshold") if journals else None
-    null = test.draw_null(significance.n_draws, spawned(rng), executor=executor, journal=journal)
-    return test, replace(significance, null=np.sort(null)).threshold()
+    fresh = test.draw_null(n, own, executor=executor, journal=journal) if n else known[:0]
+    return test, replace(significance, null=np.sort(np.concatenate([known, fresh])))
 
 
-def _prepared(
+def _planned(
+    result: SearchResult,
     test: Statistic,
-    threshold: float,
-    rings: Rings,
-    executor: Executor | None,
-    journals: Journals | None,
-) -> tuple[InjectionSetup, FloatArray, FloatArray]:
-    """What all rounds need, the ambiguous share of every ring, and errors of the contrast."""
-    gain = test.gain_at(threshold)
-    sigma = test.contrast_error(rings.places).reshape(rings.east_mas.shape)
-    nearer = _nearer(test, rings, executor, journals)
-    seen_at = np.full(nearer.shape, (np.sqrt(gain) + stats.norm.ppf(COMPLETENESS)) ** 2)
-    lost = ambiguous(nearer, seen_at).mean(axis=1)
-    setting = InjectionSetup(
-        test=test,
-        rings=rings,
-        nearer=nearer,
-        level=_levels(gain, sigma),
-        by_detection=lost > MAX_AMBIGUOUS,
-        threshold=threshold,
-        executor=executor,
-        journals=journals,
-    )
-    return setting, lost, sigma
+    n_separations: int,
+    separation_mas: Sequence[float] | None,
+    trials: int,
+    noise: ExtraNoise | None,
+    rng: np.random.Generator,
+) -> tuple[Rings, Draws]:
+    """Rings and how much noise is drawn at each place of theirs."""
+    n = n_separations if separation_mas is None else len(separation_mas)
+    afforded = AFFORDABLE / (n * SEARCHES * test.bank.work)
+    trials = min(trials, max(int(afforded), LEAST_TRIALS))
+    most = int(np.clip(trials // LEAST_PER_PLACE, 1, MOST_ANGLES))
+    rings = make_rings(result, n_separations, separation_mas, most_angles=most)
+    per_place = max(LEAST_PER_PLACE, round(trials / rings.east_mas.shape[1]))
+    stated = noise is None or not (noise.any or noise.channels)
+    return rings, Draws(per_place, int(rng.integers(2**62)), stated)
 
 
-def _levels(gain: float, sigma: FloatArray) -> FloatArray:
-    """Contrasts to inject at every ring, (n, N_LEVELS), from its errors (n, n_angles).
+SEARCHES = 2.5
+"""Searches that one companion takes, on average."""
 
-    Where some directions are nearly blind the levels reach on to what these see.
-    """
-    middle, blind = np.quantile(sigma, (0.5, COMPLETENESS + 0.02), axis=1)
-    highest = np.maximum(LEVELS[1], BEYOND * blind / middle)
-    steps = np.geomspace(LEVELS[0], highest, N_LEVELS, axis=1)
-    return np.asarray(np.minimum(np.sqrt(gain) * middle[:, None] * steps, 1.0))
-
-
-def _nearer(
-    test: Statistic, rings: Rings, executor: Executor | None, journals: Journals | None
-) -> FloatArray:
-    """Correlation with the best alias nearer to the star, (n, n_angles)."""
-    journal = journals.of("aliases") if journals else None
-    fringe = resolution_mas(test.likelihood)
-    places = rings.places.reshape(*rings.east_mas.shape, 2)
-    return nearer_aliases(test.bank, places, fringe, executor=executor, journal=journal)
-
-
-def _false_positives(
-    setting: InjectionSetup, n_draws: int, rng: np.random.Generator
-) -> tuple[int, int]:
-    """Count false alarms among as many fresh searches of noise as set the threshold."""
-    journal = setting.journals.of("false-positives") if setting.journals else None
-    null = setting.test.draw_null(n_draws, spawned(rng), executor=setting.executor, journal=journal)
-    return int((null > setting.threshold).sum()), len(null)
+LEAST_TRIALS = 80
+"""However large the data are: rings together then tell a limit to 0.03 mag."""
 
 
 def _summarised(
-    setting: InjectionSetup,
-    trials: Trials,
-    sigma: FloatArray,
-    lost: FloatArray,
-    alpha: float,
-    false: tuple[int, int],
+    test: Statistic,
+    null: Significance,
+    threshold: float,
+    rings: Rings,
+    critical: CriticalContrasts,
 ) -> DetectionLimit:
-    """Fit every ring and gather what was found."""
-    shape, level = setting.level.shape, setting.level
-    n = trials.counts(np.ones(len(trials.ring), dtype=bool), shape)
-    detected, located = (trials.counts(w, shape) for w in (trials.detected, trials.located))
-    recovered = np.where(setting.by_detection[:, None], detected, located)
-    limit, middle = (
-        np.array([_crossing(*ring, p) for ring in zip(level, recovered, n, strict=True)])
-        for p in (COMPLETENESS, 0.5)
-    )
+    """Gather what was found on every ring."""
+    pooled = Pooled.of(critical)
+    goal = _root(test, threshold), _threshold_error(test, null)
+    level = _levels(goal[0], critical.sigma)
+    counts = [
+        (x[:, :, :, None] <= level[:, None, None]).sum(axis=(1, 2))
+        for x in (critical.detected, critical.located)
+    ]
+    every, error = pooled.contrast(SHARES)
+    every = np.maximum.accumulate(every, axis=1)
+    error = np.hypot(error, goal[1] / (goal[0] + stats.norm.ppf(SHARES)))
+    at = [int(np.abs(SHARES - share).argmin()) for share in (COMPLETENESS, 0.5)]
     return DetectionLimit(
         method="injection",
-        separation_mas=setting.rings.separation_mas,
-        contrast=limit[:, 0],
-        contrast_50=middle[:, 0],
-        log_error=limit[:, 1],
-        log_error_50=middle[:, 1],
-        spread=_spread(setting, trials, sigma),
-        by_detection=setting.by_detection,
-        ambiguous=lost,
-        threshold=setting.threshold,
-        false_positive_rate=alpha,
-        false_positives=false,
+        separation_mas=rings.separation_mas,
+        contrast=every[:, at[0]],
+        contrast_50=every[:, at[1]],
+        log_error=error[:, at[0]],
+        log_error_50=error[:, at[1]],
+        spread=_spread(critical),
+        by_detection=critical.by_detection,
+        ambiguous=critical.ambiguous,
+        threshold=threshold,
+        false_positive_rate=null.alpha,
+        false_positives=(int((null.null > threshold).sum()), null.n_draws),
         completeness=COMPLETENESS,
         level=level,
-        trials=n,
-        detected=detected,
-        located=located,
+        trials=np.full(level.shape, critical.located[0].size),
+        detected=counts[0],
+        located=counts[1],
+        critical=every,
     )
 
 
-def _crossing(
-    level: FloatArray, recovered: IntArray, trials: IntArray, probability: float
-) -> tuple[float, float]:
-    """Contrast of a given completeness, and the error of its logarithm; NaN outside the levels."""
-    fit = fit_logistic(np.log(level), recovered.astype(float), trials.astype(float))
-    return _bracketed(*fit.crossing(probability))
+def _root(test: Statistic, statistic: float) -> float:
+    """Root of the gain in χ² of a statistic: standard deviations, of known errors."""
+    return float(np.sqrt(test.gain_at(np.array(statistic))))
 
 
-def _bracketed(log_contrast: float, error: float) -> tuple[float, float]:
-    """Give a contrast and the error of its logarithm; NaN where the injections end before it."""
-    if not np.isfinite(log_contrast):
-        return np.nan, np.nan
-    return float(np.exp(log_contrast)), error
+def _levels(middle: float, sigma: FloatArray) -> FloatArray:
+    """Contrasts of the map at every ring, (n, N_LEVELS), from its errors (n, n_angles)."""
+    blind = np.quantile(sigma, COMPLETENESS, axis=1) / np.median(sigma, axis=1)
+    highest = np.maximum(LEVELS[1], 2.0 * blind)
+    steps = np.geomspace(LEVELS[0], highest, N_LEVELS, axis=1)
+    return np.asarray(np.minimum(middle * np.median(sigma, axis=1)[:, None] * steps, 1.0))
 
 
-def _spread(setting: InjectionSetup, trials: Trials, sigma: FloatArray) -> FloatArray:
+def _threshold_error(test: Statistic, null: Significance) -> float:
+    """Error of the root of the threshold's gain, by bootstraps of the null draws."""
+    rng, drawn = np.random.default_rng(0), null.null
+    resampled = (np.sort(rng.choice(drawn, len(drawn))) for _ in range(BOOTSTRAPS))
+    return float(np.std([_root(test, pareto_quantile(x, null.alpha)) for x in resampled]))
+
+
+def _spread(critical: CriticalContrasts) -> FloatArray:
     """Quantiles over the position angle of the limit at one position angle, (n, 3).
 
     At one position recovery depends on the contrast in units of its error there, c/σ(angle):
-    a fit in that variable gives every direction its own limit.
+    a quantile of that gives every direction its own limit.
     """
-    out = np.full((len(sigma), len(SPREAD)), np.nan)
-    found = np.where(setting.by_detection[trials.ring], trials.detected, trials.located)
-    for k in range(len(sigma)):
-        at = np.flatnonzero(trials.ring == k)
-        strength = setting.level[k, trials.level[at]] / sigma[k, trials.angle[at]]
-        fit = fit_logistic(np.log(strength), found[at].astype(float), np.ones(len(at)))
-        out[k] = np.quantile(sigma[k], SPREAD) * _bracketed(*fit.crossing(COMPLETENESS))[0]
+    strength = critical.located / critical.sigma[:, :, None]
+    wanted = np.array([COMPLETENESS])
+    at = np.array([quantiles(ring, wanted) for ring in strength])
+    out = np.quantile(critical.sigma, SPREAD, axis=1).T * at
     return np.where(out <= 1.0, out, np.nan)

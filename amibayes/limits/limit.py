@@ -11,7 +11,6 @@ from scipy import stats
 
 from amibayes.data.tables import UNITS, quantity_table
 from amibayes.detection.binomial import clopper_pearson
-from amibayes.limits.logistic import Logistic, fit_logistic
 from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag
@@ -71,6 +70,10 @@ class Limit(Protocol):
         ...
 
 
+SHARES = np.linspace(0.0025, 0.9975, 400)
+"""At which the contrasts are kept: 0.5 and 0.95 are among them."""
+
+
 @dataclass(frozen=True, eq=False)
 class DetectionLimit:
     """Contrast that is recovered with a stated probability at a stated false-positive rate.
@@ -100,12 +103,14 @@ class DetectionLimit:
     false_positive_rate : float
         α, at which the threshold was set.
     false_positives : (int, int)
-        Searches of noise alone, other than those that set the threshold, that exceed it; and
-        how many there were.
+        Searches of noise alone that exceed the threshold, and how many there were.
     completeness : float
     level : (n, n_levels) float array
-        Injected contrasts.
+        Contrasts of the completeness map.
     trials, detected, located : (n, n_levels) int array
+        Of the map. All contrasts of a ring are those of the same companions and noise.
+    critical : (n, n_shares) float array
+        Contrasts above which the `SHARES` of companions are recovered; NaN where none up to 1 is.
     """
 
     method: str
@@ -125,6 +130,7 @@ class DetectionLimit:
     trials: IntArray
     detected: IntArray
     located: IntArray
+    critical: FloatArray
 
     def to_table(self) -> QTable:
         """The limit at every separation as an astropy table with units."""
@@ -202,11 +208,10 @@ class DetectionLimit:
             "ambiguous_share": list(self.ambiguous),
             **self.columns(),
             "false_positive_rate": self.false_positive_rate,
-            "false_positive_rate_measured": self.false_positives[0] / self.false_positives[1],
             "false_positive_interval": list(self.false_positive_interval),
             "threshold": self.threshold,
             "completeness": self.completeness,
-            "n_trials": int(self.trials.sum()),
+            "n_trials": int(self.trials[:, 0].sum()),
         }
 
     def columns(self) -> dict[str, FloatArray]:
@@ -244,27 +249,31 @@ class DetectionLimit:
     def probability(self, separation_mas: float, contrast: float) -> float:
         """Probability that a companion is recovered; NaN at separations that were not tried.
 
-        By the logistic fits of the rings beside it, between which it is interpolated.
+        Between rings it is interpolated.
         """
         inner, outer = self.separation_mas[[0, -1]]
         if not inner <= separation_mas <= outer:
             return float("nan")
         behind = int(np.searchsorted(self.separation_mas, separation_mas, side="right")) - 1
         rings = [behind, min(behind + 1, len(self.separation_mas) - 1)]
-        found = [float(self._fit(k)(np.log(contrast))) for k in rings]
+        found = [self._share(k, contrast) for k in rings]
         return float(np.interp(separation_mas, self.separation_mas[rings], found))
+
+    def _share(self, ring: int, contrast: float) -> float:
+        known = np.isfinite(self.critical[ring])
+        if not known.any():
+            return 0.0
+        at, share = np.log(self.critical[ring, known]), SHARES[known]
+        highest = 1.0 if known.all() else float(share[-1])
+        return float(np.interp(np.log(contrast), at, share, left=0.0, right=highest))
 
     def counts_anywhere(self, separation_mas: float) -> bool:
         """Whether a companion there counts as recovered wherever it is seen."""
         return bool(self.by_detection[np.abs(self.separation_mas - separation_mas).argmin()])
 
-    def _fit(self, ring: int) -> Logistic:
-        counts = self.recovered[ring].astype(float), self.trials[ring].astype(float)
-        return fit_logistic(np.log(self.level[ring]), *counts)
-
     @property
     def false_positive_interval(self) -> tuple[float, float]:
-        """95 % Clopper–Pearson interval of the measured false-positive rate."""
+        """95 % Clopper–Pearson interval of the false-positive rate of the threshold."""
         return clopper_pearson(*self.false_positives)
 
     def jeffreys(self, level: float = 0.68) -> tuple[FloatArray, FloatArray]:

@@ -52,6 +52,8 @@ def make_rings(
     result: SearchResult,
     n_separations: int = LIMITS_SEPARATIONS,
     separation_mas: Sequence[float] | None = None,
+    *,
+    most_angles: int = MAX_ANGLES,
 ) -> Rings:
     """Lay rings over the field of a search, from its inner to its outer edge.
 
@@ -61,6 +63,7 @@ def make_rings(
     n_separations : int
     separation_mas : sequence of float, optional
         These separations instead.
+    most_angles : int
     """
     in_range("limits", "n_separations", n_separations, 1)
     for one in () if separation_mas is None else separation_mas:
@@ -71,6 +74,7 @@ def make_rings(
         rho = np.asarray(separation_mas, dtype=float)
     around = 2.0 * np.pi * rho.max() / resolution_mas(result.likelihood)
     n = int(np.clip(np.ceil(ANGLES_PER_FRINGE * around), MIN_ANGLES, MAX_ANGLES))
+    n = min(n, most_angles)
     turned = np.arange(len(rho))[:, None] * GOLDEN
     angle = 360.0 * ((np.arange(n)[None] + turned % 1.0) / n)
     return Rings(rho, *offset(rho[:, None], angle))

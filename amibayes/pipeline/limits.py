@@ -62,19 +62,17 @@ class LimitsOptions:
         One limit from these; by default one from all data and one from each kind.
     n_separations : int
         Rings from the inner to the outer edge of the field.
-    trials_per_cell : int
-        Injections per separation and contrast, on average.
+    trials : int
+        Companions injected per separation.
     masses : MassTable, optional
         For an axis of masses.
     """
 
-    search: SearchOptions = field(
-        default_factory=lambda: SearchOptions(null_draws=LIMITS_NULL_DRAWS)
-    )
+    search: SearchOptions = field(default_factory=SearchOptions)
     criterion: LimitCriterion = "injection"
     observables: Kinds | None = None
     n_separations: int = LIMITS_SEPARATIONS
-    trials_per_cell: int = LIMITS_TRIALS
+    trials: int = LIMITS_TRIALS
     masses: MassTable | None = None
 
 
@@ -281,7 +279,7 @@ def _one_limit(
     streams = [np.random.default_rng(k) for k in seed.spawn(2)]
     with run.stage(f"search {name}"):
         found = search_field(data, search)
-    tested = None
+    tested, search = None, _with_draws(found.result, search)
     if search.null_draws != 0:
         with run.stage(f"null searches {name}"):
             tested = false_alarm(
@@ -289,14 +287,27 @@ def _one_limit(
                 journal=run.journal("null"),
             )  # fmt: skip
     with run.stage(f"limits {name}"):
-        limit = _limit(found.result, tested, options, streams[1], run)
+        limit = _limit(found, tested, options, streams[1], run)
     measured = MeasuredLimit(search.observables, found.result, found.noise, tested, limit)
     notes = search_warnings(data, found.result, found.noise, tested, None)
     return measured, [*found.warnings, *notes]
 
 
+NULL_WORK = 5e10
+"""Positions times data of the null searches of one limit: two seconds of one core."""
+
+
+def _with_draws(result: SearchResult, search: SearchOptions) -> SearchOptions:
+    """Ask for so many null searches as a threshold needs and as can be afforded, unless given."""
+    if search.null_draws is not None:
+        return search
+    afforded = int(NULL_WORK / (len(result.grid) * result.likelihood.n_independent))
+    draws = max(min(LIMITS_NULL_DRAWS, afforded), draws_needed(search.alpha))
+    return replace(search, null_draws=draws)
+
+
 def _limit(
-    result: SearchResult,
+    found: FieldSearch,
     tested: Significance | None,
     options: LimitsOptions,
     rng: np.random.Generator,
@@ -305,15 +316,16 @@ def _limit(
     if options.criterion != "injection":
         remove = tested is not None and bool(tested.detected)
         return analytic_limit(
-            result, options.criterion, n_separations=options.n_separations, remove=remove
+            found.result, options.criterion, n_separations=options.n_separations, remove=remove
         )
     assert tested is not None
     return detection_limit(
-        result,
+        found.result,
         tested,
         rng,
         n_separations=options.n_separations,
-        trials_per_cell=options.trials_per_cell,
+        trials=options.trials,
+        noise=found.noise,
         executor=run.executor,
         progress=run.progress,
         journals=run.journals,

@@ -180,6 +180,7 @@ def _limits(
             found.result,
             tests.first,
             rng,
+            noise=found.noise,
             executor=run.executor,
             progress=run.progress,
             journals=run.under("limits").journals,

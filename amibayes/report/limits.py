@@ -165,11 +165,10 @@ def _rate_lines(content: Json) -> list[str]:
     if content["completeness"] is None:
         return []
     low, high = content["false_positive_interval"]
-    measured = content["false_positive_rate_measured"]
     return [
         f"limit       {content['completeness']:.0%} of companions recovered, false-positive rate "
-        f"{content['false_positive_rate']:.2g} (measured {measured:.2g}, 95%: {low:.2g} to "
-        f"{high:.2g}); {content['n_trials']} injections"
+        f"{content['false_positive_rate']:.2g} (95%: {low:.2g} to {high:.2g}); "
+        f"{content['n_trials']} companions injected"
     ]
 
 

@@ -109,14 +109,14 @@ ALPHA = 0.0013
 NULL_DRAWS = 10_000
 """Null searches: α is then known to a quarter of itself."""
 
-LIMITS_NULL_DRAWS = 100_000
-"""Null searches for limits: the threshold of α is then known to a tenth of α."""
+LIMITS_NULL_DRAWS = 20_000
+"""Null searches for limits: the threshold of α is then known to 0.01 mag."""
 
 LIMITS_SEPARATIONS = 24
 """Rings of a detection limit."""
 
-LIMITS_TRIALS = 240
-"""Injections per separation and contrast: 95 % completeness is then known to 1.4 %."""
+LIMITS_TRIALS = 900
+"""Companions injected per separation: a limit is then known to 0.02 mag."""
 
 VETTING_ALPHA = 0.003
 """Probability of each test below which a calibrator is dropped."""

@@ -37,9 +37,8 @@ RANKED = ("east_mas", "north_mas", "ln_contrast")
 COVERED = ("separation_mas", "position_angle_deg", "delta_mag")
 LEVELS = (0.68, 0.95)
 
-TRIALS_PER_CELL = 64
-
 STAR_K = 5800.0
+
 """Blackbody that the extraction takes for the simulated spectrum, which is that of a G2 star."""
 
 Piece = tuple[int, str, np.random.SeedSequence]
@@ -145,9 +144,7 @@ def _analysed(
     own = default_prior(result.likelihood, *FIELD_MAS)
     own = replace(own, contrast_min=prior.contrast_min, contrast_max=prior.contrast_max)
     grid = grid_posterior(delivered.likelihood, own)
-    limits = detection_limit(
-        result, tested, np.random.default_rng(seeds[1]), trials_per_cell=TRIALS_PER_CELL
-    )
+    limits = detection_limit(result, tested, np.random.default_rng(seeds[1]), noise=field.noise)
     found_at = result.companion
     place = np.array([found_at.east_mas, found_at.north_mas])
     rho = float(np.hypot(*truth[:2]))

@@ -89,7 +89,7 @@ def test_limits_and_weights_in_a_line(found: SearchResult) -> None:
     options = SearchOptions(null_draws=3000)
     weight = false_alarm(found, options, np.random.default_rng(1), None, None)
     limit = detection_limit(
-        found, weight, np.random.default_rng(2), trials_per_cell=20, separation_mas=[100.0, 300.0]
+        found, weight, np.random.default_rng(2), trials=100, separation_mas=[100.0, 300.0]
     )
     assert repr(limit).startswith(f"<DetectionLimit: injection, {limit.completeness:.0%}")
     assert repr(limit).endswith("2 separations>")

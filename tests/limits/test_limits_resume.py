@@ -15,7 +15,7 @@ from commands import alive, start
 from amibayes.cli import main
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = ("--separations", "4", "--trials", "300", "--null-draws", "8000", "--separation", "60:400")
+SMALL = ("--separations", "4", "--trials", "200", "--null-draws", "8000", "--separation", "60:400")
 # Runs of other processes are compared byte by byte, pictures and all.
 pytestmark = pytest.mark.usefixtures("full_pictures")
 

@@ -52,7 +52,7 @@ def test_limits_are_curves_over_separation() -> None:
 
 def test_a_measured_limit_has_its_completeness() -> None:
     tested = ab.significance(ab.statistic_of(FOUND), 3000, RNG)
-    limit = ab.detection_limit(FOUND, tested, RNG, n_separations=2, trials_per_cell=2)
+    limit = ab.detection_limit(FOUND, tested, RNG, n_separations=2, trials=2)
     data = limit.to_xarray()
     np.testing.assert_array_equal(data.trials, limit.trials)
     np.testing.assert_array_equal(data.delta_mag_50, limit.columns()["delta_mag_50"])
