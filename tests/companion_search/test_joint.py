@@ -553,7 +553,8 @@ def test_estimates_drawn_anew_search_all_bands(model, rng) -> None:
     bank = test.bank
     noise = rng.standard_normal((bank.n_data, 3))
     assert isinstance(test.treatment, Rotations)
-    found = test.treatment.search_simulated(bank, noise, np.random.default_rng(7))
+    drawn = test.treatment.noise_of(noise, np.random.default_rng(7))
+    found = test.treatment.search_simulated(bank, drawn)
     means = test.treatment.null.draw(noise, np.random.default_rng(7))
     colour = np.linalg.pinv(data.covariance.whitening.toarray())
     own = test.treatment.null.residual

@@ -264,7 +264,8 @@ def test_simulated_data_have_the_distribution_of_the_likelihood(freedom: Freedom
     test = made(sheet, 60.0)
     assert isinstance(test.treatment, Rotations)
     normals = rng.standard_normal((p, 4000))
-    chi2 = test.treatment.search_simulated(test.bank, normals, rng).chi2
+    noise = test.treatment.noise_of(normals, rng)
+    chi2 = test.treatment.search_simulated(test.bank, noise).chi2
     law = stats.f(p, nu)
     assert stats.kstest(chi2 * nu / ((nu - 2.0) * p), law.cdf).pvalue > 1e-4
 
@@ -282,8 +283,8 @@ def test_each_data_set_is_searched_with_its_own_covariance() -> None:
     bank = test.bank
     noise, signal = rng.standard_normal((2, bank.n_data, 4))
     assert isinstance(test.treatment, Rotations)
-    found = test.treatment.search_simulated(bank, noise, np.random.default_rng(7), signal)
-    means = test.treatment.null.draw(noise, np.random.default_rng(7))
+    means = test.treatment.noise_of(noise, np.random.default_rng(7))
+    found = test.treatment.search_simulated(bank, means, signal)
     own = test.treatment.null.residual
     for k in range(4):
         outer = np.outer(own, own) - np.outer(means[:, k], means[:, k])

@@ -15,7 +15,7 @@ from amibayes.companion_search.search import search
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
-from amibayes.detection.treatments import FreeScale, Ratio
+from amibayes.detection.treatments import FreeScale, Ratio, drawn_scale
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import symmetric_whitening
 from amibayes.limits.injection import recover
@@ -132,3 +132,22 @@ def test_gain_at_a_threshold_is_the_inverse_of_the_ratio() -> None:
         gain = ratio.gain_at(12.0)
         # χ² without the companion: what the companion explains, and the expectation of the rest.
         assert float(ratio(np.array([gain]), gain + 30.0)[0]) == pytest.approx(12.0)
+
+
+def test_scatter_of_few_data_is_as_stated_unless_they_say_otherwise() -> None:
+    """Against Bayes' rule on a fine grid of ln v, half of the prior at 1."""
+    rng, n = np.random.default_rng(4), 4000
+    for measured in (0.85, 1.0, 1.2, 2.0):
+        drawn = drawn_scale(measured, 20.0, n, rng, stated_probable=True)
+        log_v = np.linspace(-2.0, 2.0, 8001) * np.log(100.0)
+        log_like = -10.0 * (log_v + measured**2 * np.exp(-log_v))
+        free = np.exp(log_like + 10.0 * measured**2)
+        mass = free.sum() * np.diff(log_v)[0] / (4.0 * np.log(100.0))
+        # Drawn one from each n-th of the distribution: to one draw.
+        assert (drawn == 1.0).mean() == pytest.approx(1.0 / (1.0 + mass), abs=2.0 / n)
+        others = drawn[drawn != 1.0]
+        if len(others) > 500:
+            expected = (free * np.exp(0.5 * log_v)).sum() / free.sum()
+            assert others.mean() == pytest.approx(expected, rel=0.01)
+    free = drawn_scale(0.85, 20.0, n, rng, stated_probable=False)
+    assert np.sqrt(1.0 / np.mean(free**-2.0)) == pytest.approx(0.85, rel=1e-3)
