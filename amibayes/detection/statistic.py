@@ -208,7 +208,7 @@ class BankStatistic:
         return float(self.evaluate(self.observed[:, None])[0])
 
     def field(self, white: FloatArray) -> FloatArray:
-        """Statistic of one data set (n_data,) everywhere, (n_grid,); its maximum is `evaluate`'s."""
+        """Statistic of one data set (n_data,) everywhere, (n_grid,); its maximum is `value`."""
         return self.ratio(*self.treatment.field(self.bank, white))
 
     def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
@@ -231,7 +231,7 @@ class BankStatistic:
     def scatter_posterior(
         self, n: int, rng: np.random.Generator, *, stated_probable: bool
     ) -> FloatArray:
-        """Draw what scatter the noise may really have: (n_data, n) or (1, n) factors."""
+        """Draw what scatter the noise may have: (n_data, n) or (1, n) factors."""
         return self.treatment.scatter_posterior(n, rng, stated_probable=stated_probable)
 
     def _hits(self, found: Searched) -> Hits:
@@ -274,8 +274,7 @@ class BankStatistic:
         ----------
         n : int
         rng : numpy.random.Generator
-        executor, progress, journal : optional
-            As in `amibayes.parallel.run_job`; the result does not depend on them.
+        executor, progress, journal : optional, see `amibayes.parallel.run_job`
         """
         sizes = pieces_of(n, self.bank.n_data)
         pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
