@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amibayes.data.observables import Observables
     from amibayes.extraction.reading import ImageOptions
 
-RESULT = "calibrated.oifits"
+RESULT, KERNEL_RESULT = "calibrated.oifits", "calibrated_kpfits.fits"
 
 EXAMPLES = """examples:
   amibayes calibrate target.oifits --cal cal*.oifits
@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
     images = of_one_visit([*arguments.targets, *arguments.cal], common.image_options_of(arguments))
     calibrators = _prepared(arguments.cal, arguments, images, target=None, one_star=False)
     targets = _prepared(arguments.targets, arguments, images, target=arguments.target)
-    folder = output_folder(arguments.out, [RESULT], overwrite=arguments.overwrite)
+    names = [RESULT, KERNEL_RESULT]
+    folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)
     diameters = diameters_of(arguments.calibrator_diameters, calibrators)
     serving, sizes, method = _with_library(arguments, targets, calibrators, diameters)
     found = calibrate(
@@ -192,9 +193,15 @@ def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> di
             "covariance": used.covariance_kind,
         },
         "calibration": found.as_json(),
-        "output": str(folder / RESULT),
+        "output": _written(found, folder),
         "warnings": list(used.notes),
     }
+
+
+def _written(found: Calibration, folder: Path) -> str:
+    """The file that holds the result; kernel phases have a format of their own."""
+    kernels = found.observables.phase_name == "kernel phase" and not found.observables.n_vis2
+    return str(folder / (KERNEL_RESULT if kernels else RESULT))
 
 
 def _summary(found: Calibration, folder: Path) -> list[str]:
@@ -212,4 +219,4 @@ def _summary(found: Calibration, folder: Path) -> list[str]:
     for use in found.calibrators:
         state = "kept" if use.kept else "not used"
         lines.append(f"calibrator  {use.path}: {state}{', ' if use.reason else ''}{use.reason}")
-    return shortened(lines, [row("written to", str(folder / RESULT))])
+    return shortened(lines, [row("written to", _written(found, folder))])

@@ -18,7 +18,8 @@ RESULT, REPORT = "result.json", "report.html"
 PICTURES = (".png", ".fits")
 """Of the files that are written: the pictures, and the numbers of the maps."""
 
-CHAIN, CALIBRATED, JOURNAL = "posterior.h5", "calibrated.oifits", "search.journal"
+CHAIN, JOURNAL = "posterior.h5", "search.journal"
+CALIBRATED, CALIBRATED_KP = "calibrated.oifits", "calibrated_kpfits.fits"
 
 EXAMPLES = """examples:
   amibayes search target.oifits --cal cal*.oifits
@@ -135,7 +136,7 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
 
     names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated, several=several)]
     names += [CHAIN] if options.posterior else []
-    return [*names, CALIBRATED] if calibrated or options.library else names
+    return [*names, CALIBRATED, CALIBRATED_KP] if calibrated or options.library else names
 
 
 def request(arguments: argparse.Namespace) -> str:

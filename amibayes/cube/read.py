@@ -146,6 +146,12 @@ def open_cube(
 
 
 def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile | RampFile:
+    if any(hdu.name == "KP-DATA" for hdu in hdus):
+        raise DataError(
+            "holds kernel phases (KPFITS) of images without a mask",
+            source=source,
+            remedy="give it to search, limits or calibrate",
+        )
     science = _science(hdus, source)
     if len(science.shape) == 4:
         return _ramp_file(hdus, science, given, source)

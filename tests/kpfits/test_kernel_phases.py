@@ -237,6 +237,22 @@ def test_bad_files_get_one_line(
         assert f"{name}.fits" in error
 
 
+def test_calibrate_and_extract_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is calibrated is named; images of a KPFITS file are not taken for those of a mask."""
+    star = kernel_file(tmp_path / "t.fits", PUPIL.phases(EAST, NORTH, 0.02, 0.0))
+    rng = np.random.default_rng(1)
+    (noise,) = noisy(rng, 1)
+    calibrator = kernel_file(tmp_path / "c.fits", noise)
+    out = tmp_path / "out"
+    assert main(["calibrate", str(star), "--cal", str(calibrator), "--out", str(out)]) == 0
+    assert "calibrated_kpfits.fits" in capsys.readouterr().out
+    assert kernel_observables(out / "calibrated_kpfits.fits").n_independent == 80
+    assert main(["calibrate", str(star), "--cal", str(calibrator), "--out", str(out)]) == 2
+    capsys.readouterr()
+    assert main(["extract", str(star), "--out", str(tmp_path / "x")]) == 3
+    assert "holds kernel phases (KPFITS)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "codes"),
     [
