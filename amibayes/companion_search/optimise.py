@@ -67,8 +67,8 @@ STAR_STARTS, STAR_FITS = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5), 3
 """Limb darkening and background, as parts of their ranges, at which diameters are tried (with more
 of them, the diameters of the minima are others), and how many of the best are fitted to the end."""
 
-POOR, SIMPLEX_EVALUATIONS = 2.0, 400
-"""χ² per datum of a star alone from which it is fitted without gradients too, and how often."""
+SIMPLEX_EVALUATIONS = 400
+"""Of a fit without gradients of two or three parameters, which takes some 150."""
 
 FINEST_STEP = 0.0025
 """Scale of a star's parameters in their fit, as a part of their ranges."""
@@ -87,19 +87,16 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
     scale = np.maximum(lower + FINEST_STEP * width, 1e-6)
     objective = _objective(without, scale)
     disc = np.array([name == "diameter_mas" for name in without.parameters.names])
-    several = disc.any() and not disc.all()
-    starts = []
-    for rest in STAR_STARTS if several else STAR_STARTS[:1]:
-        # A disc has lobes: a fit starts from the best of a ladder of diameters.
-        part = np.where(disc | ~disc.any(), np.linspace(0.0, 1.0, 201)[:, None] ** 2, rest)
-        ladder = lower + part * width
-        chi2 = without.chi2(ladder)
-        starts.append((float(chi2.min()), ladder[np.argmin(chi2)]))
-    starts = sorted(starts, key=lambda start: start[0])[:STAR_FITS]
-    fits = [_minimise(objective, start, scale, bounds) for _, start in starts]
-    least = min(fits, key=lambda fit: fit[1])[0]
-    if several and without.chi2(least[None])[0] > POOR * likelihood.n_independent:
-        fits += [_across_walls(objective, theta, scale, bounds) for theta, _ in fits]
+    several = bool(disc.any() and not disc.all())
+    # A disc has lobes: a fit starts from the best of a ladder of diameters.
+    rungs = np.linspace(0.0, 1.0, 201)[:, None] ** 2
+    parts = [np.where(disc | ~disc.any(), rungs, rest) for rest in STAR_STARTS]
+    ladders = [lower + part * width for part in (parts if several else parts[:1])]
+    starts = [_best_of(without.chi2, ladder) for ladder in ladders]
+    starts = sorted(starts, key=lambda start: start[1])[:STAR_FITS]
+    fits = [_minimise(objective, start, scale, bounds) for start, _ in starts]
+    if several and likelihood.observables.n_vis2:
+        fits += _across_walls(without, objective, ladders, fits, scale, bounds)
     if known is not None:
         fits.append(_minimise(objective, known, scale, bounds))
     if likelihood.model.surroundings:
@@ -111,14 +108,47 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
     return min(fits, key=lambda fit: fit[1])
 
 
-def _across_walls(
-    objective: Objective, start: FloatArray, scale: FloatArray, bounds: FloatArray
-) -> tuple[FloatArray, float]:
-    """Minimise without gradients, (θ, deviance).
+Fit = tuple[FloatArray, float]
+"""Parameters, and deviance or χ²."""
 
-    Where a baseline is at a null of the star its closure phases turn by 180° at once: χ² has
-    walls there, at which a fit by gradients ends.
+
+def _best_of(chi2: Callable[[FloatArray], FloatArray], thetas: FloatArray) -> Fit:
+    found = chi2(thetas)
+    return thetas[np.argmin(found)], float(found.min())
+
+
+def _across_walls(
+    star: Likelihood,
+    objective: Objective,
+    ladders: Sequence[FloatArray],
+    fits: Sequence[Fit],
+    scale: FloatArray,
+    bounds: FloatArray,
+) -> list[Fit]:
+    """Fit a star, past its nulls perhaps, without gradients: from V² alone, and from other fits.
+
+    Where a baseline is at a null its closure phases turn by 180° at once: χ² has walls there,
+    at which a fit by gradients ends. That of V² has none, and its best star is next to that of
+    all data.
     """
+    n = star.observables.n_vis2
+    sigma = np.sqrt(star.noise.covariance.variance[:n, None])
+
+    def chi2_vis2(thetas: FloatArray) -> FloatArray:
+        return np.asarray(((star.difference(thetas)[:n] / sigma) ** 2).sum(axis=0))
+
+    def of_vis2(x: FloatArray, _: FloatArray) -> float:
+        return float(chi2_vis2((x * scale)[None])[0])
+
+    start, _ = min((_best_of(chi2_vis2, ladder) for ladder in ladders), key=lambda f: f[1])
+    first, _ = _without_gradients(of_vis2, start, scale, bounds)
+    starts = [first, min(fits, key=lambda fit: fit[1])[0]]
+    return [_without_gradients(objective, start, scale, bounds) for start in starts]
+
+
+def _without_gradients(
+    objective: Objective, start: FloatArray, scale: FloatArray, bounds: FloatArray
+) -> Fit:
     optimiser = nlopt.opt(nlopt.LN_SBPLX, len(start))
     optimiser.set_lower_bounds(bounds[:, 0] / scale)
     optimiser.set_upper_bounds(bounds[:, 1] / scale)
