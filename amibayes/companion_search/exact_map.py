@@ -78,7 +78,7 @@ def _pieces(
         yield from _by_model(likelihood, grid, nuisance, contrasts)
         return
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
-    scale, star = response.scale[:, None], response.star[:, None]
+    scale, star = response.scale[:, None], (response.star + 1j * response.across)[:, None]
     wave = scale * response.disc[:, None]
     for index, cosine, sine in lattice_waves(likelihood, grid):
         for where, sign in ((index, -1.0), (index + len(grid) // 2, 1.0)):

@@ -96,7 +96,7 @@ class TemplateBank:
         response = linear_response(likelihood, nuisance)
         self._even, self._odd, self._primary = response.even, response.odd, response.star
         self._disc = None if (response.disc == 1.0).all() else response.disc[:, None]
-        self._offset = np.asarray(self._even.matrix @ self._primary)
+        self._offset = response.offset
         both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
         self._even_shared, self._odd_shared = both[1:]
         if beside is None:

@@ -1,4 +1,4 @@
-"""Detection limits of companions beside a disc or a ring, whose parameters are free.
+"""Detection limits of companions beside a disc, a ring or a crescent, whose parameters are free.
 
 The light around the star is a part of the model of the search: its parameters are nuisances,
 whose directions are projected out of every template. Companions are injected into the best fit
@@ -45,14 +45,18 @@ class LimitsBeside:
     limit: DetectionLimit
 
 
-def symmetric(model: Compared) -> bool:
-    """Whether a model is extended light alone that has no closure phases.
+def searchable(model: Compared) -> bool:
+    """Whether a model is extended light alone, beside which a linear search finds companions.
 
-    The linear search takes the star and what is around it as real; a crescent is not.
+    Where bands have contrasts of their own, or images a response off the axis, that search
+    takes the star and what is around it as real; a crescent is not.
     """
-    parts = model.fit.model.likelihood.model.surroundings
-    plain = all(isinstance(p, Extended) and not p.crescent for p in parts)
-    return model.fit.hypothesis.family == "extended" and bool(parts) and plain
+    likelihood = model.fit.model.likelihood
+    parts = likelihood.model.surroundings
+    lopsided = any(isinstance(p, Extended) and p.crescent for p in parts)
+    simple = likelihood.samples.off_axis is None and not likelihood.model.bands
+    light = bool(parts) and all(isinstance(p, Extended) for p in parts)
+    return model.fit.hypothesis.family == "extended" and light and (simple or not lopsided)
 
 
 def limits_beside(
@@ -65,7 +69,7 @@ def limits_beside(
     null_draws: int = LIMITS_NULL_DRAWS,
     executor: Executor | None = None,
 ) -> LimitsBeside | None:
-    """Measure the limit beside the most probable disc or ring; None where it is neither.
+    """Measure the limit beside the most probable disc, ring or crescent; None where it is none.
 
     Parameters
     ----------
@@ -80,7 +84,7 @@ def limits_beside(
     executor : Executor, optional
     """
     best = found.best
-    if not symmetric(best):
+    if not searchable(best):
         return None
     fit = best.fit.model.likelihood
     # The noise of the fit, without the average over its amounts: a search needs one covariance.

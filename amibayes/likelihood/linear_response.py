@@ -40,17 +40,19 @@ def _part(matrix: csr_array) -> Part:
 
 @dataclass(frozen=True, eq=False)
 class WhitenedResponse:
-    """Matrices A, B with template = A·(D·Re(E) − V₀) + B·Im(−D·E).
+    """Matrices A, B with template = A·D·Re(E) + B·Im(−D·E) − offset.
 
-    With V₀ real and s = 1/(flux), dV/dc = s·(D·E − V₀), hence dV² = 2V₀ Re dV and
-    dφ = Im dV / V₀.
+    With s = 1/(flux), dV/dc = s·(D·E − V₀), hence dV² = 2 Re(V₀* dV) and dφ = Im(V₀* dV)/|V₀|².
+    V₀ is real but for lopsided light around the star, and A is then of V² and B of phases alone.
 
     Parameters
     ----------
     even, odd : Part
         A and B.
     star : (n_samples,) float array
-        V₀.
+        V₀, its real part.
+    offset : (n_rows of A,) float array
+        What the flux of a companion takes from the visibilities.
     disc : (n_samples,) float array
         D, the visibility of the companion's disc.
     """
@@ -58,20 +60,29 @@ class WhitenedResponse:
     even: Part
     odd: Part
     star: FloatArray
+    offset: FloatArray
     disc: FloatArray
 
 
 def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> WhitenedResponse:
     """Make the response of the whitened data to a faint companion."""
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
-    star, scale = response.star, response.scale
+    star, across, scale = response.star, response.across, response.scale
     whitening = likelihood.noise.covariance.whitening
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
-    inverse = star / np.maximum(star**2, NEAR_NULL**2)
-    even = _part(by_vis2 @ likelihood.samples.squares.multiply(2.0 * scale * star))
-    odd = _part(by_closure @ likelihood.samples.legs.multiply(-scale * inverse))
-    return WhitenedResponse(even, odd, star, response.disc)
+    squares, legs = likelihood.samples.squares, likelihood.samples.legs
+    size2 = np.maximum(star**2 + across**2, NEAR_NULL**2)
+    along = by_vis2 @ squares.multiply(2.0 * scale * star)
+    turned = by_closure @ legs.multiply(-scale * (star / size2))
+    if across.any():
+        along = along - by_closure @ legs.multiply(scale * (across / size2))
+        turned = turned - by_vis2 @ squares.multiply(2.0 * scale * across)
+    even, odd = _part(along), _part(turned)
+    if not across.any():
+        return WhitenedResponse(even, odd, star, np.asarray(even.matrix @ star), response.disc)
+    taken = by_vis2 @ (squares @ (2.0 * scale * (star**2 + across**2)))
+    return WhitenedResponse(even, odd, star, np.asarray(taken)[even.rows], response.disc)
 
 
 def nuisance_directions(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:

@@ -37,16 +37,19 @@ class LinearResponse:
     Parameters
     ----------
     star : (n_samples,) float array
-        Visibility without a companion; real, since the star stands at the origin.
+        Visibility without a companion; its real part where light around the star is lopsided.
     scale : (n_samples,) float array
         1/(flux without a companion), times the companion's colour.
     disc : (n_samples,) float array
         D, the visibility of the companion's disc.
+    across : (n_samples,) float array
+        Imaginary part of the visibility without a companion: 0 but for crescents.
     """
 
     star: FloatArray
     scale: FloatArray
     disc: FloatArray
+    across: FloatArray
 
 
 NEVER_NEGATIVE = (
@@ -193,6 +196,7 @@ class BinaryModel:
             np.asarray(light[:, 0].real * scale),
             scale * (one if colour is None else np.broadcast_to(colour, (len(one), 1))[:, 0]),
             one if disc is None else np.broadcast_to(disc, (len(one), 1))[:, 0],
+            np.asarray((light[:, 0].imag if np.iscomplexobj(light) else 0.0) * scale),
         )
 
     def _sources(self, samples: UVPoints, theta: FloatArray, *, slopes: bool) -> list[Source]:

@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.companion_search.field import default_separation
 from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES, extended_names
-from amibayes.comparison.limits import LimitsBeside, limits_beside, symmetric
+from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
 from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
@@ -70,7 +70,7 @@ def limits_stage(
     if models is None or not options.limits or options.null_draws == 0:
         return None
     stated = models.verdict.statement in (models.best.name, FAMILIES["extended"])
-    if not stated or not symmetric(models.best):
+    if not stated or not searchable(models.best):
         return None
     grid = found.result.grid
     field = _default_field(found, options) or (grid.inner_mas, grid.outer_mas)

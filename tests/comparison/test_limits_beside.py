@@ -91,6 +91,29 @@ def limits_beside_nothing(star) -> np.ndarray:
 
 
 @pytest.mark.slow
+def test_limit_beside_a_crescent() -> None:
+    """No deeper than without it, and not shallower by more than a disc makes it."""
+    model = BinaryModel(1, surroundings=Hypothesis("crescent").model(BinaryModel()).surroundings)
+    theta = [120.0, -60.0, 0.0, 0.05, 220.0, 0.7, 40.0, 0.2, 0.9, 250.0]
+    base = Likelihood(simulated(niriss(), theta, np.random.default_rng(1), model))
+    found = compare_sky_models(
+        search(base, FIELD),
+        Prior(*FIELD, contrast_min=1e-4),
+        np.random.default_rng(2),
+        models=["star", "crescent"],
+        confusion_draws=0,
+    )
+    beside = limits_beside(
+        found, base, FIELD, np.random.default_rng(3), alpha=0.01, null_draws=2000
+    )
+    assert beside.model == "crescent"
+    star = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    alone = limits_beside_nothing(star)
+    assert np.nanmedian(beside.limit.delta_mag) < np.nanmedian(alone) + 0.1
+    assert np.nanmedian(beside.limit.delta_mag) > np.nanmedian(alone) - 1.5
+
+
+@pytest.mark.slow
 def test_limits_command_gives_the_limit_beside_a_stated_disc(tmp_path: Path) -> None:
     """A disc hides companions of a star alone; with the disc in the model they are seen."""
     path = tmp_path / "disc.oifits"
