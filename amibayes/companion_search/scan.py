@@ -149,7 +149,11 @@ class GroupWeights:
 
     def sums(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """Weighted sums (n, m) over the data of values (n_data, m)."""
-        return np.asarray(self.weight.T @ self.groups.sums(values).astype(self.weight.dtype))
+        return self.of_sums(self.groups.sums(values))
+
+    def of_sums(self, sums: NDArray[np.floating]) -> FloatArray:
+        """Weighted sums (n, m) of the sums over the groups, (n_groups, m)."""
+        return np.asarray(self.weight.T @ sums.astype(self.weight.dtype))
 
 
 def weighted_gain(

@@ -15,6 +15,7 @@ one sparse matrix before any position is looked at.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,9 @@ from amibayes.units import MAS, FloatArray, IntArray, SingleArray
 
 RATE_STEPS_PER_FRINGE = 4
 """Steps in rate per λ/B_max of the place at the date farthest from the reference date."""
+
+NUMBERS_KEPT = 12_000_000
+"""Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
 
@@ -87,6 +91,7 @@ class TemplateBank:
     ) -> None:
         model, samples = likelihood.model, likelihood.samples
         self.grid = grid
+        self._kept: list[tuple[IntArray, FloatArray, Templates]] | None = None
         self.n_data = likelihood.n_independent
         self.n_contrasts = model.n_contrasts
         self.rates_mas_yr = trial_rates(likelihood)
@@ -260,7 +265,19 @@ class TemplateBank:
                 yield both, rates, self._in_bands(cosine, sine, mirrored=True)
 
     def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
-        """Yield the same of companions at rest, alike in every band."""
+        """Yield the same of companions at rest, alike in every band; made once where they fit."""
+        if len(self) * self.n_data > 2 * NUMBERS_KEPT:
+            yield from self._made()
+            return
+        if self._kept is None:
+            self._kept = list(self._made())
+        yield from self._kept
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave to every process to make its own templates."""
+        return self.__dict__ | {"_kept": None}
+
+    def _made(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
         half, still = len(self.grid) // 2, np.zeros((1, 2))
         for index, cosine, sine in self._half_plane():
             yield np.concatenate([index, index + half]), still, self._mirrored(cosine, sine)

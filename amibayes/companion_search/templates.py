@@ -8,14 +8,18 @@ contrasts of their own there is one template of each band.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.companion_search.scan import GroupWeights, best_positive, weighted_gain
+from amibayes.companion_search.scan import (
+    GroupWeights,
+    ScaleGroups,
+    best_positive,
+    weighted_gain,
+)
 from amibayes.units import FloatArray, IntArray
 
 UNCOUPLED = 1e-6
@@ -127,6 +131,8 @@ class MirroredTemplates:
         Length squared, without the nuisance directions.
     basis : (n_data, k) float array
         The nuisance directions.
+    squares : dict
+        Sums of squares over groups of data that were asked for.
     """
 
     even: FloatArray
@@ -135,6 +141,7 @@ class MirroredTemplates:
     odd_rows: IntArray
     norm: FloatArray
     basis: FloatArray
+    squares: dict[int, tuple[ScaleGroups, FloatArray]] = field(default_factory=dict)
 
     @property
     def sigma(self) -> FloatArray:
@@ -148,7 +155,15 @@ class MirroredTemplates:
         templates[self.odd_rows] += sign * self.odd
         return templates - self.basis @ (self.basis.T @ templates)
 
-    @cached_property
+    def _squares(self, groups: ScaleGroups) -> FloatArray:
+        """Sums over the groups of the squares of templates, (n_groups, 2m), made once."""
+        known = self.squares.get(id(groups))
+        if known is None or known[0] is not groups:
+            known = groups, np.asarray(groups.sums(self.both**2))
+            self.squares[id(groups)] = known
+        return known[1]
+
+    @property
     def both(self) -> FloatArray:
         """Templates (n_data, 2m) of positions and mirror images."""
         return np.hstack([self.laid_out(), self.laid_out(-1.0)])
@@ -171,7 +186,7 @@ class MirroredTemplates:
 
     def weighted_gain(self, weights: GroupWeights, match: Match) -> FloatArray:
         """Gain in weighted χ²."""
-        ratio = self.norm.astype(match[0].dtype) / weights.sums(self.both**2)
+        ratio = self.norm.astype(match[0].dtype) / weights.of_sums(self._squares(weights.groups))
         return np.asarray(np.maximum(match[0], 0.0) ** 2 * ratio)
 
 

@@ -38,7 +38,7 @@ beams of the outermost ring need not be resolved for."""
 LEAST_PER_PLACE = 2
 """Draws of noise at every place: their differences are the Monte Carlo error."""
 
-AFFORDABLE = 6e10
+AFFORDABLE = 1.5e11
 """Positions times data of all injected companions together: some four seconds of one core. Large
 data on wide fields get fewer companions."""
 
@@ -56,7 +56,7 @@ LEVELS = (0.4, 4.0)
 """Contrasts of the completeness map, in units of the one that linear theory detects half of the
 time."""
 
-NULL_DRAWS, FRESH_WORK = 20_000, 5e10
+NULL_DRAWS, FRESH_WORK = 20_000, 8e10
 """Null searches from which the threshold is known to 0.01 mag, and positions times data of those
 that are added to the ones of the search: some two seconds of one core."""
 
