@@ -103,7 +103,8 @@ class StageBars:
         rate = (now - before) / max(clock - begun, 1e-9)
         left = f", {tqdm.format_interval((end - now) / rate)} left" if rate > 0 else ""
         unit = self._unit
-        _report(f"amibayes: {self._name}: {now} of {end} {unit}s, {rate:.3g} {unit}s/s{left}")
+        speed = f", {rate:.3g} {unit}s/s" if rate > 0 else ""
+        _report(f"amibayes: {self._name}: {now} of {end} {unit}s{speed}{left}")
 
     def end(self) -> None:
         """End the stage, and report how long it took where that is wanted."""

@@ -112,7 +112,8 @@ class EnsembleSampler:
             if self.path:
                 save_chain(sampler, self.path, digest)
             if self.progress:
-                self.progress(sampler.iteration, int(ENOUGH * longest(times(sampler))))
+                expected = int(ENOUGH * longest(times(sampler)))
+                self.progress(sampler.iteration, max(expected, sampler.iteration))
         return sampler
 
     def _drawn(self, log_prob: LogProb, prior: ModelPrior, rng: np.random.Generator) -> FloatArray:

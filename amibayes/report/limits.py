@@ -13,6 +13,7 @@ from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
 from amibayes.report.models import models_json
+from amibayes.report.words import percent
 from amibayes.support.atomic_files import atomic_path
 from amibayes.support.terminal import row, with_warnings
 from amibayes.units import contrast_to_delta_mag
@@ -121,9 +122,29 @@ def _add_columns(table: Table, measured: MeasuredLimit, report: LimitsReport) ->
     for key, values in columns.items():
         table[f"{key}_{name}"] = values
         table[f"{key}_{name}"].unit = "mag"
+        table[f"{key}_{name}"].description = _meaning(key, measured)
     if report.options.masses is not None:
         table[f"mass_{name}"] = report.options.masses.mass_at(limit.delta_mag)
         table[f"mass_{name}"].description = f"in {report.options.masses.unit}"
+
+
+MEANINGS = {
+    "delta_mag": "limit, mean over the position angle",
+    "delta_mag_p16": "16 % point over the position angle of the limit",
+    "delta_mag_p50": "50 % point over the position angle of the limit",
+    "delta_mag_p84": "84 % point over the position angle of the limit",
+    "delta_mag_error": "1 sigma of the limit",
+    "delta_mag_c50": "recovered half of the time",
+    "delta_mag_c50_error": "1 sigma of what is recovered half of the time",
+}
+"""What the columns of ``limits.ecsv`` hold, by the beginnings of their names."""
+
+
+def _meaning(key: str, measured: MeasuredLimit) -> str:
+    """Words for a column: what it holds, at which completeness, from which data."""
+    share = measured.limit.facts()["completeness"]
+    level = f", {percent(share)} recovered" if share and "c50" not in key else ""
+    return f"{MEANINGS.get(key, key)}{level}, from {NAMES[measured.observables]}"
 
 
 def write_limits_table(path: str | Path, report: LimitsReport) -> None:
@@ -166,9 +187,9 @@ def _rate_lines(content: Json) -> list[str]:
         return []
     low, high = content["false_positive_interval"]
     return [
-        f"limit       {content['completeness']:.0%} of companions recovered, false-positive rate "
-        f"{content['false_positive_rate']:.2g} (95%: {low:.2g} to {high:.2g}); "
-        f"{content['n_trials']} companions injected"
+        f"limit       {percent(content['completeness'])} of companions recovered, "
+        f"false-positive rate {content['false_positive_rate']:.2g} "
+        f"(95 %: {low:.2g} to {high:.2g}); {content['n_trials']} companions injected"
     ]
 
 

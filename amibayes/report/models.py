@@ -15,7 +15,7 @@ from amibayes.posterior.evidence import Evidence
 from amibayes.posterior.priors import Prior, Range
 from amibayes.report.common import Json, number
 from amibayes.report.page import Column, Section, Table
-from amibayes.report.words import chance, count, fixed, measured, plain
+from amibayes.report.words import chance, count, fixed, measured, percent, plain
 from amibayes.support.options import SKY_MODELS
 from amibayes.support.terminal import row
 
@@ -252,7 +252,7 @@ def models_lines(found: ModelComparison | None, beside: LimitsBeside | None = No
             row(
                 "limits",
                 f"beside the {beside.model}: delta mag {np.nanmin(depth):.2f} to "
-                f"{np.nanmax(depth):.2f} ({beside.limit.completeness:.0%} recovered)",
+                f"{np.nanmax(depth):.2f} ({percent(beside.limit.completeness)} recovered)",
             )
         )
     if verdict.degenerate:

@@ -8,7 +8,7 @@ import numpy as np
 
 from amibayes.companion_search.result import RIVAL, SearchResult
 from amibayes.detection.false_alarm import Significance
-from amibayes.detection.tails import MIN_PROBABILITY
+from amibayes.detection.tails import Tail
 from amibayes.limits.limit import DetectionLimit
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.posterior.ensemble import Posterior
@@ -16,7 +16,7 @@ from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.models import models_lines
 from amibayes.report.result import upper_limit
-from amibayes.report.words import places_of
+from amibayes.report.words import FARTHEST_TOLD, percent, places_of
 from amibayes.support.terminal import row, with_warnings
 
 EVEN = 0.5
@@ -39,8 +39,8 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         _verdict(report),
         *_best_fit(report),
         f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
-        f"({result.ndof} dof: reduced {result.chi2_single / result.ndof:.3f} -> "
-        f"{result.chi2_binary / result.ndof:.3f})",
+        f"({result.ndof} dof: reduced {three_digits(result.chi2_single / result.ndof)} -> "
+        f"{three_digits(result.chi2_binary / result.ndof)})",
         f"detection   delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
@@ -110,6 +110,19 @@ def with_error(value: float, error: float, unit: str = "", largest: float = np.i
     return f"{value:.{places}f} +/- {error:.{places}f}{unit}"
 
 
+def with_sides(median: float, low: float, high: float) -> str:
+    """Write a median and the sides of its interval, to the second digit of the smaller one."""
+    below, above = median - low, high - median
+    if above + below > OPEN_SHARE * abs(median):
+        return f"{low:.3g} to {high:.3g}"
+    least = min((x for x in (below, above) if x > 0.0), default=0.0)
+    places = max(0, places_of(least)) if least > 0.0 else 4
+    return f"{median:.{places}f} +{above:.{places}f} -{below:.{places}f}"
+
+
+OPEN_SHARE = 1.0
+"""An interval wider than this share of its median has no middle worth stating: its ends are."""
+
 LARGEST_MAG, LARGEST_ANGLE_DEG = 1.5, 60.0
 """Errors of a magnitude and of an angle beyond which either may have any value."""
 
@@ -122,47 +135,59 @@ def _verdict(report: SearchReport) -> str:
         return f"companion   undecided: {tested.n_draws} null draws are too few"
     if report.verdict is not None and report.verdict.statement not in ("companion", "no companion"):
         return f"companion   not stated: see the verdict; {_chance(tested)}"
-    verdict = "DETECTED" if tested.detected else "not detected"
-    return f"companion   {verdict}; {_chance(tested)}"
+    if report.verdict is None:
+        verdict = "DETECTED" if tested.detected else "not detected"
+        return f"companion   {verdict}; {_chance(tested)}"
+    # The verdict has said whether there is one, and with which probability.
+    return row("false alarm", _chance(tested, stated=report.verdict.statement == "companion"))
 
 
-def _chance(tested: Significance) -> str:
+def _chance(tested: Significance, *, stated: bool = False) -> str:
     """The false-alarm probability, with that by randomised residuals where there is one."""
     check = tested.randomised
     if check is None or check.probability is None:
-        return _parametric(tested)
+        return _parametric(tested, stated=stated)
     if check.probability < tested.probability:
-        return f"{_parametric(tested)}; {check.note}"
+        return f"{_parametric(tested, stated=stated)}; {check.note}"
     low, high = tested.interval
     return (
-        f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) by "
+        f"false-alarm probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) by "
         f"randomised residuals of {check.n_exposures} exposures; {tested.parametric:.2g} by "
         f"{tested.n_draws} null searches"
     )
 
 
-def _parametric(tested: Significance) -> str:
+def _parametric(tested: Significance, *, stated: bool = False) -> str:
     """The false-alarm probability, and past the draws what is no more than extrapolated."""
     low, high = tested.interval
     tail = tested.tail
     if tail is None:
         return (
-            f"false-alarm probability {tested.probability:.2g} (95%: {low:.2g} to {high:.2g}) "
+            f"false-alarm probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) "
             f"in {tested.n_draws} null searches"
         )
-    above = tested.n_above
+    told = "" if stated else f": false-alarm probability below {high:.2g} (95 %)"
     return (
-        f"{above or 'none'} of {tested.n_draws} null searches reach it: false-alarm probability "
-        f"below {high:.2g} (95%); extrapolated {_power(tail.generalised_pareto)} (Pareto), "
-        f"{_power(tail.extreme_value)} (extreme value)"
+        f"{tested.n_above or 'none'} of {tested.n_draws} null searches reach it{told}; "
+        f"extrapolated {_laws(tail)}"
     )
 
 
+def _laws(tail: Tail) -> str:
+    """Extrapolations by both laws, which are known to a power of ten; one where they agree."""
+    pareto, extreme = _power(tail.generalised_pareto), _power(tail.extreme_value)
+    return pareto if pareto == extreme else f"{pareto} (Pareto), {extreme} (extreme value)"
+
+
 def _power(probability: float) -> str:
-    """An extrapolation is known to a power of ten."""
-    if probability <= MIN_PROBABILITY:
-        return f"< {MIN_PROBABILITY:.0e}"
+    if probability < FARTHEST_TOLD:
+        return f"< {FARTHEST_TOLD:.0e}"
     return f"{probability:.0e}"
+
+
+def three_digits(value: float) -> str:
+    """A reduced χ²: three digits that count, more only where it is large."""
+    return f"{value:.0f}" if value >= 100.0 else f"{value:#.3g}"
 
 
 def _nuisance_lines(report: SearchReport) -> list[str]:
@@ -213,7 +238,7 @@ def _limit_lines(limits: DetectionLimit) -> list[str]:
         return ["limits      no injected companion is recovered reliably in this field"]
     return [
         f"limits      delta mag {delta.min():.2f} to {delta.max():.2f} at {rho.min():.0f} to "
-        f"{rho.max():.0f} mas ({limits.completeness:.0%} recovered, false-positive rate "
+        f"{rho.max():.0f} mas ({percent(limits.completeness)} recovered, false-positive rate "
         f"{limits.false_positive_rate:.2g})"
     ]
 
@@ -224,14 +249,22 @@ def _upper_limit_lines(report: SearchReport) -> list[str]:
         return []
     return [
         f"upper limit contrast < {limit['contrast']:.2g}, delta mag > {limit['delta_mag']:.2f} "
-        f"({limit['level']:.0%}, anywhere in the field; prior: {limit['prior']})"
+        f"({percent(limit['level'])}, anywhere in the field; prior: {limit['prior']})"
     ]
 
 
 def _evidence_lines(evidence: Evidence) -> list[str]:
     shares = zip(evidence.companions, evidence.log_z, evidence.probability, strict=True)
-    parts = [f"{k}: ln Z {z:.1f} ({p:.2g})" for k, z, p in shares]
+    parts = [f"{k}: ln Z {z:.1f} ({_share(p)})" for k, z, p in shares]
     return [f"evidence    companions (probability) {', '.join(parts)}"]
+
+
+def _share(probability: float) -> str:
+    """Probability of a model; one that the evidences leave no chance has no digits."""
+    return f"{probability:.2g}" if probability >= LEAST_SHARE else f"< {LEAST_SHARE:.0e}"
+
+
+LEAST_SHARE = 1e-6
 
 
 def _second_lines(report: SearchReport, evidence: Evidence) -> list[str]:
@@ -244,9 +277,15 @@ def _second_lines(report: SearchReport, evidence: Evidence) -> list[str]:
         key=lambda c: np.hypot(c.east_mas - first.east_mas, c.north_mas - first.north_mas),
     )
     gain = report.result.chi2_binary - evidence.two.chi2
+    angle = with_error(
+        other.position_angle_deg, other.position_angle_error_deg, " deg", LARGEST_ANGLE_DEG
+    )
+    separation = with_error(
+        other.separation_mas, other.separation_error_mas, " mas", other.separation_mas
+    )
     line = (
-        f"second      {other.separation_mas:.2f} mas, PA {other.position_angle_deg:.2f} deg, "
-        f"contrast {other.contrast:.5f}: delta chi2 {gain:.1f}"
+        f"second      {separation}, PA {angle}, contrast "
+        f"{with_error(other.contrast, other.contrast_error, largest=1.0)}: delta chi2 {gain:.1f}"
     )
     if report.second_significance is not None:
         tested = report.second_significance
@@ -261,11 +300,10 @@ def _posterior_lines(posterior: Posterior) -> list[str]:
         ("position_angle_deg", "deg"),
         ("delta_mag", "mag"),
     ):
-        median, low, high = posterior.interval(name)
-        parts.append(f"{median:.2f} +{high - median:.2f} -{median - low:.2f} {unit}")
+        parts.append(f"{with_sides(*posterior.interval(name))} {unit}")
     state = "converged" if posterior.converged else "NOT CONVERGED"
     return [
-        f"posterior   {', '.join(parts)} (median, 68%)",
+        f"posterior   {', '.join(parts)} (median, 68 %)",
         f"chain       {posterior.n_steps} steps, tau {posterior.autocorrelation_time:.1f}, "
         f"split R-hat {posterior.split_rhat:.3f}: {state}",
     ]

@@ -67,6 +67,16 @@ def chance(probability: float) -> str:
     return plain(probability, 2)
 
 
+FARTHEST_TOLD = 1e-10
+"""Extrapolated probabilities below this have no number: thousands of draws say that they are
+small, and laws fitted to them no more."""
+
+
+def percent(share: float) -> str:
+    """Write a share as everywhere: 95 %."""
+    return f"{100.0 * share:.0f} %"
+
+
 def count(number: int, one: str, many: str | None = None) -> str:
     """Write a number of things: 1 mode, 2 modes, 10 000 draws."""
     written = f"{number:,}".replace(",", "\u202f")

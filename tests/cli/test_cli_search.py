@@ -42,7 +42,7 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
     assert run("search", *words) == 0
     summary = capsys.readouterr().out.strip().split("\n")
     assert len(summary) <= 20
-    assert any("DETECTED" in line for line in summary)
+    assert summary[0].startswith("verdict     COMPANION: ")
     result = json.loads((out / "result.json").read_text())
     assert set(result) == KEYS
     fit = result["fit"]

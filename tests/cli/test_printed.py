@@ -78,7 +78,7 @@ def test_two_companions_and_a_disc_are_told(report: SearchReport) -> None:
     )
     words = line(report, "second").split()
     assert float(words[1]) == pytest.approx(np.hypot(*other[:2]), abs=10.0)
-    assert float(words[4]) == pytest.approx(np.degrees(np.arctan2(*other[:2])) % 360, abs=4.0)
+    assert float(words[6]) == pytest.approx(np.degrees(np.arctan2(*other[:2])) % 360, abs=4.0)
     gain = report.result.chi2_binary - report.evidence.two.chi2
     assert f"delta chi2 {gain:.1f} (detected; " in line(report, "second")
     assert "1: ln Z" in line(report, "evidence")

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
-from amibayes.detection.tails import MIN_PROBABILITY
 from amibayes.models.bands import band_name
 from amibayes.report.page import Column, Fact, Section, Table
 from amibayes.report.sections.joint import joint_tables
 from amibayes.report.statement import false_alarm, field
-from amibayes.report.words import NONE, chance, count, fixed, measured, places_of, plain
+from amibayes.report.words import (
+    FARTHEST_TOLD,
+    NONE,
+    chance,
+    count,
+    fixed,
+    measured,
+    places_of,
+    plain,
+)
 
 Json = dict[str, Any]
 
@@ -38,7 +46,7 @@ def search(content: Json) -> Section:
         f"Every position of the field, {field(content)}, was tried. χ² falls from "
         f"{fixed(fit['chi2_single'], 1)} without a companion to "
         f"{fixed(fit['chi2_binary'], 1)} with one, for {count(fit['ndof'], 'degree')} of freedom: "
-        f"reduced, from {fixed(fit['chi2r_single'], 3)} to {fixed(fit['chi2r_binary'], 3)}.",
+        f"reduced, from {plain(fit['chi2r_single'])} to {plain(fit['chi2r_binary'])}.",
     )
     return Section(
         "Search",
@@ -146,8 +154,8 @@ def _extrapolated(s: Json) -> tuple[Fact, ...]:
 
 
 def _by_law(probability: float) -> str:
-    if probability < MIN_PROBABILITY:
-        return f"<\u00a0{chance(MIN_PROBABILITY)}"
+    if probability < FARTHEST_TOLD:
+        return f"<\u00a0{chance(FARTHEST_TOLD)}"
     return chance(probability)
 
 
