@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         "steps": steps,
         "compared": _compared(truth(folder / SCENE), found["fit"]),
         "detected": found["significance"]["detected"],
+        "statement": found["verdict"]["statement"],
         "report": str(folder / "search" / "report.html"),
     }
     write_json(folder / RESULT, content)
@@ -114,10 +115,9 @@ def _compared(true: dict[str, float], fit: dict[str, Any]) -> dict[str, dict[str
 
 
 def _summary(content: dict[str, Any]) -> list[str]:
-    state = {True: "detected", False: "NOT detected", None: "not tested"}[content["detected"]]
     lines = [
         "",
-        f"companion {state}",
+        f"the search states: {content['statement']}",
         f"{'':22}{'truth':>10}{'found':>12}{'error':>10}{'off by':>10}",
     ]
     for name, (label, unit, places) in COMPARED.items():

@@ -85,6 +85,8 @@ def _best_fit(report: SearchReport) -> list[str]:
         f"{with_error(c.separation_mas, c.separation_error_mas, ' mas', c.separation_mas)}, "
         f"PA {angle} (E {c.east_mas:.{places}f}, N {c.north_mas:.{places}f} mas)"
     )
+    if found is not None and found.statement == "no companion":
+        place = f"{place}: no more than noise gives"
     return [row("best fit", place), contrast]
 
 
@@ -123,6 +125,9 @@ def with_sides(median: float, low: float, high: float) -> str:
 OPEN_SHARE = 1.0
 """An interval wider than this share of its median has no middle worth stating: its ends are."""
 
+OPEN_ANGLE_DEG = 180.0
+"""A 68 % interval of position angles wider than this leaves every direction open."""
+
 LARGEST_MAG, LARGEST_ANGLE_DEG = 1.5, 60.0
 """Errors of a magnitude and of an angle beyond which either may have any value."""
 
@@ -134,10 +139,10 @@ def _verdict(report: SearchReport) -> str:
     if tested.detected is None:
         return f"companion   undecided: {tested.n_draws} null draws are too few"
     if report.verdict is not None and report.verdict.statement not in ("companion", "no companion"):
-        return f"companion   not stated: see the verdict; {_chance(tested)}"
+        return f"companion   not stated: see the verdict; false alarm: {_chance(tested)}"
     if report.verdict is None:
         verdict = "DETECTED" if tested.detected else "not detected"
-        return f"companion   {verdict}; {_chance(tested)}"
+        return f"companion   {verdict}; false alarm: {_chance(tested)}"
     # The verdict has said whether there is one, and with which probability.
     return row("false alarm", _chance(tested, stated=report.verdict.statement == "companion"))
 
@@ -151,7 +156,7 @@ def _chance(tested: Significance, *, stated: bool = False) -> str:
         return f"{_parametric(tested, stated=stated)}; {check.note}"
     low, high = tested.interval
     return (
-        f"false-alarm probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) by "
+        f"probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) by "
         f"randomised residuals of {check.n_exposures} exposures; {tested.parametric:.2g} by "
         f"{tested.n_draws} null searches"
     )
@@ -163,10 +168,10 @@ def _parametric(tested: Significance, *, stated: bool = False) -> str:
     tail = tested.tail
     if tail is None:
         return (
-            f"false-alarm probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) "
+            f"probability {tested.probability:.2g} (95 %: {low:.2g} to {high:.2g}) "
             f"in {tested.n_draws} null searches"
         )
-    told = "" if stated else f": false-alarm probability below {high:.2g} (95 %)"
+    told = "" if stated else f": probability below {high:.2g} (95 %)"
     return (
         f"{tested.n_above or 'none'} of {tested.n_draws} null searches reach it{told}; "
         f"extrapolated {_laws(tail)}"
@@ -200,7 +205,8 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
         for k in parameters.nuisance
     }
     for name, (value, error) in (result.star_alone() if alone else star).items():
-        label, unit = name.removesuffix("_mas"), " mas" if name.endswith("_mas") else ""
+        label = name.removesuffix("_mas").replace("limb_darkening", "limb dark.")
+        unit = " mas" if name.endswith("_mas") else ""
         if name == "diameter_mas" and value < UNRESOLVED * error:
             bound = value + UNRESOLVED * error
             shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
@@ -218,7 +224,7 @@ def _noise_lines(report: SearchReport) -> list[str]:
     names = {"vis2": ("V2", 1.0), "closure_phase_rad": ("deg closure phase", np.degrees(1.0))}
     parts = []
     for name, noise in found.items():
-        if ":" in name and noise.probability_none > EVEN:
+        if noise.probability_none > EVEN:
             continue
         kind, _, source = name.partition(":")
         label, unit = names[kind]
@@ -300,7 +306,11 @@ def _posterior_lines(posterior: Posterior) -> list[str]:
         ("position_angle_deg", "deg"),
         ("delta_mag", "mag"),
     ):
-        parts.append(f"{with_sides(*posterior.interval(name))} {unit}")
+        median, low, high = posterior.interval(name)
+        if name == "position_angle_deg" and high - low > OPEN_ANGLE_DEG:
+            parts.append("any position angle")
+            continue
+        parts.append(f"{with_sides(median, low, high)} {unit}")
     state = "converged" if posterior.converged else "NOT CONVERGED"
     return [
         f"posterior   {', '.join(parts)} (median, 68 %)",

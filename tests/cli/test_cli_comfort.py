@@ -243,6 +243,7 @@ def test_demo_runs_the_loop_and_finds_the_truth(tmp_path: Path, capsys) -> None:
     content = json.loads(capsys.readouterr().out)
     assert content == json.loads((out / "demo.json").read_text())
     assert content["detected"] is True
+    assert content["statement"] == "companion"
     assert [step["command"].split()[1] for step in content["steps"]] == [
         "simulate", "extract", "search",
     ]  # fmt: skip

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import json
+import os
 import re
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import amibayes
+from amibayes.support.environment import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -67,3 +71,58 @@ def test_every_public_argument_and_result_has_a_type(name: str, function: object
     assert not bare, f"{name}: {bare}"
     # Dataclasses write their own __init__, whose result nobody needs to be told.
     assert name.endswith("__init__") or signature.return_annotation is not signature.empty
+
+
+def recipe() -> str:
+    return (ROOT / "recipe" / "meta.yaml").read_text(encoding="utf-8")
+
+
+CONDA_NAMES = {
+    "astropy": "astropy-base",
+    "matplotlib": "matplotlib-base",
+    "lazy_loader": "lazy-loader",
+}
+"""Packages of conda-forge that have other names there; the -base ones come without a screen."""
+
+
+def test_the_recipe_asks_for_what_the_project_asks_for() -> None:
+    run = re.search(r"^  run:\n((?:    - .*\n)+)", recipe(), re.MULTILINE)
+    assert run is not None
+    asked = dict(re.findall(r"- (\S+) (>=[\d.]+)$", run[1], re.MULTILINE))
+    needed = dict(re.split("(?=>=)", entry) for entry in PROJECT["project"]["dependencies"])
+    assert asked == {CONDA_NAMES.get(name, name): bound for name, bound in needed.items()}
+    oldest = (ROOT / "recipe" / "conda_build_config.yaml").read_text(encoding="utf-8")
+    assert f'"{PROJECT["project"]["requires-python"].removeprefix(">=")}"' in oldest
+
+
+def test_every_place_states_one_version_and_one_title() -> None:
+    deposit = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    cited = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f'set version = "{amibayes.__version__}"' in recipe()
+    assert f'title: "{deposit["title"]}"' in cited
+    assert f"keywords: [{', '.join(deposit['keywords'])}]" in cited
+    assert deposit["license"] == PROJECT["project"]["license"]["text"]
+    assert "license: BSD-3-Clause" in cited
+
+
+def test_one_extra_brings_all_that_users_need() -> None:
+    extras = PROJECT["project"]["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = set(re.findall(r"\[(.*)\]", everything)[0].split(","))
+    # MPI needs a library of the cluster's own.
+    assert named == set(EXTRAS) - {"mpi"}
+    assert set(EXTRAS) <= set(extras)
+
+
+@pytest.mark.parametrize("script", ["release", "recipe", "package", "run"])
+def test_scripts_of_continuous_integration_can_be_run(script: str) -> None:
+    path = ROOT / ".ci" / script
+    assert os.access(path, os.X_OK)
+    subprocess.run(["bash", "-n", str(path)], check=True)
+
+
+def test_the_container_is_made_of_the_wheel() -> None:
+    text = (ROOT / "Containerfile").read_text(encoding="utf-8")
+    assert "--wheel" in text
+    assert 'ENTRYPOINT ["amibayes"]' in text
+    assert "USER observer" in text
