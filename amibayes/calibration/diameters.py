@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def diameters_of(
     given : str or path, optional
         ``0.31:0.02,0.4`` in the order of the calibrators; or a table (ECSV, CSV, FITS) with
         columns name, diameter_mas and, if known, error_mas, whose name is that of the file or
-        of its target.
+        of its target; or one of the JSDC, of which the band of the data is taken.
 
     Raises
     ------
@@ -61,28 +61,57 @@ def _from_table(path: str, calibrators: Sequence[Observables]) -> list[Diameter]
 
     try:
         table = Table.read(path)
-        names = [str(name).strip().casefold() for name in table["name"]]
-        values = [float(x) for x in table["diameter_mas"]]
-        errors = [float(x) for x in table["error_mas"]] if "error_mas" in table.colnames else []
+        columns = {column.casefold(): column for column in table.colnames}
+        names = [_plain_name(str(name)) for name in table[columns["name"]]]
+        sizes = {key: [float(x) for x in table[columns[key]]] for key in columns if _is_size(key)}
+        own = "diameter_mas" in sizes
+        if not own and not any(key.startswith("udd") for key in sizes):
+            raise KeyError("diameter_mas")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
             "is no table of diameters",
             source=path,
-            remedy="give columns name, diameter_mas and, if known, error_mas",
+            remedy="give columns name, diameter_mas and, if known, error_mas, or those of the JSDC",
         ) from error
     out = []
     for calibrator in calibrators:
         file = Path(calibrator.source)
         known = {file.name, file.stem, str(file), calibrator.setups[0].target}
-        rows = [i for i, name in enumerate(names) if name in {k.casefold() for k in known}]
+        rows = [i for i, name in enumerate(names) if name in {_plain_name(k) for k in known}]
         if not rows:
             raise DataError(
                 f"has no line for {calibrator.source} ({calibrator.setups[0].target})",
                 source=path,
                 remedy="name the file or its target",
             )
-        out.append((values[rows[0]], errors[rows[0]] if errors else 0.0))
+        size = "diameter_mas" if own else _band_of(calibrator, sizes)
+        sigma = sizes.get("error_mas" if own else "e_ldd")
+        out.append((sizes[size][rows[0]], sigma[rows[0]] if sigma else 0.0))
     return out
+
+
+JSDC_BANDS_UM = {
+    "uddb": 0.44, "uddv": 0.55, "uddr": 0.66, "uddi": 0.8, "uddj": 1.25, "uddh": 1.65,
+    "uddk": 2.2, "uddl": 3.5, "uddm": 4.8, "uddn": 10.0,
+}  # fmt: skip
+"""Columns of the JMMC Stellar Diameters Catalogue (Bourges et al. 2017, VizieR II/346) with
+uniform-disc diameters in mas, and the wavelengths of their bands."""
+
+
+def _is_size(key: str) -> bool:
+    return key in ("diameter_mas", "error_mas", "e_ldd", *JSDC_BANDS_UM)
+
+
+def _plain_name(name: str) -> str:
+    """A name as catalogues and headers both have it: HD_12345 is HD 12345."""
+    return name.strip().casefold().replace(" ", "").replace("_", "")
+
+
+def _band_of(calibrator: Observables, sizes: Mapping[str, Sequence[float]]) -> str:
+    """Column of the band nearest to a calibrator's wavelengths."""
+    wavelength = 1e6 * float(np.median(np.concatenate([s.wavelength_m for s in calibrator.setups])))
+    known = {key: um for key, um in JSDC_BANDS_UM.items() if key in sizes}
+    return min(known, key=lambda key: abs(np.log(known[key] / wavelength)))
 
 
 def without_disc(calibrator: Observables, diameter_mas: float) -> Observables:

@@ -22,7 +22,7 @@ from amibayes.calibration import (
 from amibayes.cli import data_options
 from amibayes.cli.main import build_parser
 from amibayes.data.covariance import scaled
-from amibayes.errors import UsageError
+from amibayes.errors import DataError, UsageError
 from amibayes.oifits import read_oifits
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import prepare
@@ -123,3 +123,18 @@ def test_diameters_need_calibrators() -> None:
         data_options.search_settings(arguments)
     assert isinstance(arguments, argparse.Namespace)
     assert diameters_of(None, []) is None
+
+
+def test_a_table_of_the_jsdc_gives_the_diameter_in_the_band_of_the_data(path: Path) -> None:
+    """Columns of VizieR II/346; spaces of names do not matter."""
+    data = read_oifits(path)
+    setup = replace(data.setups[0], target="HD_100", wavelength_m=np.array([1.6e-6, 1.7e-6]))
+    star = replace(data, setups=(setup,))
+    table = path.with_name("jsdc.csv")
+    table.write_text("Name,LDD,e_LDD,UDDH,UDDK\nHD 99,9,9,9,9\nHD 100,0.52,0.03,0.50,0.51\n")
+    assert diameters_of(table, [star]) == [(0.50, 0.03)]
+    infrared = replace(star, setups=(replace(setup, wavelength_m=np.array([2.2e-6])),))
+    assert diameters_of(table, [infrared]) == [(0.51, 0.03)]
+    table.write_text("Name,LDD\nHD 100,0.52\n")
+    with pytest.raises(DataError, match="or those of the JSDC"):
+        diameters_of(table, [star])

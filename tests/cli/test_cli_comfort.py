@@ -20,6 +20,7 @@ from commands import run
 from amibayes.cli.completion import whole_parser
 from amibayes.cli.main import COMMANDS, EXAMPLES, build_parser, command_parsers
 from amibayes.support.environment import EXTRAS, Checkup, Package, requirements
+from amibayes.support.options import CalibrationMethod, choices
 
 ROOT = Path(__file__).resolve().parents[2]
 
