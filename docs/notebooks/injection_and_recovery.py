@@ -44,7 +44,7 @@ assert share[6.0] > 0.8 > 0.1 > share[9.0]
 # The limit is where 95 of 100 are recovered; `to_xarray` has the completeness of every cell.
 
 # %%
-limit = ab.detection_limit(found, tested, rng, separation_mas=[150.0, 250.0], trials_per_cell=10)
+limit = ab.detection_limit(found, tested, rng, separation_mas=[150.0, 250.0], trials=100)
 limit
 assert (limit.delta_mag > 6.0).all()
 assert (limit.delta_mag < 8.0).all()
