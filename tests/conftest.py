@@ -35,6 +35,27 @@ def pytest_configure() -> None:
             os.environ.setdefault(name, "1")
 
 
+ON_REQUEST = ("slow", "release")
+"""Marks of tests that run where an expression of ``-m`` asks for them, and not else."""
+
+
+def asked_for(mark: str, expression: str) -> bool:
+    """Whether an expression of ``-m`` names a mark without denying it."""
+    words = expression.replace("(", " ").replace(")", " ").split()
+    return any(word == mark and (k == 0 or words[k - 1] != "not") for k, word in enumerate(words))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out slow and release tests unless they are asked for, whatever else ``-m`` says."""
+    off = {mark for mark in ON_REQUEST if not asked_for(mark, config.option.markexpr)}
+    marks = [{mark.name for mark in item.iter_markers()} & set(ON_REQUEST) for item in items]
+    # A test with both marks runs for either.
+    dropped = [item for item, own in zip(items, marks, strict=True) if own and own <= off]
+    if dropped:
+        config.hook.pytest_deselected(items=dropped)
+        items[:] = [item for item in items if item not in set(dropped)]
+
+
 def _greet_arviz() -> None:
     """Let ArviZ, which corner imports, say what it says once a day, before any test does.
 

@@ -96,5 +96,7 @@ def limits_beside(
     tested = significance(
         statistic_of(result, stated_errors=True), null_draws, streams[0], alpha, executor=executor
     )
+    if tested.detected is None:
+        return None  # a false-positive rate that so few draws cannot reach
     limit = detection_limit(result, tested, streams[1], executor=executor)
     return LimitsBeside(best.name, result, tested, limit)

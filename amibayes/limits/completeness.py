@@ -38,8 +38,8 @@ beams of the outermost ring need not be resolved for."""
 LEAST_PER_PLACE = 2
 """Draws of noise at every place: their differences are the Monte Carlo error."""
 
-AFFORDABLE = 1.5e11
-"""Positions times data of all injected companions together: some four seconds of one core. Large
+AFFORDABLE = 2.5e11
+"""Positions times data of all injected companions together: some eight seconds of one core. Large
 data on wide fields get fewer companions."""
 
 COMPLETENESS = 0.95

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from amibayes.limits.injection import allocate
 from amibayes.limits.logistic import fit_logistic
 
 X = np.log(np.geomspace(0.4, 4.0, 14))
@@ -62,7 +61,7 @@ def test_errors_of_both_crossings_are_what_the_crossings_scatter() -> None:
 def test_normal_law_of_the_contrast_is_followed(unequal: float) -> None:
     """A statistic that scatters normally is no logistic curve in ln c; 95 % must still be 95 %.
 
-    Expected counts, allocated as the rounds do, of directions whose sensitivities differ.
+    Expected counts, more where they tell more, of directions whose sensitivities differ.
     """
     sigma = np.exp(unequal * stats.norm.ppf((np.arange(50) + 0.5) / 50))
 
@@ -85,20 +84,3 @@ def test_all_or_nothing() -> None:
     assert 0.0 < error < 0.2
     assert fit_logistic(X, 0.0 * step, trials).crossing(0.95)[0] == np.inf
     assert fit_logistic(X, trials, trials).crossing(0.5)[0] == -np.inf
-
-
-def test_rounds_go_where_the_map_is_uncertain_and_are_whole() -> None:
-    first = allocate(np.zeros((3, 14), int), np.zeros((3, 14), int), 421)
-    assert first.sum() == 421
-    assert np.ptp(first) == 1
-    p = np.tile(special.expit(5.0 * X), (3, 1))
-    trials = np.full((3, 14), 1000)
-    extra = allocate(trials, np.rint(1000 * p).astype(int), 90_000)
-    assert extra.sum() == 90_000
-    assert extra.min() >= 0
-    share = (trials + extra)[0] / (trials + extra)[0].sum()
-    wanted = np.sqrt(p[0] * (1 - p[0]))
-    free = extra[0] > 100  # what was there already is too much at the ends
-    np.testing.assert_allclose(
-        share[free] / share[free].sum(), wanted[free] / wanted[free].sum(), rtol=0.05
-    )
