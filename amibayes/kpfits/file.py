@@ -113,7 +113,7 @@ class KernelFile:
 
 def is_kpfits(names: Collection[str]) -> bool:
     """Whether a file with these names of HDUs (in capitals) holds kernel phases."""
-    return "KP-DATA" in names
+    return any(name.startswith("KP-DATA") for name in names)
 
 
 def open_kpfits(path: str | Path) -> KernelFile:
@@ -126,6 +126,12 @@ def open_kpfits(path: str | Path) -> KernelFile:
     """
     with reporting_damage(path), fits.open(path, memmap=False) as hdus:
         there = {hdu.name.upper(): hdu for hdu in hdus[1:]}
+        if "KP-DATA" not in there and is_kpfits(there):
+            raise DataError(
+                "holds kernel phases in XARA's own structure (KP-DATA1, ...), not in KPFITS",
+                source=path,
+                remedy="save them as KPFITS, with KP-COV or KP-SIGM",
+            )
         missing = [name for name in ("KP-DATA", *NEEDED) if name not in there]
         if missing:
             raise DataError(

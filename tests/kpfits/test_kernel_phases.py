@@ -223,6 +223,17 @@ BAD = {
 }
 
 
+def test_the_structure_of_xara_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = kernel_file(tmp_path / "a.fits")
+    with fits.open(path) as hdus:
+        hdus["KP-DATA"].name = "KP-DATA1"
+        hdus.writeto(tmp_path / "x.fits")
+    assert main(["search", str(tmp_path / "x.fits"), "--out", str(tmp_path / "o")]) == 3
+    assert "in XARA's own structure" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_get_one_line(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
