@@ -223,9 +223,7 @@ BAD = {
 }
 
 
-def test_the_structure_of_xara_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_structure_of_xara_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = kernel_file(tmp_path / "a.fits")
     with fits.open(path) as hdus:
         hdus["KP-DATA"].name = "KP-DATA1"
