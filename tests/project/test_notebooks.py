@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -57,3 +58,30 @@ def test_a_notebook_is_executed_by_jupyter(make: SimpleNamespace) -> None:
     made = make.executed(make.notebook((FOLDER / "first_look.py").read_text(encoding="utf-8")))
     shown = [cell["outputs"] for cell in made["cells"] if cell["cell_type"] == "code"]
     assert any("text/html" in output.get("data", {}) for outputs in shown for output in outputs)
+
+
+def test_the_tutorial_of_the_repository_is_that_of_the_documentation() -> None:
+    """Its prose and code; the output is that of the run it was made from."""
+    page = (ROOT / "examples" / "tutorial" / "README.md").read_text(encoding="utf-8")
+    source = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+    code = (ROOT / "docs" / "tutorial.py").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)\n```", page, re.M | re.S)
+    assert len(blocks) >= 8
+    assert all(block in code for block in blocks)
+    headings = re.findall(r"^#+ .*", source, re.M)
+    assert [line for line in page.splitlines() if line in headings] == headings
+    assert "{literalinclude}" not in page
+    pictures = re.findall(r"!\[.+\]\((\w+\.png)\)", page)
+    assert len(pictures) >= 5
+    for name in pictures:
+        assert (ROOT / "examples" / "tutorial" / name).stat().st_size < 100_000
+    for link in re.findall(r"\]\((\.\./[^)#]+)", page):
+        assert (ROOT / "examples" / "tutorial" / link).exists(), link
+
+
+def test_inclusions_are_cut_at_their_marks() -> None:
+    make = runpy.run_path(str(ROOT / "docs" / "render_tutorial.py"))
+    text = "# [a]\none\n# [/a]\n# [b]\ntwo\n# [/b]\n"
+    options = ':start-after: "# [b]"\n:end-before: "# [/b]"\n'
+    assert make["part"](text, options) == "two"
+    assert make["part"](text, ":language: text\n") == text.strip("\n")
