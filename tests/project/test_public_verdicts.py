@@ -1,0 +1,47 @@
+"""What the main job says, with no option, of public data whose object is known."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def _script() -> ModuleType:
+    path = DOCS / "public_verdicts.py"
+    spec = importlib.util.spec_from_file_location("public_verdicts", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+VERDICTS = _script()
+FAST = ("Canopus, MATISSE", "α Cen A, first file")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(
+            case,
+            id=case.name.replace(" ", "_"),
+            marks=[] if case.name in FAST else [pytest.mark.slow],
+        )
+        for case in VERDICTS.CASES
+    ],
+)
+def test_the_verdict_of_public_data_is_right(data: Path, case: object) -> None:
+    assert not VERDICTS.faults(case, VERDICTS.searched(case, data))
+
+
+def test_the_page_has_every_case() -> None:
+    text = (DOCS / "public_verdicts.md").read_text(encoding="utf-8")
+    assert not [c.name for c in VERDICTS.CASES if f"| {c.name} |" not in text]
