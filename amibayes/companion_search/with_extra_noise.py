@@ -71,8 +71,10 @@ def search_with_noise(
             tried.append((_score(result), result, noise))
     if converged:
         return tried[-1][1], tried[-1][2]
-    # Noise and position chase each other: the most likely pair of those tried stands.
-    _, result, noise = min(tried, key=lambda t: t[0])
+    # Noise and position chase each other: the most likely pair of those tried stands, each with
+    # the calibration errors that are there for certain.
+    floors = noise.floors
+    _, result, noise = min((t for t in tried if t[2].floors == floors), key=lambda t: t[0])
     return replace(result, warnings=(*result.warnings, NOT_CONVERGED)), noise
 
 
@@ -118,16 +120,18 @@ def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
     """Shares of channels agree where they differ by little of what they are uncertain by."""
     if len(a.channels) != len(b.channels):
         return False
-    each = zip(a.channels, b.channels, strict=True)
+    each = list(zip(a.channels, b.channels, strict=True))
+    pairs = [(x.vis2, y.vis2) for x, y in each]
+    pairs += [(x.closure_phase, y.closure_phase) for x, y in each]
     return all(
-        abs(x.vis2.value - y.vis2.value) <= SHARE_CONVERGED
-        and abs(x.closure_phase.value - y.closure_phase.value) <= SHARE_CONVERGED
-        for x, y in each
+        abs(x.value - y.value) <= max(SHARE_CONVERGED, SHARE_OF_ERROR * np.nan_to_num(y.error))
+        for x, y in pairs
     )
 
 
-SHARE_CONVERGED = 0.02
-"""Change of a correlation at which search and noise agree: below what a hundred exposures tell."""
+SHARE_CONVERGED, SHARE_OF_ERROR = 0.02, 0.25
+"""Change of a correlation at which search and noise agree: below what a hundred exposures tell, or
+a quarter of what it is uncertain by."""
 
 
 def noise_averaged(
