@@ -268,11 +268,11 @@ def _model(per: dict[str, float]) -> list[str]:
 PARTS: dict[str, tuple[str, ...]] = {
     "search, significance": ("--no-limits",),
     "… and limits": (),
-    "… and pictures": (),
+    "… and pictures, without limits": ("--no-limits",),
 }
 """What is measured, with the words of the command beside `QUICK`."""
 
-DROP = {"… and pictures": ("--no-pictures",)}
+DROP = {"… and pictures, without limits": ("--no-pictures",)}
 """Words of `QUICK` that a part goes without."""
 
 

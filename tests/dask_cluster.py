@@ -7,6 +7,13 @@ import subprocess
 
 from commands import start
 
+MPI_ALLOWED = {
+    "OMPI_ALLOW_RUN_AS_ROOT": "1",
+    "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
+    "OMPI_MCA_rmaps_base_oversubscribe": "1",
+}
+"""What Open MPI asks for where a container's user is root and cores are few; MPICH ignores it."""
+
 
 def free_port() -> int:
     with socket.socket() as probe:

@@ -22,6 +22,11 @@ AHEAD = 16
 """Pieces in flight at least, so that a growing cluster finds work."""
 
 
+AHEAD_PER_THREAD = 4
+"""Pieces in flight for each thread: results are taken in order, and a target that takes longer
+than its neighbours leaves the others with work."""
+
+
 def _in_order(
     submit: Callable[[Any], Any], result: Callable[[Any], Any], pieces: Sequence[Any], ahead: int
 ) -> Iterator[Any]:
@@ -95,7 +100,7 @@ class DaskExecutor:
         # a task of its own: sent once, and made again where the worker that held it dies
         shared = self._client.submit(_same, function, pure=False)
         submit = partial(self._client.submit, run_in_worker, shared, pure=False)
-        ahead = max(AHEAD, 2 * sum(self._client.nthreads().values()))
+        ahead = max(AHEAD, AHEAD_PER_THREAD * sum(self._client.nthreads().values()))
         found = _in_order(submit, self._result, pieces, ahead)
         return (self._or_instead(k, answer, lost) for k, answer in enumerate(found))
 

@@ -117,6 +117,17 @@ def test_piece_that_kills_every_worker_ends_the_run_in_one_line(
         list(two_processes.map(work.kill_self, [1, 2]))
 
 
+def test_a_piece_that_kills_every_worker_may_be_answered_for(
+    tmp_path: Path, two_processes: ProcessExecutor
+) -> None:
+    """Other pieces are done; the index is that of the job, whatever its journal has."""
+    pieces = [(work.square, 3), (work.kill_self, 1), (work.square, 5), (work.kill_self, 2)]
+    answers = run_job(work.apply, pieces, two_processes, lost=lambda k, error: (k, error.what))
+    assert list(answers)[::2] == [9, 25]
+    again = list(run_job(work.apply, pieces, two_processes, lost=lambda k, _: k))
+    assert again == [9, 1, 25, 3]
+
+
 PARENT = """
 import sys
 from pathlib import Path

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from commands import run, start
-from dask_cluster import end, free_port, start_dask, start_worker
+from dask_cluster import MPI_ALLOWED, end, free_port, start_dask, start_worker
 from helpers import niriss, simulated
 
 from amibayes.oifits import write_oifits
@@ -102,14 +102,12 @@ def test_ranks_of_mpi(survey: Path, tmp_path: Path) -> None:
     mpiexec = shutil.which("mpiexec")
     if mpiexec is None:
         pytest.skip("mpiexec is not installed")
-    # Open MPI asks for both where a container's user is root and cores are few; MPICH for none.
-    allowed = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1",
-               "OMPI_MCA_rmaps_base_oversubscribe": "1"}  # fmt: skip
     words = ["search", "--batch", survey / "targets.ecsv", *WORDS, "--out", tmp_path / "out"]
+    path = os.pathsep.join([str(HERE.parent), *sys.path])
     finished = subprocess.run(
         [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", "-m", "amibayes",
          *map(str, words), "--scheduler", "mpi"],
-        env=os.environ | allowed | {"PYTHONPATH": os.pathsep.join([str(HERE.parent), *sys.path])},
+        env=os.environ | MPI_ALLOWED | {"PYTHONPATH": path},
         capture_output=True,
         text=True,
         timeout=200.0,
