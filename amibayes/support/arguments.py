@@ -1,4 +1,4 @@
-"""Arguments at the public edges: quantities become numbers, and absurd ones a line that says so.
+"""Arguments at the public edges: quantities become numbers, and unusable ones a line that says so.
 
 A public function or container is marked by `checks_arguments`. What an argument may be is its
 annotation, which mypy reads too; here it is held against what a user gives in a notebook.
@@ -44,7 +44,7 @@ REMEDIES = {
 
 
 def checks_arguments(target: Target) -> Target:
-    """Let a function, or the constructor of a class, take quantities and refuse absurd values.
+    """Let a function, or the constructor of a class, take quantities and refuse unusable values.
 
     An argument that its annotation does not allow, a number that is NaN where the default is
     not, and a name that there is not are a `UsageError` that names the argument.

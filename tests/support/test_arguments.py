@@ -152,7 +152,7 @@ def found() -> ab.SearchResult:
         (lambda r: ab.read_oifits(None), "path is None, not a path"),
     ],
 )  # fmt: skip
-def test_the_public_interface_refuses_the_absurd(call, line: str, found) -> None:
+def test_the_public_interface_refuses_the_unusable(call, line: str, found) -> None:
     with pytest.raises(UsageError, match=line) as caught:
         call(found)
     assert "--" not in str(caught.value)
