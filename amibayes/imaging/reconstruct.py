@@ -186,7 +186,9 @@ def reconstruct_image(
     samples = uv_points_of(data)
     grid = choose_grid(samples, field_mas, pixel_mas)
     response = pixel_response(samples, grid, star=star, diameter_mas=diameter_mas)
-    problem = Problem(response, grid, REGULARISERS[regulariser](grid), regulariser == "entropy")
+    fixed = FIRST_FLUX if star and not data.n_vis2 else None
+    penalty = REGULARISERS[regulariser](grid, fixed)
+    problem = Problem(response, grid, penalty, regulariser == "entropy")
     table = np.empty((3, 0))
     if weight is None:
         rng = rng or np.random.default_rng(1)

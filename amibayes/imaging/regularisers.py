@@ -1,7 +1,9 @@
 """What an image should be like where the data do not say: smooth, or with edges.
 
 Both act on the shares p = x/Σx of the light, whatever its sum: the flux of the image is left to
-the data.
+the data. Phases alone do not tell the flux of symmetric light, and a wide glow would make any
+bump a small share: there p = x/f with a flux f that is fixed, towards which the entropy draws,
+and the total variation has the sum of the light added.
 """
 
 from __future__ import annotations
@@ -35,26 +37,28 @@ def default_image(grid: PixelGrid) -> FloatArray:
     return np.asarray(shares / shares.sum())
 
 
-def entropy(grid: PixelGrid) -> Regulariser:
-    """Σ p ln(p/q) against the default image q (Skilling & Bryan 1984), 0 where they are one."""
+def entropy(grid: PixelGrid, flux: float | None = None) -> Regulariser:
+    """Σ p ln(p/q) − p + q against the default image q (Skilling & Bryan 1984), 0 where p is q."""
     prior = np.log(default_image(grid))
 
     def value(light: FloatArray) -> tuple[float, FloatArray]:
-        total = max(float(light.sum()), FLOOR)
+        total = max(float(light.sum()), FLOOR) if flux is None else flux
         share = light / total
         log = np.log(np.maximum(share, FLOOR)) - prior
         found = float(share @ log)
+        if flux is not None:
+            return found - float(share.sum()) + 1.0, log / total
         return found, (log - found) / total
 
     return value
 
 
-def total_variation(grid: PixelGrid) -> Regulariser:
+def total_variation(grid: PixelGrid, flux: float | None = None) -> Regulariser:
     """Mean length of the gradient of p in units of the mean pixel (Rudin et al. 1992)."""
     n = grid.n
 
     def value(light: FloatArray) -> tuple[float, FloatArray]:
-        total = max(float(light.sum()), FLOOR)
+        total = max(float(light.sum()), FLOOR) if flux is None else flux
         image = np.pad((light / total).reshape(n, n), ((0, 1), (0, 1))) * n**2
         right, up = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
         length = np.sqrt(right**2 + up**2 + EDGE**2)
@@ -64,6 +68,8 @@ def total_variation(grid: PixelGrid) -> Regulariser:
         by[1:, :-1] += up / length
         by[:-1, :-1] -= (right + up) / length
         by_share = by[:-1, :-1].ravel()
+        if flux is not None:  # light that the data do not ask for goes
+            return found + float(light.sum()) / total, (by_share + 1.0) / total
         return found, (by_share - float(by_share @ light) / total) / total
 
     return value

@@ -38,17 +38,20 @@ def correlation(image: ab.ReconstructedImage, name: str) -> float:
 
 
 @pytest.mark.parametrize("regulariser", REGULARISERS)
+@pytest.mark.parametrize("flux", [None, 0.05])
 @pytest.mark.parametrize("through", [False, True])
-def test_gradient_is_that_of_finite_differences(regulariser: str, through: bool) -> None:
+def test_gradient_is_that_of_finite_differences(
+    regulariser: str, through: bool, flux: float | None
+) -> None:
     """Central differences in random directions; also with a response to the flux of pixels."""
     rng = np.random.default_rng(1)
     data = seen("spiral")
     samples, grid = uv_points_of(data), PixelGrid(9, 50.0)
     response = pixel_response(samples, grid)
     if through:
-        flux = rng.uniform(0.5, 1.0, response.fringe.shape)
-        response = PixelResponse(response.fringe * flux, flux, response.star, 1.0)
-    problem = Problem(response, grid, REGULARISERS[regulariser](grid), True)
+        seen_flux = rng.uniform(0.5, 1.0, response.fringe.shape)
+        response = PixelResponse(response.fringe * seen_flux, seen_flux, response.star, 1.0)
+    problem = Problem(response, grid, REGULARISERS[regulariser](grid, flux), True)
     term = DataTerm.of(data, samples)
     light = rng.uniform(1e-4, 1e-3, 81)
     _, gradient = problem.objective(term, 30.0, light)
@@ -153,6 +156,7 @@ def test_kernel_phases_make_an_image(tmp_path: Path) -> None:
     )
     row, column = np.unravel_index(int(image.light.argmax()), image.light.shape)
     assert image.grid.offset_mas[[column, row]] == pytest.approx([-120.0, 60.0], abs=31.0)
+    assert 0.02 < image.flux < 0.06  # phases say little of symmetric light
 
 
 def test_sizes_that_make_no_image_are_refused() -> None:
