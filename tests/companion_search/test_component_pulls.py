@@ -1,0 +1,93 @@
+"""Errors of the components beyond a point: companion's disc, its colour, the star's limb darkening.
+
+The data come from formulas of their own (Hestroffer 1997 for discs; no smearing on either side).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import gamma, jv
+from test_global_search import coverage
+
+from amibayes.companion_search.optimise import refine
+from amibayes.data.observables import Observables
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.binary import BinaryModel
+from amibayes.models.parameters import Box
+from amibayes.units import MAS
+
+TRUTH = {
+    "diameter_mas": 2.6,
+    "limb_darkening": 0.25,
+    "companion_diameter_mas": 0.7,
+    "contrast_slope": -1.5,
+}
+PLACE, CONTRAST, REFERENCE_M = (5.2, -3.7), 0.24, 1.62e-6
+
+
+def observed(sheet: Observables) -> Observables:
+    """The data of a limb-darkened star and a companion that is a disc with a colour, no noise."""
+
+    def disc(diameter: float, exponent: float, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        nu = 0.5 * exponent + 1.0
+        x = np.maximum(np.pi * diameter * MAS * np.hypot(u, v), 1e-9)
+        return gamma(nu + 1.0) * jv(nu, x) / (x / 2.0) ** nu
+
+    def visibility(u_m: np.ndarray, v_m: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+        u, v = u_m / wavelength, v_m / wavelength
+        ratio = CONTRAST * (wavelength / REFERENCE_M) ** TRUTH["contrast_slope"]
+        east, north = (MAS * x for x in PLACE)
+        star = disc(TRUTH["diameter_mas"], TRUTH["limb_darkening"], u, v)
+        other = disc(TRUTH["companion_diameter_mas"], 0.0, u, v)
+        return (star + ratio * other * np.exp(-2j * np.pi * (u * east + v * north))) / (1 + ratio)
+
+    vis2, closure = sheet.vis2, sheet.closure_phase
+    power = np.abs(visibility(vis2.u_m[:, 0], vis2.v_m[:, 0], vis2.wavelength_m)) ** 2
+    u, v = (np.column_stack([x, -x.sum(axis=1)]) for x in (closure.u_m, closure.v_m))
+    legs = visibility(u, v, closure.wavelength_m[:, None])
+    return replace(
+        sheet,
+        vis2=replace(vis2, value=power),
+        closure_phase=replace(closure, value=np.angle(legs.prod(axis=1))),
+    )
+
+
+@pytest.mark.parametrize("n", [60, pytest.param(600, marks=pytest.mark.slow)])
+def test_pulls_of_discs_colour_and_limb_darkening(n: int) -> None:
+    """Means, widths and shares within 1σ of all parameters, to 4.5 standard errors."""
+    model = BinaryModel(
+        diameter_mas="free",
+        smearing=False,
+        limb_darkening="free",
+        companion_diameter_mas="free",
+        contrast_slope="free",
+        reference_wavelength_m=REFERENCE_M,
+    )
+    sheet = observed(coverage("mirc4t", 0.004, 0.01))
+    free = Likelihood(sheet, model)
+    names = free.parameters.names
+    known = {"east_mas": PLACE[0], "north_mas": PLACE[1], "contrast": CONTRAST} | TRUTH
+    truth = np.array([known[name] for name in names])
+    assert free.chi2(truth)[0] < 1e-6
+    noise = sheet.covariance.draw(np.random.default_rng(8), n)
+    pulls = np.empty((n, len(names)))
+    for k in range(n):
+        vis2, closure = np.split(
+            np.concatenate([sheet.vis2.value, sheet.closure_phase.value]) + noise[:, k],
+            [sheet.n_vis2],
+        )
+        data = replace(
+            sheet,
+            vis2=replace(sheet.vis2, value=vis2),
+            closure_phase=replace(sheet.closure_phase, value=closure),
+        )
+        likelihood = Likelihood(data, model)
+        fit = np.array(refine(likelihood, truth, Box(0.5, 20.0, 1.0), 0.0).theta)
+        pulls[k] = (fit - truth) / np.sqrt(np.diag(likelihood.errors(fit)))
+    assert np.abs(pulls.mean(axis=0)).max() < 4.5 / np.sqrt(n)
+    assert np.abs(pulls.std(axis=0) - 1.0).max() < 4.5 / np.sqrt(2 * n)
+    covered = (np.abs(pulls) < 1.0).mean(axis=0)
+    assert np.abs(covered - 0.683).max() < 4.5 * np.sqrt(0.683 * 0.317 / n)
