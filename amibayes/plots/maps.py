@@ -32,7 +32,7 @@ from amibayes.plots.style import (
     styled,
 )
 from amibayes.support.atomic_files import atomic_path
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 Quantity = Literal["sqrt_delta_chi2", "delta_chi2"]
 ContrastKind = Literal["signed", "positive"]
@@ -111,6 +111,10 @@ def sky_map(
     return figure
 
 
+GREY_ENDS = 0.95
+"""Power of ten, as a share of the threshold's, whose grey is surely not of the colours below it."""
+
+
 @styled()
 def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
     """Draw the probability that noise reaches the statistic of each position, anywhere.
@@ -132,9 +136,13 @@ def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
     figure = new_figure(6.1)
     ax = figure.subplots()
     lowest = told_by_draws(tested)
-    value = np.log10(np.maximum(probability_maps(tested)["global"], lowest))
+    value = np.log10(np.maximum(chance_of_places(result, tested), lowest))
+    if tested.detected:  # the search claims one position; what else is left is structure
+        least = GREY_ENDS * float(np.log10(tested.alpha))
+        value = np.where(near_best(result), value, np.maximum(value, least))
     low = float(np.log10(lowest))
     label = "False-alarm probability anywhere in the field"
+    label += ",\ncompanion taken out elsewhere" if tested.detected else ""
     colours = _chance_colours(low, float(np.log10(tested.alpha)))
     style: dict[str, Any] = {"cmap": colours, "vmin": low, "vmax": 0.0, "extend": "min"}
     bar = _paint(figure, ax, result.grid, value, label, **style)
@@ -145,6 +153,29 @@ def false_alarm_map(result: SearchResult, tested: Significance) -> Figure:
     figure.suptitle(_headline(result))
     figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def chance_of_places(result: SearchResult, tested: Significance) -> FloatArray:
+    """Global false-alarm probability of every position, (n_grid,).
+
+    Where a companion was detected, noise reaches the sidelobes of its fringes nowhere either: away
+    from it (λ/2B) the probability is that of the data without it.
+    """
+    found = probability_maps(tested)["global"]
+    if not tested.detected or tested.test is None:
+        return found
+    test = tested.test
+    white = test.likelihood.residuals(result.theta)[:, 0]
+    # Noise that is measured in what a star alone leaves would hold the companion.
+    without = tested.survival(test.with_noise_of(white).field(white))
+    return np.where(near_best(result), found, without)
+
+
+def near_best(result: SearchResult) -> BoolArray:
+    """Whether a position is within λ/2B of the best fit, (n_grid,)."""
+    best, grid = result.companion, result.grid
+    apart = np.hypot(grid.east_mas - best.east_mas, grid.north_mas - best.north_mas)
+    return np.asarray(apart <= 0.5 * resolution_mas(result.likelihood))
 
 
 def _chance_colours(low: float, threshold: float) -> LinearSegmentedColormap:

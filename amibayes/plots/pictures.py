@@ -302,7 +302,9 @@ PICTURES = (
         "False-alarm probability",
         "Probability that noise alone gives a companion as good as that of each position, anywhere "
         "in the field: grey where it is no detection, coloured below the threshold, and of one "
-        "colour from where the null draws tell no more.",
+        "colour from where the null draws tell no more. A companion that was detected is taken out "
+        "of the data elsewhere, as its sidelobes are no noise; the darkest grey there is structure "
+        "that the fit leaves.",
         "significance",
         _false_alarm,
         lambda run: run.significance,

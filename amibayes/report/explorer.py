@@ -20,7 +20,7 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.plots.fit import longest_baseline_m
-from amibayes.plots.maps import probability_maps, told_by_draws
+from amibayes.plots.maps import chance_of_places, told_by_draws
 from amibayes.units import FloatArray, IntArray
 
 Json = dict[str, Any]
@@ -54,6 +54,7 @@ def explorer_data(report: SearchReport) -> Json:
         "outer_mas": result.grid.outer_mas,
         "fringe_mas": resolution_mas(result.likelihood),
         "n_draws": 0 if tested is None else tested.n_draws,
+        "detected": None if tested is None else tested.detected,
         "alpha": None if tested is None else tested.alpha,
         "least_probability": None if tested is None else told_by_draws(tested),
         "maps": {name: lattice.encoded(layers) for name, layers in _maps(result, tested)},
@@ -102,7 +103,7 @@ def _maps(
         "error": result.bank_sigma,
     }
     if tested is not None and tested.field is not None:
-        chance = np.maximum(probability_maps(tested)["global"], told_by_draws(tested))
+        chance = np.maximum(chance_of_places(result, tested), told_by_draws(tested))
         whole |= {"log_probability": np.log10(chance)}
     yield "all data", whole
     data = result.likelihood.observables

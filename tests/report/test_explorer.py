@@ -58,6 +58,10 @@ def test_maps_are_those_of_the_search(report: SearchReport, content) -> None:
     least = np.log10(told_by_draws(report.significance))
     assert chance[best] == pytest.approx(least, abs=1e-5)
     assert np.nanmin(chance) >= least - 1e-5
+    # Its sidelobes are no further detections: with it taken out what is left is noise.
+    away = np.hypot(*np.subtract(np.indices(chance.shape), np.reshape(best, (2, 1, 1))))
+    far = away * content["step_mas"] > 0.75 * content["fringe_mas"]
+    assert np.nanmin(chance[far]) > np.log10(report.significance.alpha)
     assert np.nanmax(chance) <= 0.0
 
 

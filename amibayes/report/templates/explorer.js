@@ -87,8 +87,13 @@
     const known = [...values].filter((x) => x > 0).sort((a, b) => a - b);
     return [low, known[Math.floor(0.99 * known.length)] || 1e-12];
   };
-  const shade = (value, low, high) =>
-    (LAYERS[pickLayer.value].probability ? chance(value) : colour((value - low) / (high - low)));
+  // The search claims one position: what is improbable elsewhere is structure, the darkest grey.
+  const claimed = (east, north) => !content.detected ||
+    Math.hypot(east - content.marks[0].east, north - content.marks[0].north) <= 0.5 * content.fringe_mas;
+  const shade = (value, low, high, isClaimed = true) => {
+    if (!LAYERS[pickLayer.value].probability) return colour((value - low) / (high - low));
+    return chance(isClaimed ? value : Math.max(value, Math.log10(content.alpha) + 1e-9));
+  };
   const painted = () => {
     const values = maps[pickKind.value][LAYERS[pickLayer.value].layer], [low, high] = range();
     const image = document.createElement("canvas");
@@ -98,7 +103,8 @@
       const value = values[row * side + column];
       if (Number.isNaN(value)) continue;
       const k = 4 * ((side - 1 - row) * side + (side - 1 - column));  // north up, east left
-      pixels.data.set([...shade(value, low, high), 255], k);
+      pixels.data.set([...shade(value, low, high, claimed((column - content.half) * content.step_mas,
+        (row - content.half) * content.step_mas)), 255], k);
     }
     context.putImageData(pixels, 0, 0);
     return image;
@@ -218,7 +224,9 @@
     if (all.log_probability && pickKind.value === "all data") {
       const floor = Math.log10(content.least_probability) + 1e-5, p = all.log_probability[k];
       const told = `${p <= floor ? "below " : ""}${plain(10 ** p, 2)}`;
-      lines.push(`false-alarm probability anywhere in the field ${told}`);
+      const best = content.marks[0], apart = Math.hypot(cursor.east - best.east, cursor.north - best.north);
+      const rest = content.detected && apart > 0.5 * content.fringe_mas ? ", with the companion taken out of the data" : "";
+      lines.push(`false-alarm probability anywhere in the field ${told}${rest}`);
     }
     said.textContent = `${where}: ${lines.join("; ")}.`;
   };
