@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from amibayes.imaging import ReconstructedImage
 from amibayes.imaging.data_term import DataTerm
-from amibayes.models.uv_sums import phase_sums
+from amibayes.plots.fit import longest_baseline_m
 from amibayes.plots.style import (
     BLACK,
     BLUE,
@@ -110,11 +110,8 @@ def _residuals(ax: Axes, image: ReconstructedImage) -> None:
     if n:
         ax.plot(length, white[:n], "o", color=BLUE, ms=4, label="V²")
     if len(white) > n:
-        sums = phase_sums(data)
-        longest = np.zeros(len(white) - n)
-        wavelength = data.closure_phase.wavelength_m[sums.owner]
-        reach = np.hypot(sums.u_m, sums.v_m) / wavelength / 1e6
-        np.maximum.at(longest, sums.row, reach[sums.column])
+        m = data.closure_phase
+        longest = longest_baseline_m(m) / m.wavelength_m / 1e6
         ax.plot(longest, white[n:], "x", color=VERMILLION, ms=5, label=f"{data.phase_name}s")
     ax.set_xlabel("(Longest) baseline (Mλ)")
     ax.set_ylabel("Residual (σ)")
