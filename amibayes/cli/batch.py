@@ -8,7 +8,7 @@ import importlib
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -30,6 +30,10 @@ NOT_OF_A_ROW = {
 """Options of the whole run, which no row can set for itself."""
 
 SOME_FAILED = 4
+
+TASKS = 10_000
+"""A table of more targets than twice that is handed out several targets at a time: a scheduler does
+some hundred tasks in a second, and a thousand workers would wait for it."""
 
 CALIBRATORS_OF_POOL = 4
 """Three tell their scatter, and one more may be dropped."""
@@ -66,24 +70,6 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="how many are chosen out of the pool (default: %(default)s)",
     )
-
-
-def add_picture_option(group: argparse._ActionsContainer) -> None:
-    """Add ``--no-pictures``."""
-    group.add_argument(
-        "--no-pictures",
-        action="store_true",
-        help="write no pictures, which take most of the time of a short run",
-    )
-
-
-def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -> Any:
-    """Let pictures be drawn: here, or for a target of a table in a process of their own."""
-    if not getattr(arguments, "in_batch", False):
-        return save(*of)
-    from amibayes.parallel import run_apart
-
-    return run_apart(save, *of)
 
 
 def refuse_none(arguments: argparse.Namespace) -> None:
@@ -340,17 +326,37 @@ def _words(parser: argparse.ArgumentParser, column: str, value: object) -> Itera
 
 def _carry_out(arguments: argparse.Namespace, jobs: list[Job]) -> Iterator[tuple[int, Outcome]]:
     """Do the targets; give the number of each and what came of it."""
-    from amibayes.parallel import run_job
+    from amibayes.parallel import run_job, slices
     from amibayes.survey.rows import Outcome
 
+    size = max(len(jobs) // TASKS, 1)
+    parts = slices(len(jobs), size)
+    alone: list[int] = []
+
     def lost(index: int, error: AmibayesError) -> Outcome:
-        return Outcome(jobs[index].name, "failed", error.command_line, facts=jobs[index].facts)
+        job = jobs[alone[index] if alone else index]
+        return Outcome(job.name, "failed", error.command_line, facts=job.facts)
 
     with (
         common.executor_of(arguments) as executor,
-        common.progress_of(arguments, "targets", unit="target") as progress,
+        common.progress_of(arguments, "targets", unit="target", scale=size) as progress,
     ):
-        yield from enumerate(run_job(_one, jobs, executor, progress=progress, lost=lost))
+        pieces = [jobs[part] for part in parts]
+        alone_already = (lambda k, error: [lost(k, error)]) if size == 1 else (lambda *_: None)
+        done = run_job(_several, pieces, executor, progress=progress, lost=alone_already)
+        for part, outcomes in zip(parts, done, strict=True):
+            if outcomes is None:
+                alone += range(part.start, part.stop)
+            else:
+                yield from zip(range(part.start, part.stop), outcomes, strict=True)
+        # One target of these ends its worker; which, only each of them by itself can tell.
+        yield from zip(
+            alone, run_job(_one, [jobs[k] for k in alone], executor, lost=lost), strict=True
+        )
+
+
+def _several(jobs: list[Job]) -> list[Outcome]:
+    return [_one(job) for job in jobs]
 
 
 def _one(job: Job) -> Outcome:

@@ -87,7 +87,7 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         metavar="M",
         help="absolute magnitude of the star, for a table of absolute magnitudes",
     )
-    batch.add_picture_option(group)
+    data_options.add_picture_option(group)
     group.add_argument(
         "--resume",
         action="store_true",
@@ -196,7 +196,7 @@ def _write(
     from amibayes.support.atomic_files import write_json
 
     if not arguments.no_pictures:
-        batch.draw(arguments, save_limits_pictures, report, folder)
+        data_options.draw(arguments, save_limits_pictures, report, folder)
     write_limits_table(folder / TABLE, report)
     # Last: where it is, the run is finished.
     write_json(folder / RESULT, content)

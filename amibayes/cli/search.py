@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="fit N times to exposures drawn anew, for intervals beside the posterior's",
     )
     stages.add_argument("--no-limits", action="store_true", help="leave detection limits out")
-    batch.add_picture_option(stages)
+    data_options.add_picture_option(stages)
     stages.add_argument(
         "--resume",
         action="store_true",
@@ -196,7 +196,9 @@ def _write(
 
     if report.calibration is not None:
         write_observables(folder / CALIBRATED, report.observables)
-    drawn = [] if arguments.no_pictures else batch.draw(arguments, save_pictures, report, folder)
+    drawn = (
+        [] if arguments.no_pictures else data_options.draw(arguments, save_pictures, report, folder)
+    )
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
     words = common.command_line(arguments)

@@ -13,7 +13,7 @@ from commands import run
 from helpers import error_of, niriss, simulated
 from PIL import Image
 
-from amibayes.errors import DataError
+from amibayes.errors import DataError, RunError
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.batch import read_targets
 from amibayes.plots.style import save
@@ -181,3 +181,28 @@ def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
     assert first["limit_delta_mag_worst"] == min(curve)
     assert Table.read(out / "survey.ecsv")["limit_delta_mag"].unit == "mag"
     assert (out / "survey.png").is_file()
+
+
+def test_targets_that_are_handed_out_together_are_the_same_and_fail_alone(
+    survey, tmp_path, monkeypatch
+) -> None:
+    words = ("limits", "--batch", survey, *CLOSED, "--quiet", "--no-pictures")
+    assert run(*words, "--out", tmp_path / "one") == 4
+    monkeypatch.setattr("amibayes.cli.batch.TASKS", 2)
+    assert run(*words, "--out", tmp_path / "two") == 4
+    one, two = ((tmp_path / n / "survey.json").read_bytes() for n in ("one", "two"))
+    assert one == two
+
+    def losing(function, pieces, executor, *, lost, progress=None):
+        """A worker that dies of the first target, in whatever company."""
+        for k, piece in enumerate(pieces):
+            first = piece[0] if isinstance(piece, list) else piece
+            died = first.name == "HD_1"
+            yield lost(k, RunError("piece lost its worker")) if died else function(piece)
+
+    monkeypatch.setattr("amibayes.parallel.run_job", losing)
+    assert run(*words, "--out", tmp_path / "three") == 4
+    entries = json.loads((tmp_path / "three" / "survey.json").read_text())["targets"]
+    assert [e["status"] for e in entries] == ["failed", "done", "failed", "failed"]
+    assert entries[0]["error"] == "piece lost its worker"
+    assert entries[1:] == json.loads(one)["targets"][1:]
