@@ -205,6 +205,9 @@ def false_alarms_picture(content: Json) -> Figure | None:
 def quantile_plot(probability: FloatArray, listed: BoolArray, level: float) -> Figure:
     """Draw false-alarm probabilities in order against those that noise alone would give.
 
+    Targets that are listed have a place among all, the others one among themselves: companions
+    at the head of the order would push the stars without them out of the band.
+
     Parameters
     ----------
     probability : (m,) float array
@@ -218,11 +221,12 @@ def quantile_plot(probability: FloatArray, listed: BoolArray, level: float) -> F
     matplotlib.figure.Figure
     """
     m, order = len(probability), np.argsort(probability, kind="stable")
-    middle, low, high = expected_quantiles(m)
+    middle = expected_quantiles(m)[0]
     p, hit = probability[order], listed[order]
     figure = new_figure(5.6)
     ax = figure.subplots()
-    ax.fill_between(middle, low, high, color=LIGHT_GREY, lw=0, label=f"{BAND:.0%} of noise")
+    others, low, high = expected_quantiles(int((~hit).sum()))
+    ax.fill_between(others, low, high, color=LIGHT_GREY, lw=0, label=f"{BAND:.0%} of noise")
     ax.plot(middle, middle, color=BLACK, lw=1.2, label="noise alone")
     ax.plot(
         middle,
@@ -232,14 +236,16 @@ def quantile_plot(probability: FloatArray, listed: BoolArray, level: float) -> F
         lw=1.2,
         label=f"false-discovery rate {level:g}",
     )
-    ax.plot(middle[~hit], p[~hit], "o", color=BLUE, ms=4.5, label="targets")
+    ax.plot(
+        others, p[~hit], "o", color=BLUE, ms=4.5, label="other targets" if hit.any() else "targets"
+    )
     if hit.any():
         ax.plot(
             middle[hit], p[hit], "*", color=VERMILLION, mec=BLACK, mew=0.6, ms=10,
             label="listed as companions",
         )  # fmt: skip
     ax.set(xscale="log", yscale="log", xlim=(0.5 * middle[0], 1.3))
-    ax.set(ylim=(0.4 * min(p[0], low[0], level / m), 1.6))
+    ax.set(ylim=(0.4 * min(p[0], *low[:1], level / m), 1.6))
     ax.set_xlabel("False-alarm probability expected of noise alone, in order")
     ax.set_ylabel("False-alarm probability of the targets")
     figure.legend(loc="outside lower center", ncols=2)

@@ -54,7 +54,8 @@ TEXTS = {
     "survey_false_alarms.png": (
         "Quantiles of the false-alarm probabilities",
         "False-alarm probability of each target against the one that noise alone gives at its "
-        "place in the order; points of noise alone lie in the grey band, companions far below it.",
+        "place in the order, those that are listed among all and the others among themselves; "
+        "points of noise alone lie in the grey band, companions far below it.",
     ),
     "survey_completeness.png": (
         "Completeness",
