@@ -216,7 +216,7 @@ def test_bad_pixels_are_flags_and_missing_values(rng: np.random.Generator) -> No
     dq[1, 4, 4] = 4
     error = np.ones(images.shape)
     error[0, 5, 5] = 0.0
-    cube = Cube(images, 1.0, "X", "Y", error=error, dq=dq)
+    cube = Cube(images, 3e-7, "X", "Y", error=error, dq=dq)
     assert np.argwhere(cube.bad).tolist() == [[0, 0, 0], [0, 5, 5], [1, 2, 3]]
     with pytest.raises(ValueError, match="read-only"):
         cube.images[0, 0, 0] = 1.0
