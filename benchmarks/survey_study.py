@@ -251,7 +251,7 @@ def cost(targets: int, seed: int) -> str:
 
 def _model(per: dict[str, float]) -> list[str]:
     """Cost of 10⁵ targets on 1000 workers, from measured pieces."""
-    from amibayes.cli.batch import TASKS
+    from amibayes.cli.options.batch import TASKS
 
     rate, request, answer = _scheduler()
     scheduled = TASKS / rate  # ten targets a task
@@ -285,8 +285,8 @@ def _nothing(piece: Any) -> Any:
 
 def _scheduler() -> tuple[float, int, int]:
     """Tasks per second of a dask scheduler, and bytes of a target's request and answer."""
-    from amibayes.cli.batch import Job
     from amibayes.cli.main import build_parser
+    from amibayes.cli.options.batch import Job
     from amibayes.parallel import DaskExecutor
 
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

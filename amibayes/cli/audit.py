@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 from amibayes.errors import UsageError
 from amibayes.support.terminal import shortened
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli import common, data_options
+from amibayes.cli.options import common, data_options
 from amibayes.errors import UsageError
 from amibayes.support.terminal import row, shortened
 

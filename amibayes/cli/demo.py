@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 
 EXAMPLES = """examples:
   amibayes demo

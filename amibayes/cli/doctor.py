@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 
 if TYPE_CHECKING:
     from amibayes.support.environment import Checkup

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 from amibayes.support.options import ImagingProgram, choices
 
 if TYPE_CHECKING:

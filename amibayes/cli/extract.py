@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amibayes import __version__
-from amibayes.cli import common
+from amibayes.cli.options import common
 from amibayes.errors import UsageError
 from amibayes.support.options import CLIP_INTEGRATIONS, ExtractionCovariance, Geometry, choices
 from amibayes.support.terminal import shortened

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from amibayes.cli import common, data_options
+from amibayes.cli.options import common, data_options
 from amibayes.errors import UsageError
 from amibayes.support.options import OBSERVABLES
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli import batch, common, data_options
+from amibayes.cli.options import batch, common, data_options
 from amibayes.errors import UsageError
 from amibayes.support.options import (
     LIMITS_NULL_DRAWS,

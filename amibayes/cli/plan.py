@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli.common import (
+from amibayes.cli.options.common import (
     add_output_options,
     configure_logging,
     finish,

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli import batch, common, data_options
+from amibayes.cli.options import batch, common, data_options
 from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amibayes import __version__
-from amibayes.cli.common import (
+from amibayes.cli.options.common import (
     add_output_options,
     add_parallel_options,
     add_seed_option,

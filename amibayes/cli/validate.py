@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 
 RESULT, PAGE, JOURNAL = "validation.json", "validation.html", "journal"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amibayes.cli import common, data_options
+from amibayes.cli.options import common, data_options
 from amibayes.errors import UsageError
 from amibayes.support.options import VETTING_ALPHA, VETTING_NULL_DRAWS
 

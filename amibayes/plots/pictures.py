@@ -14,9 +14,8 @@ from amibayes.comparison.compare import ModelComparison
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.plots.calibration import calibrator_plot
-from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_picture, limits_plot
-from amibayes.plots.corner_plot import corner_plot
+from amibayes.plots.corner_plot import corner_plot, trace_plot
 from amibayes.plots.coverage import coverage_plot
 from amibayes.plots.fit import file_residuals_plot, fit_plot
 from amibayes.plots.maps import (

@@ -19,8 +19,8 @@ from amibayes.calibration import (
     reduce_data,
     without_disc,
 )
-from amibayes.cli import data_options
 from amibayes.cli.main import build_parser
+from amibayes.cli.options import data_options
 from amibayes.data.covariance import scaled
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits import read_oifits

@@ -296,7 +296,7 @@ def test_unfit_arrays_are_one_line(tmp_path: Path, arrays: Any, message: str) ->
     ("keys", "message"),
     [
         ({"INSTRUME": None}, "does not say its instrument"),
-        ({"FILTER": None}, "does not say its filter .give --filter"),
+        ({"FILTER": None}, "does not say its filter .give filter"),
         ({"PIXELSCL": None, "INSTRUME": "X"}, "does not say its pixel scale"),
         ({"PIXELSCL": -1.0}, "is no pixel scale"),
         ({"PIXELSCL": "small"}, "not a finite number"),
@@ -335,7 +335,7 @@ def test_all_dark_cube_is_found_in_chunks_too(tmp_path: Path) -> None:
 def test_times_of_another_number_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     cube = make_cube(rng)
     with pytest.raises(DataError, match="mjd has the shape"):
-        Cube(cube.images, 1.0, "X", "Y", mjd=np.zeros(3))
+        Cube(cube.images, 3e-7, "X", "Y", mjd=np.zeros(3))
 
 
 def test_failed_writing_leaves_nothing(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -188,7 +188,7 @@ def test_targets_that_are_handed_out_together_are_the_same_and_fail_alone(
 ) -> None:
     words = ("limits", "--batch", survey, *CLOSED, "--quiet", "--no-pictures")
     assert run(*words, "--out", tmp_path / "one") == 4
-    monkeypatch.setattr("amibayes.cli.batch.TASKS", 2)
+    monkeypatch.setattr("amibayes.cli.options.batch.TASKS", 2)
     assert run(*words, "--out", tmp_path / "two") == 4
     one, two = ((tmp_path / n / "survey.json").read_bytes() for n in ("one", "two"))
     assert one == two

@@ -30,9 +30,8 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.mass_table import MassTable
 from amibayes.models.binary import BinaryModel
 from amibayes.plots.calibration import _keys, calibrator_plot
-from amibayes.plots.chains import trace_plot
 from amibayes.plots.contrast_curve import Curve, completeness_map, contrast_marks, limits_plot
-from amibayes.plots.corner_plot import corner_plot, interval_text, label_of
+from amibayes.plots.corner_plot import corner_plot, interval_text, label_of, trace_plot
 from amibayes.plots.coverage import coverage_plot
 from amibayes.plots.fit import _Kind, fit_plot
 from amibayes.plots.maps import (

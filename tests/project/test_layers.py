@@ -46,7 +46,7 @@ LAYERS = [
     "__main__",
 ]
 
-MAX_LOOSE, MAX_IN_FOLDER = 8, 19
+MAX_LOOSE, MAX_IN_FOLDER = 8, 18
 """Modules beside the packages, and modules in one folder, that a reader can still take in."""
 
 

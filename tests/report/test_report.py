@@ -19,7 +19,8 @@ from browser import DESKTOP, PHONE, browser, shown
 from helpers import niriss, simulated
 from trial_answers import PLAN, answers
 
-from amibayes.cli import common, main
+from amibayes.cli import main
+from amibayes.cli.options import common
 from amibayes.errors import DataError
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.options import SearchOptions

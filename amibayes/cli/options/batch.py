@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 from amibayes.errors import AmibayesError, DataError, UsageError
 from amibayes.support.atomic_files import output_locks
 

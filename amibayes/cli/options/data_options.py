@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from amibayes.cli import common
+from amibayes.cli.options import common
 from amibayes.errors import UsageError
 from amibayes.support.options import (
     CLIP_CALIBRATORS,
