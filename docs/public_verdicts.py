@@ -139,9 +139,11 @@ def row(case: PublicCase, report: SearchReport) -> str:
             f"{c.north_error_mas:.1g} mas, {100 * c.contrast:.3g} ± {100 * c.contrast_error:.1g} %"
         )
         others = len(report.result.rivals)
-        place += f"; {others} other positions fit" if others else ""
+        if others:
+            place += f"; {others} other position{'s' if others > 1 else ''} within Δχ² 9"
     star = report.result.star_alone().get("diameter_mas")
-    size = "–" if star is None else f"{star[0]:.3g} ± {star[1]:.1g}"
+    single = verdict is not None and verdict.statement == "no companion"
+    size = f"{star[0]:.3g} ± {star[1]:.1g}" if star and single else "–"
     statement = verdict.statement if verdict else "–"
     return f"| {case.name} | {case.known} | {statement} | {p} | {place} | {size} |"
 
