@@ -157,7 +157,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
     with survey.interruptible():
         for k, outcome in _carry_out(arguments, jobs):
             survey.record(k, outcome)
-    content = survey.finish()
+        content = survey.finish()
     common.finish(arguments, content, lambda: survey_lines(content, survey.folder))
     return SOME_FAILED if content["n_failed"] else 0
 
