@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -79,3 +83,15 @@ def numerical_gradient(likelihood: Likelihood, theta: FloatArray, step: FloatArr
     shifted = theta + np.vstack([np.diag(step), -np.diag(step)])
     plus, minus = np.split(likelihood.log_prob(shifted), 2)
     return np.asarray((plus - minus) / (2 * step))
+
+
+def script_of_docs(name: str) -> ModuleType:
+    """A script of the documentation, as a module."""
+    path = Path(__file__).resolve().parents[1] / "docs" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from helpers import script_of_docs
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-def _script() -> ModuleType:
-    path = DOCS / "published_results.py"
-    spec = importlib.util.spec_from_file_location("published_results", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-PUBLISHED = _script()
+PUBLISHED = script_of_docs("published_results")
 CASES = [
     pytest.param(
         data,
