@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pages import put_table
 
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.search import search_companion
 
-PAGE = Path(__file__).with_name("public_verdicts.md")
-BEGIN, END = "<!-- table: docs/public_verdicts.py -->", "<!-- end of table -->"
+PAGE, MARK = "public_verdicts.md", "table: docs/public_verdicts.py"
 
 
 @dataclass(frozen=True)
@@ -162,9 +162,7 @@ def main(folder: Path) -> int:
         rows.append(row(case, report))
         wrong += faults(case, report)
         print(rows[-1], flush=True)
-    text = PAGE.read_text(encoding="utf-8")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    PAGE.write_text("\n".join([before + BEGIN, "", *rows, "", END + after]), encoding="utf-8")
+    put_table(PAGE, rows, MARK)
     print("\n".join(wrong) or "every verdict is right")
     return 1 if wrong else 0
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pages import put_table
 
 from amibayes import BinaryModel, Likelihood, Observables, calibrate, read_oifits, search
 from amibayes.calibration import bin_channels
@@ -25,8 +26,7 @@ from amibayes.data.observables import Measurements, join
 from amibayes.extraction.reading import read_observations
 from amibayes.pipeline.options import SearchOptions
 
-PAGE = Path(__file__).with_name("published_results.md")
-BEGIN, END = "<!-- table: docs/published_results.py -->", "<!-- end of table -->"
+PAGE, MARK = "published_results.md", "table: docs/published_results.py"
 
 MAX_SIGMA = 3.0
 """Differences past this need a reason."""
@@ -450,11 +450,7 @@ def table(folder: Path) -> Iterator[str]:
 def main(folder: Path) -> int:
     """Write the table into the page; 1 where a number differs without a reason."""
     lines = list(table(folder))
-    text = PAGE.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    after = rest.split(END)[1]
-    whole = "\n".join([before + BEGIN, "", *lines, "", END + after])
-    PAGE.write_text(whole, encoding="utf-8")
+    put_table(PAGE, lines, MARK)
     return int(
         any(
             abs(float(x.split("|")[6])) > MAX_SIGMA and not x.split("|")[7].strip()

@@ -21,12 +21,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "detection")]
 
 from helpers import niriss  # noqa: E402
+from pages import put_table  # noqa: E402
 from test_verdict import KINDS, Visibility, observed, points, star, told  # noqa: E402
 
 from amibayes.data.observables import Observables, join  # noqa: E402
 
-PAGE = Path(__file__).with_name("public_verdicts.md")
-BEGIN, END = "<!-- table: docs/verdict_confusion.py -->", "<!-- end of table of confusion -->"
+PAGE, MARK = "public_verdicts.md", "table: docs/verdict_confusion.py"
 STATEMENTS = ("companion", "no companion", "model rejected", "inconsistent data")
 
 Make = Callable[[np.random.Generator], Observables]
@@ -115,9 +115,7 @@ def main(n: int) -> None:
             count[told(make(rng), rng)[0].statement] += 1
         rows.append(f"| {name} | {' | '.join(str(count[s] or '') for s in STATEMENTS)} |")
         print(rows[-1], flush=True)
-    text = PAGE.read_text(encoding="utf-8")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    PAGE.write_text("\n".join([before + BEGIN, "", *rows, "", END + after]), encoding="utf-8")
+    put_table(PAGE, rows, MARK)
 
 
 if __name__ == "__main__":

@@ -93,5 +93,7 @@ def script_of_docs(name: str) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # where it is when it is run, with those it imports
     spec.loader.exec_module(module)
     return module

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+from scipy.special import gamma, jv
 
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
+from amibayes.units import MAS
 
 TELESCOPES_M = np.array([[0.0, 0.0], [35.0, 12.0], [-20.0, 60.0], [70.0, 85.0]])
 """Baselines of 37 to 110 m: λ/B_max is 3.1 mas in H."""
@@ -49,3 +53,24 @@ def common_errors(
         row = np.unique(key, axis=0, return_inverse=True)[1].ravel()
         out.append(size * rng.standard_normal(row.max() + 1)[row])
     return np.concatenate(out)
+
+
+def darkened_disc(diameter_mas: float, exponent: float, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Visibility of a disc I(μ) = μ^α, Hestroffer (1997), at spatial frequencies in 1/rad."""
+    nu = 0.5 * exponent + 1.0
+    x = np.maximum(np.pi * diameter_mas * MAS * np.hypot(u, v), 1e-9)
+    return gamma(nu + 1.0) * jv(nu, x) / (x / 2.0) ** nu
+
+
+def visibilities(
+    sheet: Observables, source: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a source shows on the baselines (n_vis2,) and on the sides of triangles (n_cp, 3).
+
+    ``source`` takes spatial frequencies, 1/rad, and wavelengths, m; smearing is left out.
+    """
+    vis2, closure = sheet.vis2, sheet.closure_phase
+    u, v = (x[:, 0] / vis2.wavelength_m for x in (vis2.u_m, vis2.v_m))
+    wavelength = closure.wavelength_m[:, None]
+    sides = [np.column_stack([x, -x.sum(axis=1)]) / wavelength for x in (closure.u_m, closure.v_m)]
+    return source(u, v, vis2.wavelength_m), source(*sides, wavelength)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli.options import common
+from amibayes.cli.options import common, data_options
 from amibayes.support.options import ImagingProgram, choices
 
 if TYPE_CHECKING:
@@ -25,10 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "files", nargs="+", metavar="FILE", help="OIFITS file(s) of one object, merged into one"
     )
     parser.add_argument("--to", required=True, choices=choices(ImagingProgram), help="the program")
-    parser.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
-    parser.add_argument(
-        "--target", metavar="NAME", help="use one target of files that hold several"
-    )
+    data_options.add_insname(parser)
+    data_options.add_target(parser)
     common.add_output_options(parser, "export")
 
 

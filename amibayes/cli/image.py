@@ -83,11 +83,9 @@ def _add_data(data: argparse._ArgumentGroup) -> None:
     data_options.add_closure_covariance(data)
     data_options.add_calibration(data)
     data_options.add_calibrator_diameters(data)
-    data.add_argument(
-        "--keep-all", action="store_true", help="use every calibrator, whatever vetting finds"
-    )
+    data_options.add_keep_all(data)
     data_options.add_insname(data)
-    data.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
+    data_options.add_target(data)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -130,23 +128,10 @@ def _options(arguments: argparse.Namespace) -> ImagingOptions:
     from amibayes.pipeline.imaging import ImagingOptions
     from amibayes.pipeline.options import SearchOptions
 
-    reduction = data_options.reduction_of(arguments)
     search = SearchOptions(
         observables=arguments.observables,
         diameter=arguments.diameter,
-        flag=reduction["flag"],
-        average_polarisations=reduction["polarisations"],
-        bin_channels=reduction["channels"],
-        merge_epochs_days=reduction["epochs_days"],
-        calibrator_diameters=arguments.calibrator_diameters,
-        closure_covariance=arguments.closure_covariance,
-        calibration=arguments.calibration,
-        clip=arguments.clip,
-        keep_all=arguments.keep_all,
-        insname=arguments.insname,
-        target=arguments.target,
-        seed=arguments.seed,
-        images=common.image_options_of(arguments),
+        **data_options.reading_settings(arguments),
     )
     return ImagingOptions(
         search,

@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.modes import innermost_first
 from amibayes.companion_search.optimise import fit_single, refine_at
-from amibayes.companion_search.result import RIVAL, SearchResult
+from amibayes.companion_search.result import RIVAL, Mode, SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.extra_noise import NoisePrior, with_noise
@@ -91,23 +91,24 @@ def look_outside(result: SearchResult) -> float | None:
     float or None
         Its separation in mas; None where nothing outside is as good.
     """
+    if not SURELY_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE:
+        return None
     likelihood, outer = result.likelihood, result.grid.outer_mas
     fringe = resolution_mas(likelihood)
     step = fringe / COARSE_STEPS_PER_FRINGE
     positions = min(MAX_LOOKED_AT, MAX_WORK / (len(likelihood.samples) + WORK_PER_POSITION))
     reach = np.hypot(outer, step * np.sqrt(positions / np.pi))
     beyond = make_grid(outer, float(min(outermost(likelihood), reach)), step)
-    if not SURELY_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE or not len(beyond):
+    if not len(beyond):
         return None
     bank = _bank(beyond, result)
     place, gain = _best_of(bank, result)
     # Half a step of this grid beside a peak costs it up to 20 %.
     if gain < 0.8 * float(result.bank_gain.max()) - RIVAL:
         return None
-    tail = bank.matched_filter(_residuals(result))(place)[0]
     box, single = Box(outer, np.inf, fringe), result.single_theta
     alone = float(likelihood.deviance(np.array([result.chi2_single]))[0])
-    found = refine_at(likelihood, place, tail, single, box, alone)
+    found = _fit_from(place, bank, likelihood, single, box, alone)
     best = result.modes[0]
     modes = sorted((best, found), key=lambda m: -m.delta_chi2)
     aliases = innermost_first(likelihood, modes, single, fringe)[1]
@@ -116,9 +117,22 @@ def look_outside(result: SearchResult) -> float | None:
     return found.companion.separation_mas
 
 
-def _residuals(result: SearchResult) -> FloatArray:
-    """Whitened residuals of the star alone, (n_data,)."""
-    return single_likelihood(result.likelihood).residuals(result.single_theta)[:, 0]
+def _residuals(likelihood: Likelihood, single: FloatArray) -> FloatArray:
+    """Whitened residuals of a star alone, (n_data,)."""
+    return single_likelihood(likelihood).residuals(single)[:, 0]
+
+
+def _fit_from(
+    place: FloatArray,
+    bank: TemplateBank,
+    likelihood: Likelihood,
+    single: FloatArray,
+    box: Box,
+    deviance_single: float,
+) -> Mode:
+    """Fit from a place (2,), mas, with the contrast that a bank's templates give there."""
+    tail = bank.matched_filter(_residuals(likelihood, single))(place)[0]
+    return refine_at(likelihood, place, tail, single, box, deviance_single)
 
 
 def _bank(grid: Grid, result: SearchResult) -> TemplateBank:
@@ -130,7 +144,7 @@ def _bank(grid: Grid, result: SearchResult) -> TemplateBank:
 
 def _best_of(bank: TemplateBank, result: SearchResult) -> tuple[FloatArray, float]:
     """Place (2,), mas, of the largest gain in χ² of a bank, and the gain."""
-    gain = bank.survey(_residuals(result)).gain
+    gain = bank.survey(_residuals(result.likelihood, result.single_theta)).gain
     best = int(gain.argmax())
     return np.array([bank.grid.east_mas[best], bank.grid.north_mas[best]]), float(gain[best])
 
@@ -229,9 +243,7 @@ def _holds(
 ) -> bool:
     """Whether a companion outside still fits notably better with the noise fitted beside it."""
     bank = TemplateBank(likelihood, within, single)
-    residuals = single_likelihood(likelihood).residuals(single)[:, 0]
-    tail = bank.matched_filter(residuals)(place)[0]
-    theta = np.array(refine_at(likelihood, place, tail, single, box, 0.0).theta)
+    theta = np.array(_fit_from(place, bank, likelihood, single, box, 0.0).theta)
     stated = likelihood.expecting(theta)
     noisy = with_noise(stated, fit_noise(stated, theta, prior=prior))
     alone, chi2 = fit_single(noisy)
@@ -256,5 +268,4 @@ def _gains(likelihood: Likelihood, grid: Grid, single: FloatArray) -> FloatArray
     """Gain in χ² of a faint companion at every position of a grid, (n,)."""
     if not len(grid):
         return np.empty(0)
-    left = single_likelihood(likelihood).residuals(single)[:, 0]
-    return TemplateBank(likelihood, grid, single).survey(left).gain
+    return TemplateBank(likelihood, grid, single).survey(_residuals(likelihood, single)).gain

@@ -199,26 +199,33 @@ class BlockCovariance:
             for k in range(len(s.index))
         )
 
-    def _assemble(self) -> tuple[csr_array, csr_array, float]:
-        row = 0
-        places, whitening, colouring, logdet = [], [], [], 0.0
+    @cached_property
+    def _places(self) -> tuple[IntArray, IntArray]:
+        """Row and column of every number of factors (g, r, m) of the stacks, side by side."""
+        first, rows, columns = 0, [np.empty(0, np.intp)], [np.empty(0, np.intp)]
         for stack in self.stacks:
-            white, colour = stack.factors()
-            g, r, m = white.shape
-            rows = row + np.arange(g * r).reshape(g, r, 1)
-            columns = stack.index.reshape(g, 1, m)
-            places.append([np.broadcast_to(x, (g, r, m)).ravel() for x in (rows, columns)])
-            whitening.append(white.ravel())
-            colouring.append(colour.swapaxes(1, 2).ravel())
-            logdet += float(np.linalg.slogdet(colour.swapaxes(1, 2) @ colour)[1].sum())
-            row += g * r
-        where = tuple(np.concatenate(x) for x in zip(*places, strict=True)) if row else ([], [])
-        shape = (row, self.size)
-        return (
-            csr_array((np.concatenate([np.empty(0), *whitening]), where), shape=shape),
-            csr_array((np.concatenate([np.empty(0), *colouring]), where), shape=shape),
-            logdet,
+            (g, m), r = stack.index.shape, stack.shape[1]
+            row = first + np.arange(g * r).reshape(g, r, 1)
+            rows.append(np.broadcast_to(row, (g, r, m)).ravel())
+            columns.append(np.broadcast_to(stack.index.reshape(g, 1, m), (g, r, m)).ravel())
+            first += g * r
+        return np.concatenate(rows), np.concatenate(columns)
+
+    def laid_out(self, factors: Sequence[FloatArray]) -> csr_array:
+        """Sparse matrix (rank, size) of a factor (g, r, m) for every stack."""
+        values = np.concatenate([np.empty(0), *(f.ravel() for f in factors)])
+        rank = sum(len(s.index) * s.shape[1] for s in self.stacks)
+        return csr_array((values, self._places), shape=(rank, self.size))
+
+    def _assemble(self) -> tuple[csr_array, csr_array, float]:
+        """Whitening and transposed colouring, (rank, size), and ln of the determinant."""
+        factors = [stack.factors() for stack in self.stacks]
+        colours = [colour.swapaxes(1, 2) for _, colour in factors]
+        logdet = sum(
+            float(np.linalg.slogdet(c @ colour)[1].sum())
+            for c, (_, colour) in zip(colours, factors, strict=True)
         )
+        return self.laid_out([white for white, _ in factors]), self.laid_out(colours), logdet
 
     @property
     def variance(self) -> FloatArray:

@@ -20,7 +20,7 @@ from amibayes.data.blocks import Block, BlockCovariance, Stack
 from amibayes.data.covariance import Covariance, DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.likelihood.noise import FittedNoise, GaussianNoise
-from amibayes.units import BoolArray, FloatArray, IntArray
+from amibayes.units import BoolArray, FloatArray
 
 DEGREES = 4.0
 """Degrees of freedom ν of the residuals."""
@@ -105,27 +105,17 @@ def symmetric_whitening(observables: Observables) -> SymmetricWhitening:
         return SymmetricWhitening(
             csr_array(eye_array(covariance.size)), np.ones(covariance.size), vis2
         )
-    stacks = covariance.stacks if isinstance(covariance, BlockCovariance) else ()
-    values, rows, columns, first = list[FloatArray](), list[IntArray](), list[IntArray](), 0
-    for stack in stacks:
-        turned = _symmetric(stack)
-        g, _, r = turned.shape
-        white = first + np.arange(g * r).reshape(g, 1, r)
-        rows.append(np.broadcast_to(stack.index[:, :, None], turned.shape).ravel())
-        columns.append(np.broadcast_to(white, turned.shape).ravel())
-        values.append(turned.ravel())
-        first += g * r
-    where = np.concatenate(rows), np.concatenate(columns)
-    frame = csr_array((np.concatenate(values), where), shape=(covariance.size, covariance.rank))
+    assert isinstance(covariance, BlockCovariance)
+    frame = csr_array(covariance.laid_out([_symmetric(s) for s in covariance.stacks]).T)
     return SymmetricWhitening(frame, np.asarray((frame**2).sum(axis=1)).ravel(), vis2)
 
 
 def _symmetric(stack: Stack) -> FloatArray:
-    """Q = A (AᵀA)^{-1/2} of every block, (g, m, r), A its standardised colouring."""
+    """(AᵀA)^{-1/2} Aᵀ of every block, (g, r, m), A its standardised colouring."""
     _, colouring = stack.factors()
     errors = np.sqrt(np.einsum("gmm->gm", stack.matrix))
     left, _, right = np.linalg.svd(colouring / errors[:, :, None], full_matrices=False)
-    return np.asarray(left @ right)
+    return np.asarray((left @ right).swapaxes(1, 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ smoothly with the data, so that a limit does not depend on rounding.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.special import ndtri
@@ -213,12 +213,17 @@ class _Trials:
     noise: FloatArray
     along: FloatArray
 
+    @cached_property
+    def goal(self) -> float:
+        """Root of the gain in χ² of a detection."""
+        return float(np.sqrt(self.test.gain_at(np.array(self.threshold))))
+
     def detected(self) -> tuple[FloatArray, BoolArray]:
         """Contrasts (n,) from which on they are detected, and whether that is at their place.
 
         By the secant rule, from linear theory.
         """
-        goal, sigma = float(np.sqrt(self.test.gain_at(np.array(self.threshold)))), self.at.sigma
+        goal, sigma = self.goal, self.at.sigma
         every, slope = np.arange(len(sigma)), 1.0 / sigma
         contrast = np.clip(sigma * np.maximum(goal - self.along, 0.2 * goal), 0.0, 1.0)
         seen, right = self._seen(every, contrast)
@@ -244,9 +249,8 @@ class _Trials:
         """Contrasts (n,) from which on they are seen at their place, where that is asked for."""
         found = np.where(detected <= 1.0, detected, np.inf)
         wrong = np.flatnonzero(np.isfinite(found) & ~self.at.anywhere & ~right)
-        goal = float(np.sqrt(self.test.gain_at(np.array(self.threshold))))
         low = found[wrong]
-        high = np.minimum(np.maximum(WIDE * goal * self.at.sigma[wrong], 2.0 * low), 1.0)
+        high = np.minimum(np.maximum(WIDE * self.goal * self.at.sigma[wrong], 2.0 * low), 1.0)
         low, high = self._parted(wrong, low, high, CELLS)
         beyond = np.isinf(high)
         top = low[beyond], np.ones(int(beyond.sum()))

@@ -13,7 +13,7 @@ from astropy.table import QTable
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.tables import UNITS, pretty, quantity_table
-from amibayes.errors import DataError, UsageError
+from amibayes.errors import DataError
 from amibayes.posterior.chain import (
     MAX_STEPS,
     N_WALKERS,
@@ -33,6 +33,7 @@ from amibayes.posterior.sampler import ModelPrior
 from amibayes.support.arguments import checks_arguments, one_of
 from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
+from amibayes.support.optional import optional_package
 from amibayes.units import (
     FloatArray,
     contrast_to_delta_mag,
@@ -194,12 +195,7 @@ class Posterior:
         UsageError
             Where ArviZ is not installed.
         """
-        try:
-            import arviz
-        except ImportError as error:
-            raise UsageError(
-                "InferenceData needs ArviZ", remedy="pip install 'amibayes[arviz]'"
-            ) from error
+        arviz = optional_package("arviz", "InferenceData needs ArviZ", "arviz")
         kept = self.chain[self.n_burn :].swapaxes(0, 1)
         groups: dict[str, Any] = {
             "posterior": {name: kept[..., k] for k, name in enumerate(self.names)},

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.errors import UsageError
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
+from amibayes.support.optional import optional_package
 
 LIVE_POINTS = 500
 """ln Z is then known to some 0.15, less than what one number of the prior changes."""
@@ -32,12 +32,7 @@ class NestedSampler:
         UsageError
             Where dynesty is not installed.
         """
-        try:
-            import dynesty
-        except ImportError as error:
-            raise UsageError(
-                "nested sampling needs dynesty", remedy="pip install 'amibayes[evidence]'"
-            ) from error
+        dynesty = optional_package("dynesty", "nested sampling needs dynesty", "evidence")
         sampler = dynesty.NestedSampler(
             lambda theta: float(log_prob(theta[None])[0]),
             lambda cube: prior.from_cube(cube[None])[0],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from amibayes.errors import UsageError
+from amibayes.support.optional import optional_package
 from amibayes.units import FloatArray
 
 UNITS = {"mas": "mas", "deg": "deg", "rad": "rad", "mag": "mag"}
@@ -41,12 +41,7 @@ def labelled(
     UsageError
         Where xarray is not installed.
     """
-    try:
-        import xarray
-    except ImportError as error:
-        raise UsageError(
-            "labelled arrays need xarray", remedy="pip install 'amibayes[xarray]'"
-        ) from error
+    xarray = optional_package("xarray", "labelled arrays need xarray", "xarray")
     kept = {name: value for name, value in attributes.items() if value is not None}
     data = xarray.Dataset(dict(variables), coords=dict(coordinates), attrs=kept)
     for name in data.variables:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import gamma, jv
+from interferometer import darkened_disc, visibilities
 from test_global_search import coverage
 
 from amibayes.companion_search.optimise import refine
@@ -31,27 +31,18 @@ PLACE, CONTRAST, REFERENCE_M = (5.2, -3.7), 0.24, 1.62e-6
 def observed(sheet: Observables) -> Observables:
     """The data of a limb-darkened star and a companion that is a disc with a colour, no noise."""
 
-    def disc(diameter: float, exponent: float, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        nu = 0.5 * exponent + 1.0
-        x = np.maximum(np.pi * diameter * MAS * np.hypot(u, v), 1e-9)
-        return gamma(nu + 1.0) * jv(nu, x) / (x / 2.0) ** nu
-
-    def visibility(u_m: np.ndarray, v_m: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-        u, v = u_m / wavelength, v_m / wavelength
+    def visibility(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
         ratio = CONTRAST * (wavelength / REFERENCE_M) ** TRUTH["contrast_slope"]
         east, north = (MAS * x for x in PLACE)
-        star = disc(TRUTH["diameter_mas"], TRUTH["limb_darkening"], u, v)
-        other = disc(TRUTH["companion_diameter_mas"], 0.0, u, v)
+        star = darkened_disc(TRUTH["diameter_mas"], TRUTH["limb_darkening"], u, v)
+        other = darkened_disc(TRUTH["companion_diameter_mas"], 0.0, u, v)
         return (star + ratio * other * np.exp(-2j * np.pi * (u * east + v * north))) / (1 + ratio)
 
-    vis2, closure = sheet.vis2, sheet.closure_phase
-    power = np.abs(visibility(vis2.u_m[:, 0], vis2.v_m[:, 0], vis2.wavelength_m)) ** 2
-    u, v = (np.column_stack([x, -x.sum(axis=1)]) for x in (closure.u_m, closure.v_m))
-    legs = visibility(u, v, closure.wavelength_m[:, None])
+    both, legs = visibilities(sheet, visibility)
     return replace(
         sheet,
-        vis2=replace(vis2, value=power),
-        closure_phase=replace(closure, value=np.angle(legs.prod(axis=1))),
+        vis2=replace(sheet.vis2, value=np.abs(both) ** 2),
+        closure_phase=replace(sheet.closure_phase, value=np.angle(legs.prod(axis=1))),
     )
 
 

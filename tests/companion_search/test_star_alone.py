@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import simulated
-from scipy.special import gamma, jv
+from interferometer import darkened_disc, visibilities
 from test_global_search import coverage
 
 from amibayes.companion_search.optimise import fit_single
@@ -17,7 +17,6 @@ from amibayes.data.systematics import Systematics
 from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.units import MAS
 
 COHERENT = 0.003
 """Error of each visibility, which makes closure phases near a null uncertain by radians."""
@@ -26,16 +25,9 @@ COHERENT = 0.003
 def star(diameter_mas: float, exponent: float, rng: np.random.Generator) -> Observables:
     """CHARA's six telescopes on a disc I(μ) = μ^α, by Hestroffer (1997); smearing left out."""
     sheet = coverage("mirc6t", 0.005, 0.005)
-    nu = 0.5 * exponent + 1.0
-
-    def visibility(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-        x = np.pi * diameter_mas * MAS * np.hypot(u, v) / wavelength
-        return gamma(nu + 1.0) * jv(nu, x) / (x / 2.0) ** nu
-
     vis2, closure = sheet.vis2, sheet.closure_phase
-    power = visibility(vis2.u_m[:, 0], vis2.v_m[:, 0], vis2.wavelength_m) ** 2
-    u, v = (np.column_stack([x, -x.sum(axis=1)]) for x in (closure.u_m, closure.v_m))
-    legs = visibility(u, v, closure.wavelength_m[:, None])
+    single, legs = visibilities(sheet, lambda u, v, _: darkened_disc(diameter_mas, exponent, u, v))
+    power = single**2
     errors = (
         np.hypot(0.003, 2.0 * COHERENT * np.sqrt(power)),
         np.hypot(0.003, COHERENT * np.sqrt((1.0 / legs**2).sum(axis=1))),

@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import niriss
+from interferometer import visibilities
 from scipy.special import j0, j1
 from scipy.stats import chi2
 
 from amibayes.companion_search.search import search
-from amibayes.data.observables import Measurements, Observables, join
+from amibayes.data.observables import Observables, join
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, within_calibration
@@ -69,24 +70,14 @@ def disc(diameter: float, spot: float = 0.0) -> Visibility:
 
 def observed(sheet: Observables, source: Visibility, rng: np.random.Generator) -> Observables:
     """The sheet's observables of a source, with noise."""
-    data = np.concatenate([_vis2(sheet.vis2, source), _closure(sheet.closure_phase, source)])
+    both, sides = visibilities(sheet, lambda u, v, _: source(MAS * u, MAS * v))
+    data = np.concatenate([np.abs(both) ** 2, np.angle(sides.prod(axis=1))])
     vis2, closure = np.split(data + sheet.covariance.draw(rng, 1)[:, 0], [sheet.n_vis2])
     return replace(
         sheet,
         vis2=replace(sheet.vis2, value=vis2),
         closure_phase=replace(sheet.closure_phase, value=closure),
     )
-
-
-def _vis2(table: Measurements, source: Visibility) -> np.ndarray:
-    u, v = (MAS * x[:, 0] / table.wavelength_m for x in (table.u_m, table.v_m))
-    return np.abs(source(u, v)) ** 2
-
-
-def _closure(table: Measurements, source: Visibility) -> np.ndarray:
-    u, v = (MAS * x.T / table.wavelength_m for x in (table.u_m, table.v_m))
-    bispectrum = source(u[0], v[0]) * source(u[1], v[1])
-    return np.angle(bispectrum * source(u[0] + u[1], v[0] + v[1]).conj())
 
 
 def told(data: Observables, rng: np.random.Generator) -> tuple[Verdict, tuple[Consistency, ...]]:

@@ -129,12 +129,16 @@ def _flags(names: tuple[str, ...] | None) -> tuple[str, ...] | None:
     return names
 
 
-def finite_float(text: str) -> float:
-    """Parse a finite number."""
+def _number(text: str) -> float:
     try:
-        value = float(text)
+        return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def finite_float(text: str) -> float:
+    """Parse a finite number."""
+    value = _number(text)
     if not abs(value) < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not finite")
     return value
@@ -252,10 +256,7 @@ def non_negative_integer(text: str) -> int:
 
 def positive_float(text: str) -> float:
     """Parse a finite number above zero."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+    value = _number(text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value

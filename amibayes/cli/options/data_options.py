@@ -149,6 +149,18 @@ def add_insname(group: argparse._ActionsContainer) -> None:
     group.add_argument("--insname", metavar="NAME", help="use one instrument table of the files")
 
 
+def add_target(group: argparse._ActionsContainer) -> None:
+    """Add ``--target``."""
+    group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
+
+
+def add_keep_all(group: argparse._ActionsContainer) -> None:
+    """Add ``--keep-all``."""
+    group.add_argument(
+        "--keep-all", action="store_true", help="use every calibrator, whatever vetting finds"
+    )
+
+
 def add_separation(group: argparse._ActionsContainer) -> None:
     """Add ``--separation``."""
     group.add_argument(
@@ -261,13 +273,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         raise UsageError(
             "needs calibrators", source="--calibrator-diameters", remedy="give --cal FILES"
         )
-    reduction = reduction_of(arguments)
-    return {
-        "flag": reduction["flag"],
-        "average_polarisations": reduction["polarisations"],
-        "bin_channels": reduction["channels"],
-        "merge_epochs_days": reduction["epochs_days"],
-        "calibrator_diameters": arguments.calibrator_diameters,
+    return reading_settings(arguments) | {
         "separation_mas": arguments.separation,
         "diameter": arguments.diameter,
         "background": arguments.background,
@@ -275,13 +281,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "companion_diameter": arguments.companion_diameter,
         "contrast_slope": arguments.contrast_slope,
         "smearing": arguments.smearing,
-        "closure_covariance": arguments.closure_covariance,
-        "calibration": arguments.calibration,
         "library": arguments.library,
-        "clip": arguments.clip,
-        "keep_all": arguments.keep_all,
-        "insname": arguments.insname,
-        "target": arguments.target,
         "contrast": arguments.contrast,
         "motion": arguments.motion,
         "fastest_mas_yr": arguments.fastest,
@@ -291,6 +291,24 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "systematics": arguments.systematics,
         "robust": arguments.robust,
         "file_noise": arguments.file_noise,
+    }
+
+
+def reading_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what `SearchOptions` has on how data are read, reduced and calibrated."""
+    reduction = reduction_of(arguments)
+    return {
+        "flag": reduction["flag"],
+        "average_polarisations": reduction["polarisations"],
+        "bin_channels": reduction["channels"],
+        "merge_epochs_days": reduction["epochs_days"],
+        "calibrator_diameters": arguments.calibrator_diameters,
+        "closure_covariance": arguments.closure_covariance,
+        "calibration": arguments.calibration,
+        "clip": arguments.clip,
+        "keep_all": arguments.keep_all,
+        "insname": arguments.insname,
+        "target": arguments.target,
         "seed": arguments.seed,
         "images": common.image_options_of(arguments),
     }
@@ -326,9 +344,7 @@ def add_data(group: argparse._ActionsContainer) -> None:
     add_closure_covariance(group)
     add_calibration(group)
     add_calibrator_diameters(group)
-    group.add_argument(
-        "--keep-all", action="store_true", help="use every calibrator, whatever vetting finds"
-    )
+    add_keep_all(group)
     group.add_argument(
         "--extra-noise",
         action=argparse.BooleanOptionalAction,
@@ -364,4 +380,4 @@ def add_data(group: argparse._ActionsContainer) -> None:
         help="Student-t residuals: outliers lose their weight, in search, null draws, limits and "
         "posterior",
     )
-    group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
+    add_target(group)
