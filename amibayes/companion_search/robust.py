@@ -1,4 +1,8 @@
-"""A search with Student-t residuals: data that fit nothing lose their weight, step by step."""
+"""A search with Student-t residuals: data that fit nothing lose their weight, step by step.
+
+What channels of an exposure share is fitted to the residuals of a first search, outliers at
+little weight; the search that counts has it in the covariance, as if the file had stated it.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,11 @@ from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
+from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.combinations import combination_of, require
-from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, mean_of_files
+from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, NoisePrior, mean_of_files
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.residuals import files_of, groups_of
 from amibayes.likelihood.student import (
     DEGREES,
@@ -40,6 +46,7 @@ def search_robust(
     *,
     free_scale: bool = True,
     per_file: bool = False,
+    prior: NoisePrior | None = None,
 ) -> tuple[SearchResult, ExtraNoise]:
     """Search with residuals of Student's t distribution.
 
@@ -51,6 +58,8 @@ def search_robust(
         Fit the scale of the errors of each kind of observable (never below the stated ones).
     per_file : bool
         Every file has scales of its own.
+    prior : NoisePrior, optional
+        Whether channels of an exposure may share some of their noise, and floors.
 
     Returns
     -------
@@ -75,14 +84,48 @@ def search_robust(
         alone.residuals(plain.single_theta)[:, 0],
     ]
     tried = [work.converge(white) for white in starts]
-    result, weights, residuals, scale = max(tried, key=lambda t: work.log_prob(t[0].theta))
+    found = max(tried, key=lambda t: work.log_prob(t[0].theta))
+    first, _, _, _ = found
+    shared = shared_noise(first.likelihood, first.theta, prior or NoisePrior(), per_file=per_file)
+    correlated = with_shared(likelihood, shared)
+    if correlated is not likelihood:
+        likelihood = correlated
+        work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
+        found = work.converge(likelihood.residuals(first.theta)[:, 0])
+    result, weights, residuals, scale = found
     stated = likelihood.observables
     base = reweighted(stated, scale)
     robustness = Robustness(base, stated, weights, residuals)
     student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
     noise = _as_noise(stated, scale, per_file=per_file)
+    noise = replace(noise, channels=shared.channels, floors=shared.floors)
     likelihood = result.likelihood.with_noise(student)
     return replace(result, likelihood=likelihood, robustness=robustness), noise
+
+
+Found = tuple[SearchResult, FloatArray, FloatArray, FloatArray]
+"""A search, and of every datum its weight, its residual and the scale of its error, (n_data,)."""
+
+
+def shared_noise(
+    weighted: Likelihood, theta: FloatArray, prior: NoisePrior, *, per_file: bool = False
+) -> ExtraNoise:
+    """What channels share of the noise, and floors, from what a fit with weights leaves.
+
+    ``weighted`` has the errors of outliers stretched. The amount of noise is left to the scales.
+    """
+    fixed = replace(prior, vis2=0.0, closure_phase_rad=0.0)
+    return fit_noise(weighted.expecting(theta), theta, per_file=per_file, prior=fixed)
+
+
+def with_shared(likelihood: Likelihood, noise: ExtraNoise) -> Likelihood:
+    """The likelihood of data whose covariance holds what channels share, and floors."""
+    data = likelihood.observables
+    covariance = noise_with_channels(data, noise.channels, noise.floors).covariance
+    if covariance is data.covariance:
+        return likelihood
+    blocks = covariance.select(np.arange(covariance.size))
+    return Likelihood(replace(data, covariance=blocks), likelihood.model)
 
 
 def _as_noise(stated: Observables, scale: FloatArray, *, per_file: bool) -> ExtraNoise:
@@ -136,9 +179,7 @@ class RobustFits:
         each = zip(self.terms, nodes, strict=True)
         return float(sum(t.log_likelihoods(difference, np.array([n]))[0, 0] for t, n in each))
 
-    def converge(
-        self, white: FloatArray
-    ) -> tuple[SearchResult, FloatArray, FloatArray, FloatArray]:
+    def converge(self, white: FloatArray) -> Found:
         """Search, and again with new weights until the place holds."""
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):

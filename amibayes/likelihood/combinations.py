@@ -64,12 +64,6 @@ def refusal(combination: Combination) -> tuple[str, str] | None:
             "robust residuals need errors that are stated, not estimated from the scatter",
             "leave --robust out: extraction has left out integrations that are outliers",
         )
-    if c.residuals == "student" and c.channels == "correlated":
-        # Its weights are those of single data; a common error is no outlier of any of them.
-        return (
-            "robust residuals take the channels of an exposure as independent",
-            "leave --robust or --channel-noise out",
-        )
     if c.method == "closed limits" and c.bank != "tied":
         # Their formulae have one linear parameter at each position: one contrast, at rest.
         return (
@@ -105,6 +99,7 @@ def combination_of(
     noise: Amount = "stated",
     per_file: bool = False,
     method: Method = "search",
+    channels: Channels = "independent",
 ) -> Combination:
     """The combination that a likelihood and a request amount to."""
     data, model = likelihood.observables, likelihood.model
@@ -122,4 +117,5 @@ def combination_of(
         bank,
         model.companions,
         method,
+        channels,
     )

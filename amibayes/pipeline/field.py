@@ -154,9 +154,10 @@ def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult
     """Search the field of a search with stated errors with the noise that was asked for."""
     apart = options.file_noise is not False
     likelihood, field = first.likelihood, (first.grid.inner_mas, first.grid.outer_mas)
-    if options.robust:
-        return search_robust(likelihood, field, free_scale=options.extra_noise, per_file=apart)
     prior = noise_prior(likelihood.observables, options)
+    if options.robust:
+        free = options.extra_noise
+        return search_robust(likelihood, field, free_scale=free, per_file=apart, prior=prior)
     if options.extra_noise or options.channel_noise or prior.floors:
         return search_with_noise(likelihood, field, per_file=apart, prior=prior, first=first)
     return first, ExtraNoise()

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from brute_force import coverage
 from interferometer import darkened_disc, visibilities
-from test_global_search import coverage
 
 from amibayes.companion_search.optimise import refine
 from amibayes.data.observables import Observables

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from brute_force import coverage
 from helpers import simulated
 from interferometer import darkened_disc, visibilities
-from test_global_search import coverage
 
 from amibayes.companion_search.optimise import fit_single
 from amibayes.data.assumed_covariance import covariance_of_errors

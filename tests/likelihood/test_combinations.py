@@ -11,7 +11,7 @@ import pytest
 from helpers import NIRISS_HOLES
 
 from amibayes.companion_search.grid import make_grid
-from amibayes.companion_search.robust import RobustFits
+from amibayes.companion_search.robust import RobustFits, with_shared
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
@@ -19,8 +19,9 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.errors import UsageError
 from amibayes.likelihood.averaged_noise import averaged_noise
+from amibayes.likelihood.channel_noise import ChannelShare, Correlation
 from amibayes.likelihood.combinations import Combination, combination_of, refusal, require
-from amibayes.likelihood.extra_noise import add_noise
+from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
@@ -32,20 +33,28 @@ NOISES = ("stated", "extra", "averaged")
 RESIDUALS = ("gaussian", "student")
 SCOPES = ("common", "per file", "shared calibrators")
 BANKS = ("tied", "per band", "motion")
+CHANNELS = ("independent", "correlated")
 COMPANIONS = (1, 2)
 FIELD = (80.0, 200.0)
 TRUTH = np.array([120.0, -60.0, 0.05])
+HALF = ChannelShare(*[Correlation(0.5, 0.0, 0.5, 0.1)] * 2)
+"""Half of the variance is common to the channels of an exposure."""
 
 
 @cache
-def data_of(covariance: str, scope: str) -> Observables:
-    """Two files of two bands and dates, errors understated twofold in one of them."""
+def data_of(covariance: str, scope: str, channels: str = "independent") -> Observables:
+    """Two files of two bands and dates, errors understated twofold in one of them.
+
+    Of one channel each, or of two that may share some of their noise.
+    """
     rng = np.random.default_rng(3)
     parts = []
-    for k, band in enumerate([(4.3e-6, 0.2e-6), (4.8e-6, 0.3e-6)]):
+    for k, (wavelength, width) in enumerate([(4.3e-6, 0.2e-6), (4.8e-6, 0.3e-6)]):
+        parted = np.array([0.0] if channels == "independent" else [-0.25, 0.25]) * width
         sheet = point_source(
             NIRISS_HOLES[:5],
-            *band,
+            wavelength + parted,
+            width / len(parted),
             vis2_error=0.005,
             closure_error_rad=0.005,
             insname=f"NIRISS{k}",
@@ -89,21 +98,24 @@ def likelihood_of(data: Observables, bank: str) -> Likelihood:
 
 def theta_of(likelihood: Likelihood, companions: int = 1) -> np.ndarray:
     one = likelihood.model.at_rest(TRUTH[None])[0]
-    other = likelihood.model.at_rest(np.array([[-100.0, 70.0, 0.01]]))[0]
+    other = likelihood.model.at_rest(np.array([[-100.0, 70.0, 0.001]]))[0]
     return np.concatenate([one, other][:companions])
 
 
 @pytest.mark.parametrize("bank", BANKS)
 @pytest.mark.parametrize("scope", SCOPES)
 @pytest.mark.parametrize("covariance", COVARIANCES)
-def test_every_combination_works_or_is_refused(covariance, scope, bank) -> None:
+@pytest.mark.parametrize("channels", CHANNELS)
+def test_every_combination_works_or_is_refused(channels, covariance, scope, bank) -> None:
     """Fit the noise, make the bank, search one data set, and evaluate the posterior."""
-    data = data_of(covariance, scope)
+    data = data_of(covariance, scope, channels)
     stated = likelihood_of(data, bank)
     per_file = scope != "common"
     for noise, residuals, companions in product(NOISES, RESIDUALS, COMPANIONS):
-        asked = combination_of(stated, residuals=residuals, noise=noise, per_file=per_file)
-        assert asked == Combination(covariance, noise, residuals, scope, bank)
+        asked = combination_of(
+            stated, residuals=residuals, noise=noise, per_file=per_file, channels=channels
+        )
+        assert asked == Combination(covariance, noise, residuals, scope, bank, channels=channels)
         asked = replace(asked, companions=companions)
         if (why := refusal(asked)) is not None:
             assert (covariance, residuals) == ("estimated", "student")
@@ -122,30 +134,38 @@ def test_every_combination_works_or_is_refused(covariance, scope, bank) -> None:
 
 
 @cache
-def profile_of(covariance, scope, bank, residuals, free) -> Likelihood:
+def profile_of(covariance, scope, bank, residuals, free, channels) -> Likelihood:
     """The likelihood with the noise fitted at the truth, or with outliers' errors stretched."""
-    stated, per_file = likelihood_of(data_of(covariance, scope), bank), scope != "common"
-    theta = theta_of(stated)
+    stated, per_file = likelihood_of(data_of(covariance, scope, channels), bank), scope != "common"
+    theta, shares = theta_of(stated), ExtraNoise(channels=shares_of(channels))
     if residuals == "student":
-        work = RobustFits(stated, FIELD, free, per_file=per_file)
+        work = RobustFits(with_shared(stated, shares), FIELD, free, per_file=per_file)
         return work.weighted(work.steps(theta, Box(*FIELD, 188.0))[0])
-    if not free:
-        return stated
-    noisy = add_noise(stated.observables, fit_noise(stated, theta, per_file=per_file))
-    return Likelihood(noisy, stated.model)
+    noise = fit_noise(stated, theta, per_file=per_file) if free else shares
+    return with_noise(stated, replace(noise, channels=shares.channels))
+
+
+def shares_of(channels: str) -> tuple[ChannelShare, ...]:
+    return (HALF,) if channels == "correlated" else ()
 
 
 def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
     """The likelihood that goes with a combination, at the truth."""
     theta, free = theta_of(stated), asked.noise != "stated"
-    profile = profile_of(asked.covariance, asked.scope, asked.bank, asked.residuals, free)
+    profile = profile_of(
+        asked.covariance, asked.scope, asked.bank, asked.residuals, free, asked.channels
+    )
     if asked.noise != "averaged":
         return profile, theta
     fits = [(profile, theta), (single_likelihood(profile), np.empty(0))]
+    shares = shares_of(asked.channels)
     if asked.residuals == "student":
-        noise = averaged_student_noise(profile.noise, stated.observables, fits, per_file=per_file)
+        held = with_shared(stated, ExtraNoise(channels=shares)).observables
+        noise = averaged_student_noise(profile.noise, held, fits, per_file=per_file)
     else:
-        noise = averaged_noise(profile.noise, stated.observables, fits, per_file=per_file)
+        noise = averaged_noise(
+            profile.noise, stated.observables, fits, per_file=per_file, channels=shares
+        )
     n_files = (
         2
         if per_file and not (asked.scope == "shared calibrators" and asked.residuals == "gaussian")

@@ -1,0 +1,98 @@
+"""Robust residuals of data whose channels share some of their noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers import niriss, simulated
+from scipy import stats
+from test_channel_noise import pionier, share, with_draw
+
+from amibayes.companion_search.grid import make_grid
+from amibayes.companion_search.result import null_likelihood
+from amibayes.companion_search.robust import RobustFits, search_robust, shared_noise, with_shared
+from amibayes.data.observables import Observables
+from amibayes.detection.statistic import make_statistic
+from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.parameters import Box
+
+FIELD = (3.0, 8.0)
+COMMON = share(0.5, 0.5)
+
+
+def drawn(sheet: Observables, rng: np.random.Generator, pushed: int = 0) -> tuple:
+    """Half of the variance common to channels, some data pushed by 12 errors, and which."""
+    draw = noise_with_channels(sheet, [COMMON]).draw(1, rng)[:, 0]
+    at = rng.choice(len(draw), pushed, replace=False)
+    draw[at] += 12.0 * np.sqrt(sheet.covariance.variance[at]) * rng.choice([-1.0, 1.0], pushed)
+    return with_draw(sheet, draw), at
+
+
+TRUTH = np.array([5.0, -3.0, 0.3])
+
+
+def binary(rng: np.random.Generator) -> tuple:
+    """A binary, four of its data pushed by 12 errors, and which."""
+    return drawn(simulated(pionier(6), TRUTH, None), rng, 4)
+
+
+def errors_hold_the_truth(theta: np.ndarray, covariance: np.ndarray) -> bool:
+    return bool((np.abs(theta - TRUTH) < 4.0 * np.sqrt(np.diag(covariance))).all())
+
+
+def test_share_is_fitted_beside_outliers_and_grows_errors(rng) -> None:
+    """Share of 0.5 within five errors; an offset of all channels makes the place uncertain."""
+    stated, box = Likelihood(binary(rng)[0]), Box(*FIELD, 4.0)
+    stretch, theta = RobustFits(stated, FIELD, free_scale=True).steps(TRUTH, box)
+    weighted = RobustFits(stated, FIELD, free_scale=True).weighted(stretch)
+    shared = shared_noise(weighted, theta, NoisePrior())
+    (found,) = shared.channels
+    for kind in (found.vis2, found.closure_phase):
+        assert abs(kind.value - 0.5) < 5 * kind.error < 1.0
+    assert not shared_noise(weighted, theta, NoisePrior(channels=False)).channels
+    correlated = with_shared(stated, shared)
+    stretch, again = RobustFits(correlated, FIELD, free_scale=True).steps(theta, box)
+    larger = RobustFits(correlated, FIELD, free_scale=True).weighted(stretch).errors(again)
+    assert errors_hold_the_truth(again, larger)
+    assert larger[2, 2] > 1.4 * weighted.errors(theta)[2, 2]
+
+
+@pytest.mark.slow
+def test_search_names_outliers_and_has_the_share(rng) -> None:
+    data, at = binary(rng)
+    result, noise = search_robust(Likelihood(data), FIELD)
+    assert abs(noise.channels[0].vis2.value - 0.5) < 5 * noise.channels[0].vis2.error
+    assert set(np.argsort(result.robustness.weights)[:4]) == set(at)
+    assert errors_hold_the_truth(result.theta, result.theta_covariance)
+
+
+def test_one_channel_and_no_share_leave_the_data_as_they_are() -> None:
+    for data, noise in ((niriss(), ExtraNoise(channels=(COMMON,))), (pionier(2), ExtraNoise())):
+        likelihood = Likelihood(data)
+        assert with_shared(likelihood, noise) is likelihood
+
+
+def test_covariance_is_that_of_gaussian_residuals() -> None:
+    data = pionier(2)
+    found = with_shared(Likelihood(data), ExtraNoise(channels=(COMMON,)))
+    expected = noise_with_channels(data, [COMMON]).covariance.dense()
+    np.testing.assert_allclose(found.observables.covariance.dense(), expected, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pushed", [0, 12])
+def test_false_alarms_of_null_sets(pushed: int) -> None:
+    """60 null sets, of 720 data each, outliers among them: 12 below 0.1 are a 2e-2 accident."""
+    rng, grid, n = np.random.default_rng(5), make_grid(*FIELD, 0.7), 60
+    sheet, p = pionier(8), []
+    for _ in range(n):
+        result, _ = search_robust(Likelihood(drawn(sheet, rng, pushed)[0]), FIELD)
+        likelihood, symmetric = null_likelihood(result)
+        test = make_statistic(likelihood, grid, result.single_theta, whitening=symmetric)
+        null = test.draw_null(200, rng)
+        p.append((1 + (null >= test.value).sum()) / 201.0)
+    for level, most in ((0.1, 0.13), (0.05, 0.08)):
+        hits = int((np.array(p) < level).sum())
+        assert stats.binomtest(hits, n, most, alternative="greater").pvalue > 1e-4
