@@ -97,8 +97,7 @@ def search_robust(
     base = reweighted(stated, scale)
     robustness = Robustness(base, stated, weights, residuals)
     student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
-    noise = _as_noise(stated, scale, per_file=per_file)
-    noise = replace(noise, channels=shared.channels, floors=shared.floors)
+    noise = _as_noise(stated, scale, shared, per_file=per_file)
     likelihood = result.likelihood.with_noise(student)
     return replace(result, likelihood=likelihood, robustness=robustness), noise
 
@@ -128,8 +127,13 @@ def with_shared(likelihood: Likelihood, noise: ExtraNoise) -> Likelihood:
     return Likelihood(replace(data, covariance=blocks), likelihood.model)
 
 
-def _as_noise(stated: Observables, scale: FloatArray, *, per_file: bool) -> ExtraNoise:
-    """Fitted scales (n_data,), in quadrature to the typical error of each kind (and file)."""
+def _as_noise(
+    stated: Observables, scale: FloatArray, shared: ExtraNoise, *, per_file: bool
+) -> ExtraNoise:
+    """Fitted scales (n_data,), in quadrature to the typical error of each kind (and file).
+
+    Beside what channels share.
+    """
     data = stated.unflagged()
     added = data.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
 
@@ -139,9 +143,10 @@ def _as_noise(stated: Observables, scale: FloatArray, *, per_file: bool) -> Extr
     parts = files_of(data)
     vis2 = np.arange(len(scale)) < data.n_vis2
     if not per_file or len(parts) < 2:
-        return ExtraNoise(of(vis2), of(~vis2))
+        return replace(shared, vis2=of(vis2), closure_phase_rad=of(~vis2))
     files = [FileNoise(f.source, of(f.of_kind("vis2")), of(f.of_kind("cp"))) for f in parts]
-    return mean_of_files(data, files)
+    found = mean_of_files(data, files)
+    return replace(found, channels=shared.channels, floors=shared.floors)
 
 
 class RobustFits:
