@@ -238,6 +238,9 @@ EFFECTS = {
     "migration": MOVING,
     "inter-pixel capacitance 0.6 %": replace(PLAIN, interpixel_capacitance=0.006),
     "flat error 0.1 %": replace(PLAIN, flat_error=1e-3),
+    "flat field of 1 %, divided out": replace(PLAIN, flat_field=0.01, flat_error=0.0),
+    "flat field of 1 %, in the ramps": replace(PLAIN, flat_field=0.01, flat_error=0.0),
+    "analogue-to-digital converter": replace(PLAIN, adc_nonlinearity=1.0),
     "pixel response 3 %": replace(PLAIN, pixel_response=0.03),
     "linearity off by 1 % of 3 %": replace(PLAIN, nonlinearity=0.03, linearity_error=0.01),
     "1/f noise of 5 e⁻": replace(PLAIN, stripe_noise_e=5.0),
@@ -264,7 +267,8 @@ def effects() -> None:
                     )
                     for k in range(2)
                 ]
-                data = calibrated(paths, "off")
+                given = [ramp_path(p) for p in paths] if "in the ramps" in label else paths
+                data = calibrated(given, "off")
             vis2, closure = data.data[: data.n_vis2] - 1.0, np.degrees(data.data[data.n_vis2 :])
             print(
                 f"| {label} | {ratio:g} | {vis2.std():.1e} | {vis2.mean():+.1e} | "

@@ -29,6 +29,7 @@ PEERS = (
     Peer("virgil", "virgil-astro[pipeline]==0.4.1"),
     Peer("fouriever", "fouriever"),
     Peer("pmoired", "pmoired"),
+    Peer("jwst", "jwst==3.0.0"),
 )
 
 

@@ -213,4 +213,9 @@ def _int_times(mjd: FloatArray, integration_time_s: float) -> Any:
         fits.Column("int_mid_MJD_UTC", "D", "d", array=mjd),
         fits.Column("int_end_MJD_UTC", "D", "d", array=mjd + half),
     ]
+    # The jwst package refuses a table without them; the barycentre's times ask for a star's place.
+    columns += [
+        fits.Column(f"int_{part}_BJD_TDB", "D", "d", array=np.full(len(mjd), np.nan))
+        for part in ("start", "mid", "end")
+    ]
     return fits.BinTableHDU.from_columns(columns, name="INT_TIMES")

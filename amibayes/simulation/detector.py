@@ -33,6 +33,9 @@ class Detector:
         Electrons per second and pixel; both stay in the images.
     flat_error : float
         Standard deviation of the relative error of the flat field, fixed for a detector.
+    flat_field : float
+        Standard deviation of the sensitivity of pixels, fixed for a detector. Reads have it;
+        slopes are divided by it, with that error.
     full_well_e : float
         Charge at which a pixel saturates.
     nonlinearity : float
@@ -61,6 +64,9 @@ class Detector:
     stripe_noise_e : float
         Noise of one read that all pixels of a column share, 1/f from column to column. A
         column is what NIRISS reads at one go: its fast axis is y in images as JWST has them.
+    adc_nonlinearity : float
+        Errors of the analogue-to-digital converter, in units of those of NIRISS
+        (`amibayes.simulation.ramps.converted`).
 
     Raises
     ------
@@ -75,6 +81,7 @@ class Detector:
     dark_e_s: float = 0.04
     background_e_s: float = 0.125
     flat_error: float = 1e-3
+    flat_field: float = 0.0
     full_well_e: float = 72000.0
     nonlinearity: float = 0.0
     linearity_error: float = 0.0
@@ -88,6 +95,7 @@ class Detector:
     boundary_shift_x: float = 0.0
     boundary_shift_y: float = 0.0
     stripe_noise_e: float = 0.0
+    adc_nonlinearity: float = 0.0
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -119,6 +127,7 @@ class Detector:
 
 LARGEST = {
     "flat_error": 0.3,
+    "flat_field": 0.1,
     "nonlinearity": 0.2,
     "linearity_error": 0.2,
     "interpixel_capacitance": 0.1,
@@ -129,6 +138,7 @@ LARGEST = {
     "boundary_shift_x": 1e-5,
     "boundary_shift_y": 1e-5,
     "stripe_noise_e": 1e3,
+    "adc_nonlinearity": 100.0,
 }
 """Beyond these an effect is no longer the small correction that it is modelled as."""
 
@@ -182,11 +192,14 @@ class DetectorMaps:
     ----------
     flat : (ny, nx) array
         Factor by which the flat field used differs from the true one.
+    sensitivity : (ny, nx) array
+        Of pixels, their mean 1.
     dead, hot : (ny, nx) bool arrays
         Pixels without signal, and with too much of it.
     """
 
     flat: FloatArray
+    sensitivity: FloatArray
     dead: BoolArray
     hot: BoolArray
 
@@ -201,8 +214,9 @@ def draw_maps(detector: Detector, shape: tuple[int, int], rng: np.random.Generat
 
     Each effect has its own stream, so that switching one does not change the others.
     """
-    of_flat, of_bad = rng.spawn(2)
+    of_flat, of_bad, of_sensitivity = rng.spawn(3)
     flat = 1.0 + detector.flat_error * of_flat.standard_normal(shape)
+    sensitivity = 1.0 + detector.flat_field * of_sensitivity.standard_normal(shape)
     lot = of_bad.random(shape)
     half = detector.bad_pixel_fraction / 2.0
-    return DetectorMaps(flat, lot < half, (lot >= half) & (lot < 2.0 * half))
+    return DetectorMaps(flat, sensitivity, lot < half, (lot >= half) & (lot < 2.0 * half))

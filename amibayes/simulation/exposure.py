@@ -177,7 +177,8 @@ class Recorder:
         """(…, ny, nx) electrons per second at some pointings (…, 2)."""
         images = self.image.at(jitter_px.reshape(-1, 2))
         shape = (*jitter_px.shape[:-1], *images.shape[1:])
-        return np.maximum(self.rate_e_s * images, 0.0).reshape(shape)
+        light = np.maximum(self.rate_e_s * images, 0.0) * self.maps.sensitivity
+        return np.asarray(light.reshape(shape))
 
     def __call__(self, piece: tuple[FloatArray, np.random.SeedSequence]) -> dict[str, Any]:
         """Simulate the integrations of some jitters (n, 2), in pixels, with a seed."""
@@ -214,7 +215,7 @@ def make_recorder(
     UsageError
         Where the brightest pixel saturates before its second group.
     """
-    expected = np.maximum(rate_e_s * image.mean(pointings.jitter_px), 0.0)
+    expected = np.maximum(rate_e_s * image.mean(pointings.jitter_px), 0.0) * maps.sensitivity
     peak = float(expected.max()) * detector.frame_time_s
     if 2.0 * peak > detector.full_well_e:
         raise UsageError(

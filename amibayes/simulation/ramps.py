@@ -7,12 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.cube.ramps import GAIN_E_DN
 from amibayes.ramps.transfer import SIDES, gains
 from amibayes.simulation.detector import Detector
 from amibayes.units import FloatArray
 
 TO_NEIGHBOURS = 0.05
 """Fraction of a cosmic ray's charge that ends up in each of the four neighbours."""
+
+
+ADC_WAVES = (
+    (1024.0, 124.34e-6, -6.41e-6),
+    (512.0, -2.78e-6, 4.83e-6),
+    (1024.0 / 3.0, -0.64e-6, 4.13e-6),
+)
+"""Periods in counts, and amplitudes of sine and cosine, of the readout of JWST's detectors."""
+
+BIAS_DN = 12000.0
+"""Counts of a pixel after the reset: those of NIRISS, which pixels differ from by hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +80,27 @@ def read_ramps(
             _add_hits(charge, detector, rng)
         reads[first + group] += measured_signal(charge, detector)
         n_good = _count_good(n_good, charge, detector.full_well_e, first + group)
-    return Ramps(linearised(reads, detector), n_good)
+    return Ramps(linearised(converted(reads, detector), detector), n_good)
+
+
+def converted(reads: FloatArray, detector: Detector) -> FloatArray:
+    """Reads as the analogue-to-digital converter gives them, bias taken off, in electrons.
+
+    Counts x become x/(1 + Σ(s sin + c cos)(2πx/p)); what a bias frame shows of it is taken off.
+    """
+    if detector.adc_nonlinearity == 0.0:
+        return reads
+    off = detector.adc_nonlinearity * GAIN_E_DN
+    return np.asarray(reads + off * (_adc_error(reads / GAIN_E_DN + BIAS_DN) - _adc_error(BIAS_DN)))
+
+
+def _adc_error(counts: FloatArray | float) -> FloatArray:
+    """Counts that the converter gives too many, to first order of what is 1e-4."""
+    waves = (
+        s * np.sin(2.0 * np.pi * counts / period) + c * np.cos(2.0 * np.pi * counts / period)
+        for period, s, c in ADC_WAVES
+    )
+    return np.asarray(-counts * sum(waves))
 
 
 def collected(charge: FloatArray, light: FloatArray, detector: Detector) -> FloatArray:

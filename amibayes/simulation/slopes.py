@@ -97,7 +97,7 @@ class SlopeFit:
     detector : Detector
         Its noise.
     maps : DetectorMaps
-        Flat-field errors and bad pixels.
+        Sensitivity, flat-field errors and bad pixels.
     n_groups : int
         Groups of a ramp.
     """
@@ -161,8 +161,8 @@ class SlopeFit:
 
     def _flattened(self, slopes: Slopes) -> Slopes:
         """Divide by the flat field and mark the bad pixels."""
-        images = slopes.images / self._maps.flat
-        variance = slopes.variance / self._maps.flat**2
+        flat = self._maps.flat * self._maps.sensitivity
+        images, variance = slopes.images / flat, slopes.variance / flat**2
         images[:, self._maps.dead] = np.nan
         images[:, self._maps.hot] += self._detector.full_well_e
         slopes.dq[:, self._maps.bad] |= DO_NOT_USE

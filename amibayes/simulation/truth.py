@@ -58,6 +58,7 @@ def _times(observation: Observation) -> dict[str, Any]:
     return {
         "DATE-OBS": day,
         "TIME-OBS": clock,
+        "VSTSTART": f"{day} {clock}",
         "EXPSTART": start,
         "EXPMID": start + 0.5 * duration / 86400.0,
         "EXPEND": start + duration / 86400.0,

@@ -9,9 +9,19 @@ import pytest
 from scipy import stats
 
 from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED
+from amibayes.cube.ramps import GAIN_E_DN
 from amibayes.errors import UsageError
 from amibayes.simulation.detector import PRESETS, Detector, detector_preset, draw_maps
-from amibayes.simulation.ramps import Ramps, linearised, measured_signal, read_ramps, to_neighbours
+from amibayes.simulation.ramps import (
+    ADC_WAVES,
+    BIAS_DN,
+    Ramps,
+    converted,
+    linearised,
+    measured_signal,
+    read_ramps,
+    to_neighbours,
+)
 from amibayes.simulation.slopes import SlopeFit, slope_weights
 
 QUIET = Detector(
@@ -230,3 +240,32 @@ def test_detectors_that_make_no_sense(changes: dict[str, float], message: str) -
         detector_preset("paper", changes)
     with pytest.raises(UsageError, match="choose from paper, realistic"):
         detector_preset("ideal")
+
+
+def test_ramps_have_the_flat_field_and_slopes_do_not(rng: np.random.Generator) -> None:
+    detector = replace(QUIET, flat_field=0.02)
+    maps = draw_maps(detector, (16, 16), rng)
+    assert maps.sensitivity.std() == pytest.approx(0.02, rel=0.2)
+    light = np.full((1, 16, 16), 1e4) * maps.sensitivity
+    ramps = read_ramps(light, detector, 4, rng)
+    np.testing.assert_allclose(ramps.reads[-1], 4.0 * light * FRAME, rtol=1e-12)
+    slopes = SlopeFit(light[0], detector, maps, 4)(ramps)
+    np.testing.assert_allclose(slopes.images, 1e4, rtol=1e-12)
+
+
+def test_the_converter_errs_by_its_waves() -> None:
+    # Counts are known from the definition, x / (1 + Σ(s sin + c cos)), the bias frame likewise.
+    detector = replace(QUIET, adc_nonlinearity=1.0)
+    reads = np.linspace(0.0, 3e4, 901).reshape(1, 1, 1, -1)
+
+    def counts(x: np.ndarray | float) -> np.ndarray:
+        waves = sum(
+            s * np.sin(2 * np.pi * x / p) + c * np.cos(2 * np.pi * x / p) for p, s, c in ADC_WAVES
+        )
+        return np.asarray(x / (1.0 + waves))
+
+    expected = GAIN_E_DN * (counts(reads / GAIN_E_DN + BIAS_DN) - counts(BIAS_DN))
+    found = converted(reads, detector)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert 3.0 < np.abs(found - reads).max() < 12.0
+    assert converted(reads, QUIET) is reads

@@ -1,0 +1,269 @@
+"""The jwst package beside amibayes on simulated visits: the tables of `jwst_pipeline.md`.
+
+    python docs/jwst_pipeline.py --peers FOLDER [--minutes 10] [--only stars binaries routes]
+    python docs/jwst_pipeline.py --data DATA_FOLDER
+
+FOLDER keeps the environment of jwst, which is installed from PyPI the first time. Visits are
+added to ``docs/static/jwst_trials.jsonl``, one line each, until so many minutes have passed; the
+tables are then made from all lines. DATA_FOLDER holds ``jwst/sima-*`` and ``cubes/niriss_f480m_*``:
+what is stated of these, by each route.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pages import put_table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from amibayes import calibrate, read_oifits
+from amibayes.extraction.reading import ImageOptions, of_one_visit, read_observations
+from amibayes.units import offset
+from benchmarks.jwst_pipeline import LIMIT_MAS, ROUTES, Visit, trial
+from benchmarks.statements import searched
+
+FILE = Path(__file__).with_name("static") / "jwst_trials.jsonl"
+PAGE = "jwst_pipeline.md"
+
+SEPARATION_MAS, ANGLE_DEG, CONTRAST = 150.0, 40.0, 0.01
+
+KINDS: dict[str, tuple[int, float, bool]] = {
+    "stars": (10, 7.0, False),
+    "binaries": (10, 7.0, False),
+    "routes": (20, 0.0, True),
+}
+"""Integrations, jitter (mas), and whether fringe models are kept, of a kind of visits."""
+
+LABELS = {
+    "calints": "amibayes, from `calints`",
+    "amimulti-oi": "jwst, `amimulti-oi`, read by amibayes",
+    "ami-oi": "jwst, `ami-oi` and `psf-ami-oi`, read by amibayes",
+    "aminorm-oi": "jwst, `aminorm-oi`, read by amibayes",
+    "as delivered": "jwst, `aminorm-oi` as delivered",
+}
+
+
+def visit(kind: str, seed: int) -> Visit:
+    """A visit of a kind; companions stand anywhere at 100 to 400 mas for the routes' pulls."""
+    n, jitter, _ = KINDS[kind]
+    if kind == "stars":
+        return Visit(None, seed, n, jitter)
+    radius, angle, contrast = SEPARATION_MAS, ANGLE_DEG, CONTRAST
+    if kind == "routes":
+        rng = np.random.default_rng(700 + seed)
+        radius, angle = rng.uniform(100.0, 400.0), rng.uniform(0.0, 360.0)
+        contrast = 10.0 ** rng.uniform(-2.0, -1.0)
+    return Visit(np.array([*offset(radius, angle), contrast]), seed, n, jitter)
+
+
+def trials(kind: str) -> list[dict[str, Any]]:
+    """Visits of a kind that are there."""
+    lines = FILE.read_text().splitlines() if FILE.exists() else []
+    return [t for t in map(json.loads, lines) if t["kind"] == kind]
+
+
+def run(environments: Path, minutes: float, kinds: list[str], most: int) -> None:
+    """Add visits, the kinds in turn, while there is time."""
+    FILE.parent.mkdir(exist_ok=True)
+    start, seed = time.monotonic(), 0
+    while seed < most:
+        for kind in kinds:
+            if time.monotonic() - start > 60.0 * minutes:
+                return
+            if any(t["seed"] == seed for t in trials(kind)):
+                continue
+            with tempfile.TemporaryDirectory() as name:
+                done = trial(visit(kind, seed), Path(name), environments, KINDS[kind][2])
+            line = json.dumps({"kind": kind, "seed": seed, **done}, default=float)
+            with FILE.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+            print(kind, seed, done["seconds"], flush=True)
+        seed += 1
+
+
+def columns(kind: str, way: str) -> dict[str, np.ndarray]:
+    """Numbers of the visits of a kind by a route."""
+    got = [t["ways"][way] for t in trials(kind) if way in t["ways"]]
+    return {key: np.array([g[key] for g in got]) for key in (got[0] if got else ())}
+
+
+def star_table() -> list[str]:
+    """V² and closure phases of single stars against 1 and 0."""
+    rows = [
+        "| route | visits | V²: rms error | stated | bias | closure phase: rms error (deg) "
+        "| stated (deg) | bias (deg) |",
+        f"|{'---|' * 8}",
+    ]
+    for way, label in LABELS.items():
+        got = columns("stars", way)
+        if not got:
+            continue
+        cells = [
+            f"{figure:.2g}"
+            for name, truth in (("vis2", 1.0), ("closure", 0.0))
+            for figure in _errors(got, name, truth)
+        ]
+        rows.append(f"| {label} | {len(got['vis2'])} | {' | '.join(cells)} |")
+    return rows
+
+
+def _errors(got: dict[str, np.ndarray], name: str, truth: float) -> tuple[float, float, float]:
+    """Rms error, stated error, and mean error over all visits and numbers."""
+    unit = "" if name == "vis2" else "_deg"
+    off = got[f"{name}{unit}"] - truth
+    # The bias that is common to all baselines; closure phases have none, but their rms mean has.
+    mean = off.mean() if name == "vis2" else np.sqrt((off.mean(axis=0) ** 2).mean())
+    return rms(off), rms(got[f"{name}_error{unit}"]), float(mean)
+
+
+def limit_table() -> list[str]:
+    """Contrast limits of single stars, and the time."""
+    marks = " | ".join(f"limit at {mas:g} mas (mag)" for mas in LIMIT_MAS)
+    rows = [f"| route | {marks} | CPU seconds for an integration |", f"|{'---|' * 5}"]
+    seconds = [t["seconds"] for t in trials("stars")]
+    n = 2 * KINDS["stars"][0]
+    for way in ROUTES:
+        got = columns("stars", way)
+        if not got:
+            continue
+        name = "amibayes" if way == "calints" else "analyze"
+        each = np.median([s[name] for s in seconds]) / n
+        cells = [f"{mag:.2f}" for mag in np.median(got["limit_mag"], axis=0)]
+        rows.append(f"| {LABELS[way]} | {' | '.join(cells)} | {each:.2g} |")
+    return rows
+
+
+def binary_table() -> list[str]:
+    """What is stated of one companion, visit after visit, against the truth."""
+    rows = [
+        "| route | visits | separation (mas) | position angle (deg) | contrast (%) | "
+        "errors of one visit |",
+        f"|{'---|' * 6}",
+        f"| truth | | {SEPARATION_MAS:g} | {ANGLE_DEG:g} | {100 * CONTRAST:g} | |",
+    ]
+    for way in ROUTES:
+        got = columns("binaries", way)
+        if not got:
+            continue
+        names = (("separation_mas", 1.0), ("position_angle_deg", 1.0), ("contrast_stated", 100.0))
+        cells = [mean_and_error(scale * got[name]) for name, scale in names]
+        stated = [
+            f"{np.median(got[name]) * scale:.2g}"
+            for name, scale in (
+                ("separation_error_mas", 1.0),
+                ("position_angle_error_deg", 1.0),
+                ("contrast_error", 100.0),
+            )
+        ]
+        n = len(got["near"])
+        rows.append(f"| {LABELS[way]} | {n} | {' | '.join(cells)} | {', '.join(stated)} |")
+    return rows
+
+
+def pull_table() -> list[str]:
+    """Pulls of position and contrast over many small visits."""
+    rows = [
+        "| route | found | rms pull: east | north | contrast | mean pull: contrast | "
+        "within 1σ (all three) | within 2σ |",
+        f"|{'---|' * 8}",
+    ]
+    for way in ROUTES:
+        got = columns("routes", way)
+        if not got:
+            continue
+        near = got["near"].astype(bool)
+        pulls = np.stack([got[name][near] for name in ("east", "north", "contrast")])
+        each = " | ".join(f"{rms(p):.2f}" for p in pulls)
+        rows.append(
+            f"| {LABELS[way]} | {near.sum()} of {len(near)} | {each} | {pulls[2].mean():+.2f} | "
+            f"{(abs(pulls) < 1).mean():.2f} | {(abs(pulls) < 2).mean():.2f} |"
+        )
+    return rows
+
+
+def mean_and_error(values: np.ndarray) -> str:
+    """Mean, and what its scatter makes it uncertain by."""
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return f"{values.mean():.4g} ± {error:.2g}"
+
+
+def rms(values: np.ndarray) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def public_table(data: Path) -> list[str]:
+    """What is stated of the F480M cubes made by ami_sim and of their genuine products."""
+    rows = [
+        "| route | separation (mas) | position angle (deg) | contrast (%) |",
+        "|---|---|---|---|",
+    ]
+    jwst, cubes = data / "jwst", data / "cubes"
+    for way in ROUTES:
+        if way == "calints":
+            paths = [cubes / f"niriss_f480m_{name}.fits" for name in ("target", "calibrator")]
+            images = of_one_visit(paths, ImageOptions(header=CUBES))
+            target, other = (read_observations([path], images)[0] for path in paths)
+            found = calibrate([target], [other], method="weighted").observables
+        elif way == "aminorm-oi":
+            found = read_oifits(jwst / "sima_aminorm-oi.fits")
+        else:
+            names = PRODUCTS[way]
+            target, other = (read_oifits(jwst / name) for name in names)
+            found = calibrate([target], [other], method="weighted").observables
+        c = searched(found).noisy.companion
+        rows.append(
+            f"| {LABELS[way]} | {c.separation_mas:.1f} ± {c.separation_error_mas:.1f} | "
+            f"{c.position_angle_deg:.2f} ± {c.position_angle_error_deg:.2f} | "
+            f"{100 * c.contrast:.3f} ± {100 * c.contrast_error:.3f} |"
+        )
+    return rows
+
+
+CUBES = {"instrument": "niriss", "filter": "F480M", "pixel_scale_rad": 65.6e-3 * np.pi / 648000}
+
+PRODUCTS = {
+    "amimulti-oi": ("sima-target_amimulti-oi.fits", "sima-calibrator_amimulti-oi.fits"),
+    "ami-oi": ("sima-target_a3001_ami-oi.fits", "sima-calibrator_a3001_psf-ami-oi.fits"),
+}
+
+TABLES = {
+    "stars": star_table,
+    "limits": limit_table,
+    "binaries": binary_table,
+    "pulls": pull_table,
+}
+
+
+def main() -> int:
+    """Add visits, and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--peers", type=Path, metavar="FOLDER")
+    parser.add_argument("--minutes", type=float, default=0.0, help="time for more visits")
+    parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--most", type=int, default=50, help="visits of a kind")
+    parser.add_argument("--data", type=Path, metavar="DATA_FOLDER")
+    arguments = parser.parse_args()
+    if arguments.peers:
+        run(arguments.peers.resolve(), arguments.minutes, arguments.only, arguments.most)
+    for name, table in TABLES.items():
+        put_table(PAGE, table(), f"{name}: docs/jwst_pipeline.py")
+    if arguments.data:
+        put_table(PAGE, public_table(arguments.data), "public: docs/jwst_pipeline.py")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
