@@ -5,16 +5,24 @@ its own star and background free. What the parts gain in χ² by going their own
 one way, is the test; its probability is the share of data sets drawn from the model and its
 noise whose parts go as far apart. To first order in the changes: the same for the data and for
 the draws.
+
+The target calibrated with one calibrator, and with the others, are no parts of the data: they
+have the target's noise in common, which is in neither side of the comparison. What the two differ
+by is what the calibrators differ by, and draws of these are its test.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from amibayes.calibration.leave_one_out import Comparison, LeftOut, leave_out
+from amibayes.calibration.matching import Keys, keys_of
+from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
@@ -23,6 +31,8 @@ from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
 from amibayes.models.binary import BinaryModel
+from amibayes.parallel import spawn
+from amibayes.support.options import ALPHA
 from amibayes.units import BoolArray, FloatArray
 
 Split = Literal["observables", "files", "epochs", "calibrators"]
@@ -35,6 +45,13 @@ SIMULATIONS = 4000
 
 MAX_PARTS = 12
 """Parts of a split that are compared: each is searched by itself."""
+
+DRAWS_PER_RATE = 2.0
+"""Draws of each comparison in units of their number over α: the verdict shares α between them."""
+
+ENOUGH = 100
+"""Draws as extreme as the data after which no more are made: p is known to 10 % (Besag & Clifford
+1991)."""
 
 SINGULAR = 1e-10
 """Directions that a part measures so much worse than its best one it does not measure."""
@@ -66,6 +83,8 @@ def consistency(
     *,
     stated: Observables | None = None,
     prior: NoisePrior | None = None,
+    calibrators: Sequence[tuple[Observables, Diameter]] = (),
+    alpha: float = ALPHA,
 ) -> tuple[Consistency, ...]:
     """Compare all the parts that the data of a search have.
 
@@ -79,21 +98,31 @@ def consistency(
         own best fit leaves. The noise of a joint fit would hide that they disagree.
     prior : NoisePrior, optional
         Of that noise.
+    calibrators : sequence of (Observables, (diameter, error))
+        That the data were calibrated with, exchangeable with each other.
+    alpha : float
+        Probability that the verdict asks for, of all comparisons together.
     """
+    own_rng = np.random.default_rng(spawn(rng, 1)[0])
     whole, theta = result.likelihood, result.theta
     data = whole.observables
     files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
     found = []
-    kinds, nights = _kinds(data), _epochs(data)
-    if len(kinds) > 1:
-        found.append(compare(whole, theta, "observables", kinds, rng))
-    splits: list[tuple[Split, dict[str, BoolArray]]] = [("files", files), ("epochs", nights)]
+    every: list[tuple[Split, dict[str, BoolArray]]] = [
+        ("observables", _kinds(data)),
+        ("files", files),
+        ("epochs", _epochs(data)),
+    ]
+    splits = [(name, parts) for name, parts in every if 1 < len(parts) <= MAX_PARTS]
+    wanted = int(DRAWS_PER_RATE * (len(splits) + len(calibrators)) / alpha)
+    simulations = max(SIMULATIONS, wanted)
     for name, parts in splits:
-        if not 1 < len(parts) <= MAX_PARTS:
-            continue
-        own = [_own_noise(result, mask, stated, prior) for mask in parts.values()]
-        found.append(compare(whole, theta, name, parts, rng, own=own))
-    return tuple(found)
+        own = None
+        if name != "observables":
+            own = [_own_noise(result, mask, stated, prior) for mask in parts.values()]
+        found.append(compare(whole, theta, name, parts, rng, simulations, own))
+    apart = compare_calibrators(result, calibrators, own_rng, simulations)
+    return (*found, *apart)
 
 
 def _own_noise(
@@ -207,6 +236,98 @@ def compare(
         # known.
         above += int(((by_noise >= gain[0]) if own else (drawn >= ratio[0])).sum())
     return Consistency(split, tuple(parts), float(gain[0]), (1 + above) / (1 + simulations))
+
+
+OTHERS = "the other calibrators"
+
+
+def compare_calibrators(
+    result: SearchResult,
+    calibrators: Sequence[tuple[Observables, Diameter]],
+    rng: np.random.Generator,
+    simulations: int = SIMULATIONS,
+) -> tuple[Consistency, ...]:
+    """Compare the target calibrated with each calibrator, and with the others; the worst first.
+
+    Either way the noise of the target is the same: what the two differ by, to first order, is
+    what the calibrators differ by. The test is the gain in χ² of that difference by a companion of
+    its own, with the calibrators' errors and the scatter between the others; as that scatter is a
+    fitted one, the gain counts relative to the χ² of the others about their mean. Two calibrators
+    are one comparison, relative to the rest of what they differ by. The weights are not those of
+    the fit, whose errors hold how far the calibrators lie apart.
+
+    Parameters
+    ----------
+    result : SearchResult
+        Of the calibrated target.
+    calibrators : sequence of (Observables, (diameter, error))
+        Those that the target was calibrated with, and their uniform discs in mas.
+    rng : numpy.random.Generator
+    simulations : int
+        Draws of the calibrators.
+    """
+    keys, found = keys_of(result.likelihood.observables), []
+    star = result.likelihood.parameters.nuisance
+    names = _names([c.source for c, _ in calibrators])
+    for k, name in enumerate(names[:1] if len(names) == 2 else names):
+        apart = leave_out(k, calibrators, keys)
+        if apart is None:
+            continue
+        templates = _templates(result.likelihood, result.theta, keys, apart)
+        comparison = apart.against(templates, star)
+        gain = _difference(comparison, apart.measured)
+        ratio = gain / _scale(apart, comparison, apart.measured, gain)
+        above = made = 0
+        for n in pieces_of(simulations, apart.n_independent * (1 + apart.n_others)):
+            drawn = apart.draw(n, rng)
+            by_noise = _difference(comparison, drawn)
+            above += int((by_noise >= ratio * _scale(apart, comparison, drawn, by_noise)).sum())
+            made += n
+            if above >= ENOUGH:
+                break
+        parts = name, (names[1] if len(names) == 2 else OTHERS)
+        found.append(Consistency("calibrators", parts, float(gain[0]), (1 + above) / (1 + made)))
+    return tuple(sorted(found, key=lambda one: (one.p, -one.delta_chi2)))
+
+
+def _names(sources: Sequence[str]) -> list[str]:
+    """File names, or numbers where these do not tell them apart."""
+    names = [Path(source).name for source in sources]
+    return [n if names.count(n) == 1 else f"calibrator {k + 1}" for k, n in enumerate(names)]
+
+
+def _templates(likelihood: Likelihood, theta: FloatArray, keys: Keys, apart: LeftOut) -> FloatArray:
+    """Change of the response with the effect of a unit change of each parameter, (p, n_keys).
+
+    V² is divided by the response, closure phases have it taken off. Data of one key are averaged
+    by their variances: the response is the same in all of them.
+    """
+    data = likelihood.observables
+    n, slope = data.n_vis2, -keys.sign.astype(float)
+    response = apart.response[keys.key[:n]]
+    model = likelihood.predict(np.atleast_2d(theta))[:n, 0]
+    slope[:n] = -model / np.where(response > 0.0, response, np.inf)
+    weight = slope / data.covariance.variance
+    whole = np.bincount(keys.key, weight * slope, len(keys))
+    change = [np.bincount(keys.key, weight * j, len(keys)) for j in likelihood.slopes(theta).T]
+    return np.where(apart.keys & (whole > 0.0), change / np.where(whole > 0.0, whole, 1.0), 0.0)
+
+
+def _difference(comparison: Comparison, seen: Sequence[FloatArray]) -> FloatArray:
+    """χ² (n,) of what the parameters differ by."""
+    scale = np.sqrt(np.diag(comparison.covariance))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return _gain(comparison.covariance, comparison.score(seen).T, scale)
+
+
+def _scale(
+    apart: LeftOut, comparison: Comparison, seen: Sequence[FloatArray], gain: FloatArray
+) -> FloatArray:
+    """Mean square (n,) of what scatters about the mean as the noise does."""
+    if apart.n_others > 1:
+        return comparison.scatter(seen) / (apart.n_independent * (apart.n_others - 1))
+    left = max(apart.n_independent - len(comparison.covariance), 1)
+    return np.asarray(np.maximum(comparison.whole(seen) - gain, 1e-300) / left)
 
 
 def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -168,6 +168,13 @@ def within_calibration(test: BankStatistic) -> bool:
 
 
 def _apart(split: Consistency) -> str:
+    if split.split == "calibrators":
+        one, other = split.parts
+        return (
+            f"the companion depends on the calibrator: calibrated with {one} and with {other} the "
+            f"target disagrees on it by Δχ² {split.delta_chi2:.3g}, which {_share(split.p)} of "
+            "consistent calibrators exceed"
+        )
     parts = " and ".join(NAMES.get(part, part) for part in split.parts[:3])
     more = f" and {len(split.parts) - 3} more" if len(split.parts) > 3 else ""
     motion = "; a motion (--motion) may explain it" if split.split == "epochs" else ""

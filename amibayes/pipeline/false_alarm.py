@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.consistency import Consistency, consistency
@@ -133,12 +135,23 @@ def verdict_of(
     options: SearchOptions,
     rng: np.random.Generator,
     executor: Executor | None = None,
+    calibrators: Sequence[tuple[Observables, Diameter]] = (),
 ) -> tuple[Verdict, tuple[Consistency, ...]]:
-    """Give the verdict of a search, and how its parts agree where a companion is detected."""
+    """Give the verdict of a search, and how its parts agree where a companion is detected.
+
+    ``calibrators`` are those that are exchangeable, with their diameters.
+    """
     splits: tuple[Consistency, ...] = ()
     if tested.detected:
         data = stated.only(options.observables) if options.extra_noise else None
-        splits = consistency(result, rng, stated=data, prior=noise_prior(stated, options))
+        splits = consistency(
+            result,
+            rng,
+            stated=data,
+            prior=noise_prior(stated, options),
+            calibrators=calibrators,
+            alpha=options.alpha,
+        )
     test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
     rest = structure(test, options, rng, executor)
     structured = rest.probability > options.alpha or not within_calibration(test)

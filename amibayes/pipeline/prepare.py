@@ -16,6 +16,7 @@ from amibayes.calibration import (
     without_disc,
 )
 from amibayes.calibration.library import read_library
+from amibayes.calibration.transfer import Diameter
 from amibayes.data.joining import different_targets, in_order, refuse_twice, unused
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
@@ -47,6 +48,10 @@ class Prepared:
     warnings : tuple of str
     charge_migration : CubeMigration, optional
         What was done about it in the first image cube.
+    serving : tuple of Observables
+        Calibrators that the targets were calibrated with.
+    diameters_mas : tuple of (diameter, error)
+        Of each of these.
     """
 
     observables: Observables
@@ -55,6 +60,15 @@ class Prepared:
     vetting: Vetting | None = None
     warnings: tuple[str, ...] = ()
     charge_migration: CubeMigration | None = None
+    serving: tuple[Observables, ...] = ()
+    diameters_mas: tuple[Diameter, ...] = ()
+
+    @property
+    def exchangeable(self) -> list[tuple[Observables, Diameter]]:
+        """Calibrators of one population, with their discs: none where they drift with time."""
+        if self.calibration is None or self.calibration.method == "population":
+            return []
+        return list(zip(self.serving, self.diameters_mas, strict=True))
 
 
 def prepare(
@@ -87,10 +101,10 @@ def prepare(
         *unused(parts, options.observables),
         *different_targets(parts),
     )
-    vetting, calibration, observables = _calibrated(parts, references, options, rng, run)
-    warnings = (*vetting_warnings(vetting), *calibration_warnings(calibration), *joined)
+    ready = _calibrated(parts, references, options, rng, run)
+    warnings = (*vetting_warnings(ready.vetting), *calibration_warnings(ready.calibration), *joined)
     charge = next(iter(images.charges.values()), None)
-    return Prepared(observables, tuple(references), calibration, vetting, warnings, charge)
+    return replace(ready, references=tuple(references), warnings=warnings, charge_migration=charge)
 
 
 def read(
@@ -124,10 +138,10 @@ def _calibrated(
     options: SearchOptions,
     rng: np.random.Generator,
     run: Run,
-) -> tuple[Vetting | None, Calibration | None, Observables]:
+) -> Prepared:
     """Vet the calibrators and calibrate all targets together, or take these as calibrated."""
     if not references and options.library is None:
-        return None, None, join(parts)
+        return Prepared(join(parts))
     vetting, serving = None, references
     diameters = diameters_of(options.calibrator_diameters, references)
     sizes = diameters or [(0.0, 0.0)] * len(references)
@@ -153,7 +167,13 @@ def _calibrated(
         calibration = calibrate(
             parts, serving, method=method, clip=options.clip, diameters_mas=sizes, rng=rng
         )
-    return vetting, calibration, calibration.observables
+    return Prepared(
+        calibration.observables,
+        calibration=calibration,
+        vetting=vetting,
+        serving=tuple(serving),
+        diameters_mas=tuple(sizes),
+    )
 
 
 def _kept(references: list[Observables], vetting: Vetting) -> list[Observables]:

@@ -32,7 +32,7 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Announce, Run, silent
-from amibayes.pipeline.warnings import search_warnings
+from amibayes.pipeline.warnings import consistency_warnings, search_warnings
 from amibayes.posterior.bootstrap import Bootstrap, bootstrap
 from amibayes.posterior.ensemble import Posterior, sample
 from amibayes.posterior.evidence import Evidence, compare_models
@@ -164,8 +164,9 @@ def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams,
         return Tests(first, second)
     with run.stage("verdict"):
         statement, splits = verdict_of(
-            found.result, first, ready.observables, options, rng["verdict"], run.executor
-        )
+            found.result, first, ready.observables, options, rng["verdict"], run.executor,
+            ready.exchangeable,
+        )  # fmt: skip
     return Tests(first, second, statement, splits)
 
 
@@ -294,7 +295,8 @@ def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference)
     warnings = search_warnings(
         ready.observables, found.result, found.noise, tests.first, posterior.samples
     )
-    return (*ready.warnings, *found.warnings, *warnings)
+    splits = consistency_warnings(tests.splits)
+    return (*ready.warnings, *found.warnings, *splits, *warnings)
 
 
 def _prior(result: SearchResult, options: SearchOptions) -> Prior:

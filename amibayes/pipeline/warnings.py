@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.stats import chi2
 
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
+from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -26,6 +29,9 @@ ENOUGH, DOMINANT = 3.0, 0.5
 BRIGHT = 0.03
 """Contrast above which the square of a companion's light counts."""
 
+UNLIKELY = 0.01
+"""Probability below which a difference between calibrators is mentioned."""
+
 FAR_TOO_SMALL = 1e-6
 """Probability of a χ² as small, below which the errors are far too large."""
 
@@ -40,6 +46,19 @@ def calibration_warnings(calibration: Calibration | None) -> list[str]:
         "stars, but not what else differs between them (pointing on the flat field, drift, air); "
         "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators "
         "their nominal share"
+    ]
+
+
+def consistency_warnings(splits: Sequence[Consistency]) -> list[str]:
+    """Name the calibrator that changes the companion most, where few good ones change it so."""
+    tested = [s for s in splits if s.split == "calibrators"]
+    worst = min(tested, key=lambda s: s.p, default=None)
+    if worst is None or worst.p * len(tested) >= UNLIKELY:
+        return []
+    one, other = worst.parts
+    return [
+        f"the companion depends on the calibrator: {one} and {other} disagree on it (p = "
+        f"{worst.p:.2g}); search without {one} as well"
     ]
 
 

@@ -166,6 +166,7 @@ def _data(content: Json) -> Section:
     else:
         text.append(_calibration(calibration))
         tables.append(_calibrators(calibration))
+    tables += _consistency(content["consistency"])
     return Section(
         "Data and calibration",
         tuple(text),
@@ -220,6 +221,22 @@ def _calibrators(calibration: Json) -> Table:
         "differ from them at least as much"
     )
     return Table(caption, columns, rows)
+
+
+def _consistency(splits: list[Json]) -> list[Table]:
+    """Parts of the data, and calibrators, by how far they disagree on the companion."""
+    if not splits:
+        return []
+    columns = Column("Compared", "text"), Column("Parts", "text"), Column("Δχ²"), Column("p")
+    rows = tuple(
+        (s["split"], ", ".join(s["parts"]), fixed(s["delta_chi2"], 1), plain(s["p"], 2))
+        for s in splits
+    )
+    caption = (
+        "Whether parts of the data, and the target calibrated with each calibrator and with the "
+        "others, agree on the companion; p is the share of consistent data that go as far apart"
+    )
+    return [Table(caption, columns, rows)]
 
 
 SECTIONS: dict[str, Callable[[Json], Section | None]] = {
