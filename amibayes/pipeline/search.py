@@ -295,7 +295,8 @@ def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference)
     warnings = search_warnings(
         ready.observables, found.result, found.noise, tests.first, posterior.samples
     )
-    splits = consistency_warnings(tests.splits)
+    told = tests.verdict is not None and tests.verdict.statement == "inconsistent data"
+    splits = [] if told else consistency_warnings(tests.splits)
     return (*ready.warnings, *found.warnings, *splits, *warnings)
 
 
