@@ -101,7 +101,7 @@ class LeftOut:
         tau = np.sqrt(self.weight @ self.tau**2)
         combine, inverse, fisher = [], [], np.zeros((len(templates), len(templates)))
         for group in self.population.groups:
-            inverse.append(np.linalg.inv(_spread(group, tau)))
+            inverse.append(np.asarray(np.linalg.inv(_spread(group, tau)), dtype=float))
             # Covariance of the first less the mean of the others.
             apart = np.linalg.inv(inverse[-1][:, 0]) + np.linalg.inv(inverse[-1][:, 1:].sum(axis=1))
             onto = _on_group(templates[:, None], group)[:, :, 0].swapaxes(0, 1)
