@@ -1,51 +1,200 @@
-"""Put the result of ``amibayes validate`` into docs/validation.md.
+"""Coverage and error rates of what a search writes, under many conditions: docs/validation.md.
 
-Usage: python docs/validation.py FOLDER
+    python docs/validation.py FOLDER --minutes 30     as many stars as that takes of one core
+    python docs/validation.py FOLDER --full           2000 stars alone and 1000 not
+    python docs/validation.py FOLDER --table          the page, from the answers that are there
+
+Answers are kept in ``FOLDER``, one file for each condition, and every run goes on from them. The
+conditions take turns so that each has the same time.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import shutil
 import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from pages import put_table
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from pages import put_table  # noqa: E402
+from poppy_stars import PoppyExposure  # noqa: E402
+from trials import Answer, answers, known_answers  # noqa: E402
+
+from amibayes.plots.style import save  # noqa: E402
+from amibayes.report.validation import validation_pictures  # noqa: E402
+from amibayes.validation import QUICK, SimulatedExposure, Validation  # noqa: E402
+from amibayes.validation.plan import RANGES, Condition, ValidationPlan  # noqa: E402
+from amibayes.validation.tables import SimulatedTable  # noqa: E402
+from amibayes.validation.tally import Check, tally  # noqa: E402
+from amibayes.validation.trial import run_trial  # noqa: E402
 
 DOCS = Path(__file__).parent
 PICTURES = ("ranks", "coverage", "false_alarms", "completeness")
+CYCLE = ("alone", "bright", "alone", "alone", "middling", "alone", "alone", "faint", "alone")
+FULL = 334 * len(CYCLE)
+
+VLTI = SimulatedTable("vlti", 0.02, 0.5, field_mas=(1.5, 12.0))
+CONDITIONS: dict[str, Condition] = {
+    "NIRISS": SimulatedTable(),
+    "V² noisier: 0.05, closure phases 0.1°": SimulatedTable(vis2_error=0.05, closure_error_deg=0.1),
+    "5 % of outliers": SimulatedTable(outliers=0.05),
+    "two epochs": SimulatedTable(epochs=2),
+    "VLTI": VLTI,
+    "VLTI, channels correlated": replace(VLTI, common=0.6),
+    "VLTI, companion of 1.5 mas": replace(VLTI, companion_mas=1.5),
+    "images, three calibrators": SimulatedExposure("F430M", 7, 30, 3),
+    "images, one calibrator": SimulatedExposure("F430M", 7, 30, 1),
+    "images, charge migration": SimulatedExposure("F480M", 19, 30, 2, 6.75, 3.6e-7),
+    "images by poppy": PoppyExposure(),
+}
 
 
-def number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
+def plan_of(condition: Condition, per_range: int = 1, n_alone: int = 1) -> ValidationPlan:
+    return replace(QUICK, name="docs", settings=(condition,), per_range=per_range, n_alone=n_alone)
 
 
-def lines_of(content: dict) -> list[str]:
-    outcome = "all checks hold" if content["passed"] else "some checks fail"
-    rows = [
-        f"| {c['name']} | {c['n']} | {number(c['measured'])} | {number(c['expected'])} "
-        f"| {number(c['error'])} | {c['p_value']:.2g} | {'holds' if c['passed'] else '**fails**'} |"
-        for c in content["checks"]
-    ]
+def trial(number: int, condition: Condition, k: int) -> Answer:
+    """One star of a condition, with the time it took of a core."""
+    kind, begin = CYCLE[k % len(CYCLE)], time.process_time()
+    seed = np.random.SeedSequence([20, number, k])
+    answer = run_trial(plan_of(condition), (0, kind, seed))
+    answer |= {"kind": kind, "seconds": round(time.process_time() - begin, 2)}
+    return dict(json.loads(json.dumps(answer, default=lambda x: x.tolist())))
+
+
+def run(folder: Path, stars: int, minutes: float) -> None:
+    """Compute stars, always of the condition that has had the least time."""
+    spent = {}
+    done = {}
+    for name in CONDITIONS:
+        known = known_answers(file_of(folder, name))
+        spent[name], done[name] = sum(a["seconds"] for a in known), len(known)
+    begin = time.process_time()
+    while time.process_time() - begin < 60.0 * minutes:
+        open_ones = [name for name in CONDITIONS if done[name] < stars]
+        if not open_ones:
+            return
+        name = min(open_ones, key=lambda n: spent[n])
+        number = list(CONDITIONS).index(name)
+        done[name] += 1
+        found = answers(file_of(folder, name), done[name], partial(trial, number, CONDITIONS[name]))
+        spent[name] += found[-1]["seconds"]
+
+
+def file_of(folder: Path, name: str) -> Path:
+    return folder / f"{list(CONDITIONS).index(name):02d}.jsonl"
+
+
+def counted(name: str, found: list[Answer]) -> Validation:
+    """The checks of the answers of one condition, or of all."""
+    count = Counter(a["kind"] for a in found)
+    plan = plan_of(
+        CONDITIONS.get(name, SimulatedTable()), min(count[k] for k in RANGES), count["alone"]
+    )
+    by_kind = {kind: iter([a for a in found if a["kind"] == kind]) for kind in count}
+    return tally(plan, 20, [next(by_kind[kind]) for kind in plan.kinds])
+
+
+def share(check: Check) -> str:
+    return "–" if not np.isfinite(check.measured) else f"{check.measured:.2f}"
+
+
+def row_of(name: str, found: list[Answer]) -> str:
+    """A line of the table: what was measured, and which checks fail."""
+    validation = counted(name, found)
+    by_name = {c.name: c for c in validation.checks}
+    alone = validation.of_kind("alone")
+    below = "/".join(
+        str(int((validation.false_alarm_probability[alone] < p).sum())) for p in (0.01, 0.05, 0.2)
+    )
+    covered = (
+        f"{share(by_name[f'68% interval of {q}'])}, {share(by_name[f'95% interval of {q}'])}"
+        for q in ("separation_mas", "position_angle_deg", "delta_mag")
+    )
+    complete = by_name["companions found within the range of the limits"]
+    told = validation.statement
+    failing = [c.name for c in validation.checks if not c.passed]
+    known = validation.of_kind(*RANGES)
+    return " | ".join(
+        [
+            f"| {name}",
+            f"{len(alone)}: {below}",
+            str(len(known)),
+            *covered,
+            f"{share(complete)} ({complete.expected:.2f})",
+            f"{int((told >= 2).sum())} of {len(told)}",
+            f"{int((told[alone] == 0).sum())}",
+            f"{int((validation.second[validation.of_kind('bright')] < 0.05).sum())}",
+            f"{'none' if not failing else '**' + '; '.join(failing) + '**'} |",
+        ]
+    )
+
+
+HEAD = (
+    "condition",
+    "stars alone: below 0.01/0.05/0.2",
+    "with companion",
+    "separation 68, 95 %",
+    "position angle",
+    "magnitude difference",
+    "found (stated)",
+    "model refused or data inconsistent",
+    "stars alone called a companion",
+    "second companion below 0.05",
+    "checks that fail",
+)
+
+
+def lines_of(everything: dict[str, list[Answer]]) -> list[str]:
+    """The table, with the checks of all conditions together below it."""
+    rows = [row_of(name, found) for name, found in everything.items()]
+    whole = counted("", [a for found in everything.values() for a in found])
+    for name, drawing in validation_pictures(whole).items():
+        save(drawing, DOCS / "static" / f"validation_{name}.png")
     return [
-        f"Result of the {content['plan']} plan, seed {content['seed']}, {content['n_trials']} "
-        f"stars: {outcome}.",
+        f"| {' | '.join(HEAD)} |",
+        "|---" * len(HEAD) + "|",
+        *rows,
+        "",
+        "All conditions together:",
         "",
         "| check | stars | measured | expected | error | p | |",
         "|---|---|---|---|---|---|---|",
-        *rows,
+        *(check_row(c) for c in whole.checks),
         "",
         *(f"![{name.replace('_', ' ')}](static/validation_{name}.png)" for name in PICTURES),
     ]
 
 
-def main(folder: str) -> int:
-    content = json.loads((Path(folder) / "validation.json").read_text(encoding="utf-8"))
-    for name in PICTURES:
-        shutil.copy(Path(folder) / f"{name}.png", DOCS / "static" / f"validation_{name}.png")
-    put_table("validation.md", lines_of(content))
-    return 0
+def check_row(c: Check) -> str:
+    numbers = " | ".join(
+        "–" if not np.isfinite(x) else f"{x:.3f}" for x in (c.measured, c.expected, c.error)
+    )
+    outcome = "holds" if c.passed else "**fails**"
+    return f"| {c.name} | {c.n} | {numbers} | {c.p_value:.2g} | {outcome} |"
+
+
+def main(arguments: Any) -> None:
+    folder = arguments.folder
+    if not arguments.table:
+        run(folder, FULL, np.inf if arguments.full else arguments.minutes)
+    found = {name: known_answers(file_of(folder, name)) for name in CONDITIONS}
+    put_table("validation.md", lines_of({name: a for name, a in found.items() if a}))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--table", action="store_true")
+    main(parser.parse_args())

@@ -1,8 +1,9 @@
 """How often each verdict is given of simulated objects: a table of `public_verdicts.md`.
 
-    python docs/verdict_confusion.py 25
+    python docs/verdict_confusion.py 80 FOLDER
 
-takes 25 data sets of each kind. The objects are those of `tests/detection/test_verdict.py`, whose
+takes 80 data sets of each kind; the answers are kept in ``FOLDER``, and the next run, of as many or
+more, goes on from them. The objects are those of `tests/detection/test_verdict.py`, whose
 visibilities come from formulas of their own; NIRISS coverage, α = 0.01, 2000 null searches.
 """
 
@@ -11,7 +12,8 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,8 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "detection")]
 
 from helpers import niriss  # noqa: E402
 from pages import put_table  # noqa: E402
-from test_verdict import KINDS, Visibility, observed, points, star, told  # noqa: E402
+from test_verdict import KINDS, Visibility, observed, points, searched, star  # noqa: E402
+from trials import Answer, answers  # noqa: E402
 
 from amibayes.data.observables import Observables, join  # noqa: E402
 
@@ -105,18 +108,28 @@ OBJECTS: dict[str, Make] = {
 }
 
 
-def main(n: int) -> None:
+def answer(number: int, make: Make, k: int) -> Answer:
+    """Search one data set, and keep what the verdict was made of."""
+    rng = np.random.default_rng([77, number, k])
+    result, verdict, _ = searched(make(rng), rng)
+    return asdict(verdict) | {
+        "separation_mas": result.companion.separation_mas,
+        "contrast": result.companion.contrast,
+        "diameter_mas": result.nuisance("diameter_mas"),
+        "delta_chi2": result.delta_chi2,
+    }
+
+
+def main(n: int, folder: Path) -> None:
     """Write the table."""
     rows = [f"| object | {' | '.join(STATEMENTS)} |", "|---" * (len(STATEMENTS) + 1) + "|"]
     for number, (name, make) in enumerate(OBJECTS.items()):
-        count: Counter[str] = Counter()
-        for k in range(n):
-            rng = np.random.default_rng([77, number, k])
-            count[told(make(rng), rng)[0].statement] += 1
+        found = answers(folder / f"{number:02d}.jsonl", n, partial(answer, number, make))
+        count = Counter(a["statement"] for a in found)
         rows.append(f"| {name} | {' | '.join(str(count[s] or '') for s in STATEMENTS)} |")
         print(rows[-1], flush=True)
     put_table(PAGE, rows, MARK)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), Path(sys.argv[2]))

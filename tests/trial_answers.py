@@ -32,4 +32,5 @@ def answers(plan: ValidationPlan, seed: int = 1, **spoilt: float):
             "found": rng.random() < chance * spoilt.get("found", 1.0),
             "expected": chance,
             "statement": STATEMENTS.index("companion"),
+            "second": rng.random() ** spoilt.get("second", 1.0),
         }

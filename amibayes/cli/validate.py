@@ -19,9 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EXAMPLES
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
-        "--quick", action="store_true", help="36 stars, under two minutes of one core (the default)"
+        "--quick", action="store_true", help="36 stars, five minutes of one core (the default)"
     )
-    size.add_argument("--full", action="store_true", help="480 stars, half an hour")
+    size.add_argument("--full", action="store_true", help="3002 stars, a day of one core")
     common.add_seed_option(parser)
     common.add_parallel_options(parser)
     parser.add_argument(

@@ -98,8 +98,12 @@ def _beside(
     gain, grid, parameters = survey.gain.copy(), result.grid, result.likelihood.parameters
     place = first[parameters.place()]
     # What stands at the first companion's own place is its error, not another one.
-    gain[np.hypot(grid.east_mas - place[0], grid.north_mas - place[1]) < 0.25 * fringe] = 0.0
+    apart = np.hypot(grid.east_mas - place[0], grid.north_mas - place[1])
+    gain[apart < 0.25 * fringe] = 0.0
     at = peaks(grid, gain, fringe)[:SEEDS]
+    if not len(at):
+        # Light of a second companion is of no use anywhere: the fit begins, and ends, with none.
+        at = np.array([np.argmax(apart)])
     box = Box(grid.inner_mas, grid.outer_mas, fringe)
     places = np.column_stack([grid.east_mas[at], grid.north_mas[at]])
     points = starting_points(

@@ -11,6 +11,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
 from amibayes.data.systematics import calibration_errors
+from amibayes.detection.caution import caution_of
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.statistic import BankStatistic
@@ -45,11 +46,14 @@ class Verdict:
         Probability of data that fit as badly, were the best model of the family and its noise
         the true one: the smaller one of χ² and of structure in the residuals, times two;
         structure within the errors of the calibration does not count.
+    caution : str
+        Of a companion: what else may look like it, see `caution_of`; also part of the reason.
     """
 
     statement: Statement
     because: str
     p_model: float
+    caution: str = ""
 
 
 def verdict(
@@ -99,7 +103,9 @@ def verdict(
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
-        return Verdict("companion", _found(tested) + left, p_model)
+        caution = caution_of(result)
+        left += f"; but {caution}" if caution else ""
+        return Verdict("companion", _found(tested) + left, p_model, caution)
     return Verdict("no companion", _nothing(tested) + left, p_model)
 
 

@@ -41,7 +41,13 @@ def statement_of(content: Json) -> Statement:
     detected = content["significance"]["detected"]
     kind = {True: "found", False: "none", None: "open"}[detected]
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
-    sentences = [_chance(content), _others(content), _limits(content), _upper_limit(content)]
+    sentences = [
+        _caution(content),
+        _chance(content),
+        _others(content),
+        _limits(content),
+        _upper_limit(content),
+    ]
     return Statement(kind, LABELS[detected], headline, tuple(s for s in sentences if s))  # type: ignore[arg-type]
 
 
@@ -53,6 +59,12 @@ def _refused(content: Json) -> Statement | None:
     label, advice = REFUSED[verdict["statement"]]
     because = f"{verdict['because'][0].upper()}{verdict['because'][1:]}."
     return Statement("open", label, because, (advice, _chance(content)))
+
+
+def _caution(content: Json) -> str:
+    """What else may look like the companion that is stated."""
+    caution = (content.get("verdict") or {}).get("caution", "")
+    return f"{caution[0].upper()}{caution[1:]}." if caution else ""
 
 
 def place(content: Json) -> str:

@@ -17,7 +17,7 @@ from amibayes.plots.validation import (
 from amibayes.report.common import number
 from amibayes.report.page import Column, Fact, Figure, Page, Section, Statement, Table
 from amibayes.validation import Check, Validation
-from amibayes.validation.plan import FIELD_MAS, RANGES
+from amibayes.validation.plan import RANGES
 from amibayes.validation.tally import SURPRISING
 from amibayes.validation.trial import RANKED
 
@@ -40,6 +40,8 @@ EXPLAINED = {
     "come up with probability p.",
     "completeness": "Companions must be found as often as the detection limits of the same data "
     "state.",
+    "second companion": "Beside the one companion of a star a second one must not be found more "
+    "often than its false-alarm probability says.",
     "verdicts": "The model is right in every trial: it may be refused, and a single star called a "
     "companion, no more often than stated.",
 }
@@ -68,7 +70,6 @@ PICTURES = {
 QUANTITIES = {
     "east_mas": "east",
     "north_mas": "north",
-    "ln_contrast": "contrast",
     "separation_mas": "separation",
     "position_angle_deg": "position angle",
     "delta_mag": "magnitude difference",
@@ -84,16 +85,7 @@ def validation_json(validation: Validation) -> dict[str, Any]:
         "plan": plan.name,
         "passed": validation.passed,
         "n_trials": len(validation.kind),
-        "settings": [
-            {
-                "filter": s.filter,
-                "n_groups": s.n_groups,
-                "n_integrations": s.n_integrations,
-                "n_calibrators": s.n_calibrators,
-            }
-            for s in plan.settings
-        ],
-        "field_mas": list(FIELD_MAS),
+        "settings": [dict(vars(setting)) for setting in plan.settings],
         "contrasts": {kind: list(limits) for kind, limits in RANGES.items()},
         "null_draws": plan.null_draws,
         "alpha": plan.alpha,
@@ -127,6 +119,7 @@ def _trials_json(validation: Validation) -> dict[str, Any]:
         "found",
         "expected",
         "statement",
+        "second",
     )
     return {"kind": list(validation.kind)} | {
         name: listed(getattr(validation, name)) for name in columns
@@ -144,7 +137,7 @@ def validation_pictures(validation: Validation) -> dict[str, Drawing]:
     alone = validation.false_alarm_probability[validation.of_kind("alone")]
     companions = validation.of_kind(*RANGES)
     return {
-        "ranks": rank_plot(ranks, ("East", "North", "ln contrast")[: len(RANKED)]),
+        "ranks": rank_plot(ranks, ("East", "North", "contrast")[: len(RANKED)]),
         "false_alarms": alarm_plot(alone),
         "coverage": coverage_plot(coverage),
         "completeness": completeness_plot(
@@ -246,21 +239,17 @@ def plainly(name: str) -> str:
 
 def _what_was_done(validation: Validation, folder: str) -> Section:
     plan = validation.plan
-    exposures = "; ".join(
-        f"{s.filter}, {s.n_integrations} integrations of {s.n_groups} groups, "
-        f"{s.n_calibrators} calibrator{'s' if s.n_calibrators > 1 else ''}"
-        for s in plan.settings
-    )
+    exposures = "; ".join(str(setting) for setting in plan.settings)
     ranges = "; ".join(f"{kind} {low:g} to {high:g}" for kind, (low, high) in RANGES.items())
     return Section(
         "What was done",
         (
             "Every star is simulated as NIRISS images of a G2V star of magnitude 6 with photon, "
-            "read and flat noise, jitter and dithers, together with its calibrators; visibilities "
-            "and closure phases with their covariance are extracted from the images and "
-            "calibrated, and the field is searched and tested by null draws as `amibayes "
-            "search` does. The posterior is integrated directly; the limits are injections.",
-            f"Exposures, in turn: {exposures}. Field: {FIELD_MAS[0]:g} to {FIELD_MAS[1]:g} mas. "
+            "read and flat noise, jitter and dithers, together with its calibrators, and the files "
+            "are given to the function that `amibayes search` runs: the verdict, intervals, limits "
+            "and probabilities are those it writes. The prior of the contrast is the range that "
+            "truths were drawn from.",
+            f"Exposures, in turn: {exposures}. "
             f"Contrasts, log-uniform: {ranges}. {plan.null_draws} null draws; detection at "
             f"{plan.alpha:g}.",
         ),

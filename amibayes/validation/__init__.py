@@ -1,7 +1,9 @@
 """Coverage and error rates of the whole analysis, on exposures whose truth is known."""
 
-from amibayes.validation.plan import FULL, QUICK, SimulatedExposure, ValidationPlan
+from amibayes.validation.images import SimulatedExposure
+from amibayes.validation.plan import FULL, QUICK, ValidationPlan
 from amibayes.validation.run import validate
+from amibayes.validation.tables import SimulatedTable
 from amibayes.validation.tally import Check, Validation
 
 __all__ = [
@@ -9,6 +11,7 @@ __all__ = [
     "QUICK",
     "Check",
     "SimulatedExposure",
+    "SimulatedTable",
     "Validation",
     "ValidationPlan",
     "validate",

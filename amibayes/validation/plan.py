@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
 
-FIELD_MAS = (50.0, 400.0)
-"""Separations of the truths, and the field that is searched."""
+import numpy as np
+
+from amibayes.units import FloatArray
+from amibayes.validation.images import SimulatedExposure
 
 RANGES: dict[str, tuple[float, float]] = {
     "faint": (1e-5, 1e-3),
@@ -14,17 +19,21 @@ RANGES: dict[str, tuple[float, float]] = {
 }
 """Contrasts of the truths: lost in the noise, at the limit, and plain."""
 
-MAGNITUDE = 6.0
 
+class Condition(Protocol):
+    """How stars are observed: it writes the files that a search is given."""
 
-@dataclass(frozen=True)
-class SimulatedExposure:
-    """An exposure of a star of magnitude 6, and how many calibrators it comes with."""
+    @property
+    def field_mas(self) -> tuple[float, float]:
+        """Separations of the truths, and the field that is searched."""
 
-    filter: str
-    n_groups: int
-    n_integrations: int
-    n_calibrators: int
+    def write(
+        self, truth: FloatArray | None, seed: np.random.SeedSequence, folder: Path
+    ) -> tuple[list[Path], list[Path]]:
+        """Write files of a star with a companion, or of one alone, and those of calibrators.
+
+        ``truth`` is east and north (mas) and contrast.
+        """
 
 
 @dataclass(frozen=True)
@@ -34,7 +43,7 @@ class ValidationPlan:
     Parameters
     ----------
     name : str
-    settings : tuple of SimulatedExposure
+    settings : tuple of Condition
         Taken in turn.
     per_range : int
         Companions drawn from the prior in each of `RANGES`.
@@ -44,14 +53,17 @@ class ValidationPlan:
         Null searches of every data set.
     alpha : float
         False-alarm probability that counts as a detection.
+    options : mapping
+        Further options of the search (`amibayes.SearchOptions`) of every star.
     """
 
     name: str
-    settings: tuple[SimulatedExposure, ...]
+    settings: tuple[Condition, ...]
     per_range: int
     n_alone: int
     null_draws: int
     alpha: float = 0.01
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def kinds(self) -> list[str]:
@@ -71,7 +83,8 @@ FULL = ValidationPlan(
         SimulatedExposure("F430M", 14, 40, 4),
         SimulatedExposure("F480M", 19, 120, 3),
     ),
-    60,
-    300,
+    334,
+    2000,
     2000,
 )
+"""Enough stars that a share of 0.01 of those alone is known to 0.002."""

@@ -38,7 +38,8 @@ class Check:
     Parameters
     ----------
     group : str
-        ``ranks``, ``coverage``, ``false alarms``, ``completeness`` or ``verdicts``.
+        ``ranks``, ``coverage``, ``false alarms``, ``completeness``, ``verdicts`` or
+        ``second companion``.
     name : str
     n : int
         Trials it rests on.
@@ -80,6 +81,8 @@ class Validation:
         Whether it was found, and the probability that the limits state for it.
     statement : (n,) float array
         Number of the verdict's statement in `amibayes.detection.verdict.STATEMENTS`.
+    second : (n,) float array
+        False-alarm probability of a second companion, of which there is none.
     checks : tuple of Check
     """
 
@@ -93,6 +96,7 @@ class Validation:
     found: FloatArray
     expected: FloatArray
     statement: FloatArray
+    second: FloatArray
     checks: tuple[Check, ...]
 
     @property
@@ -123,6 +127,7 @@ def tally(plan: ValidationPlan, seed: int, answers: Sequence[Mapping[str, Any]])
         "found": np.nan,
         "expected": np.nan,
         "statement": np.nan,
+        "second": np.nan,
     }
     columns = {
         name: np.array([a.get(name, value) for a in answers], dtype=float)
@@ -135,6 +140,7 @@ def tally(plan: ValidationPlan, seed: int, answers: Sequence[Mapping[str, Any]])
         *_alarm_checks(alarm[np.array(kinds) == "alone"], plan.null_draws),
         *_completeness_checks(columns["found"], columns["expected"]),
         *_verdict_checks(kinds, columns["statement"], plan.alpha),
+        *_second_checks(columns["second"][np.array(kinds) == "bright"]),
     )
     return Validation(plan, seed, kinds, alarm, **columns, checks=checks)
 
@@ -179,6 +185,13 @@ def _verdict_checks(kinds: Sequence[str], statement: FloatArray, alpha: float) -
     yield at_most("verdicts", "right models refused", refused, 2.0 * alpha)
     companions = told[alone] == STATEMENTS.index("companion")
     yield at_most("verdicts", "single stars called a companion", companions, alpha)
+
+
+def _second_checks(probability: FloatArray) -> Iterable[Check]:
+    """Beside a companion that was found there is no other."""
+    for alpha in FALSE_ALARMS[:2]:
+        name = f"second companions below {alpha:g}"
+        yield at_most("second companion", name, probability < alpha, alpha)
 
 
 def at_most(group: str, name: str, hits: BoolArray, largest: float) -> Check:

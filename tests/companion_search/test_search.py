@@ -9,6 +9,7 @@ from scipy import stats
 
 from amibayes.companion_search.field import default_separation, resolves_stars
 from amibayes.companion_search.search import search
+from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.seeds import peaks
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
@@ -25,6 +26,14 @@ def test_noiseless_binaries_come_back(contrast: float, channels: int) -> None:
     np.testing.assert_allclose(result.theta, theta, rtol=1e-3)
     assert result.chi2_binary < 1e-3
     assert result.modes[0].theta == tuple(result.theta)
+
+
+def test_a_second_companion_may_be_looked_for_where_none_is_of_use() -> None:
+    """Light nowhere improves the fit of data without noise: the second one has none."""
+    result = search(Likelihood(niriss()), (60.0, 300.0))
+    two = search_second(result)
+    assert [c.contrast for c in two.companions] == [0.0, 0.0]
+    assert two.chi2 == pytest.approx(result.chi2_single, abs=1e-9)
 
 
 def test_diameter_and_background_are_fitted_along(rng) -> None:

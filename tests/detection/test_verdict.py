@@ -8,16 +8,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import niriss
+from helpers import niriss, simulated
 from interferometer import visibilities
 from scipy.special import j0, j1
 from scipy.stats import chi2
 
+from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables, join
+from amibayes.detection.caution import caution_of
 from amibayes.detection.consistency import Consistency
+from amibayes.detection.false_alarm import Significance
 from amibayes.detection.statistic import statistic_of
-from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, within_calibration
+from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, verdict, within_calibration
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
@@ -80,11 +83,18 @@ def observed(sheet: Observables, source: Visibility, rng: np.random.Generator) -
     )
 
 
-def told(data: Observables, rng: np.random.Generator) -> tuple[Verdict, tuple[Consistency, ...]]:
-    """The verdict as the main job gives it."""
+def searched(
+    data: Observables, rng: np.random.Generator
+) -> tuple[SearchResult, Verdict, tuple[Consistency, ...]]:
+    """The fit and the verdict as the main job gives them."""
     result = search_field(data, OPTIONS).result
     tested = false_alarm(result, OPTIONS, rng)
-    return verdict_of(result, tested, data, OPTIONS, rng)
+    return result, *verdict_of(result, tested, data, OPTIONS, rng)
+
+
+def told(data: Observables, rng: np.random.Generator) -> tuple[Verdict, tuple[Consistency, ...]]:
+    """The verdict alone."""
+    return searched(data, rng)[1:]
 
 
 def anywhere(rng: np.random.Generator, near: float = 80.0, far: float = 280.0) -> list[float]:
@@ -118,6 +128,31 @@ def test_one_of_each_kind_is_told_for_what_it_is(kind: str) -> None:
     assert found.statement in EXPECTED[kind], found
     assert 0.0 <= found.p_model <= 1.0
     assert found.because
+
+
+@pytest.mark.parametrize(
+    ("place", "diameter", "caution"),
+    [
+        ((120.0, 90.0), 55.0, ""),
+        ((60.0, 45.0), 0.0, "nearer than λ/2B, 94.1 mas"),
+        ((120.0, 90.0), 80.0, "larger than any star"),
+        ((60.0, 45.0), 200.0, "inside the star's disc of 200 mas"),
+    ],
+)
+def test_what_else_may_look_like_the_companion_is_stated(
+    place: tuple[float, float], diameter: float, caution: str
+) -> None:
+    model = BinaryModel(diameter_mas="free")
+    data = simulated(niriss(), [*place, 0.1, diameter], None, model)
+    result = search(Likelihood(data, model), (60.0, 300.0))
+    warned = caution_of(result)
+    assert caution in warned
+    assert bool(warned) == bool(caution)
+    certain = Significance(100.0, np.arange(1000.0) / 100.0, 1e-3, (0.0, 4e-3), None, 0.01)
+    stated = verdict(result, certain, replace(certain, probability=1.0), ())
+    assert stated.statement == "companion"
+    assert stated.caution == warned
+    assert stated.because.endswith(warned)
 
 
 def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:

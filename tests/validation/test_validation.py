@@ -22,13 +22,13 @@ from amibayes.report.validation import (
     validation_table,
 )
 from amibayes.validation import QUICK, validate
-from amibayes.validation.plan import FIELD_MAS, RANGES, ValidationPlan
+from amibayes.validation.plan import RANGES, ValidationPlan
 from amibayes.validation.tally import rate, tally, unequal, uniformity
 from amibayes.validation.trial import run_trial
 
 
 def test_a_sound_programme_passes() -> None:
-    """23 checks at 1e-3 on fixed seeds; 1 of 50 runs may fail one by chance, here none does."""
+    """25 checks at 1e-3 on fixed seeds; 1 of 50 runs may fail one by chance, here none does."""
     validation = tally(PLAN, 1, list(answers(PLAN)))
     assert validation.passed, [c for c in validation.checks if not c.passed]
     assert {c.n for c in validation.checks if c.group == "ranks"} == {100}
@@ -43,6 +43,7 @@ def test_a_sound_programme_passes() -> None:
         ("coverage", 0.8, "coverage"),
         ("found", 0.75, "completeness"),
         ("verdict", 0.06, "verdicts"),
+        ("second", 3.0, "second companion"),
     ],
 )
 def test_a_fault_is_found_where_it_is(fault: str, size: float, group: str) -> None:
@@ -102,7 +103,8 @@ def test_one_star_goes_the_whole_way_and_is_held_to_its_truth() -> None:
     assert answer["expected"] > 0.99
     assert answer["false_alarm_probability"] < 0.01
     rho = np.hypot(*answer["truth"][:2])
-    assert FIELD_MAS[0] <= rho <= FIELD_MAS[1]
+    inner, outer = plan.settings[0].field_mas
+    assert inner <= rho <= outer
     assert RANGES["bright"][0] <= answer["truth"][2] <= RANGES["bright"][1]
     # Each rank is beyond 5e-5 of either end in one of 1e4 sound runs.
     assert all(5e-5 < rank < 1.0 - 5e-5 for rank in answer["rank"])
@@ -113,7 +115,7 @@ def test_a_failure_of_the_analysis_names_the_trial(monkeypatch) -> None:
     def refuse(*_: object) -> None:
         raise DataError("holds nothing", source="star")
 
-    monkeypatch.setattr("amibayes.validation.trial.observe", refuse)
+    monkeypatch.setattr("amibayes.validation.trial.search_companion", refuse)
     with pytest.raises(RunError, match=r"trial 3 \(alone\): star: holds nothing"):
         run_trial(QUICK, (3, "alone", np.random.SeedSequence(1)))
 
@@ -122,10 +124,10 @@ def test_the_page_says_what_holds_and_what_fails(tmp_path) -> None:
     sound = tally(PLAN, 1, list(answers(PLAN)))
     bad = tally(PLAN, 3, list(answers(PLAN, 3, coverage=0.8)))
     failing = [check for check in bad.checks if not check.passed]
-    assert validation_table(sound)[-1] == "All 23 checks hold."
+    assert validation_table(sound)[-1] == "All 25 checks hold."
     *rows, last = validation_table(bad)[1:]
     assert [row[:52].strip() for row in rows] == [check.name for check in failing]
-    assert last.startswith(f"{len(failing)} of 23 checks fail: {failing[0].name}")
+    assert last.startswith(f"{len(failing)} of 25 checks fail: {failing[0].name}")
     figures = {}
     for name, drawing in validation_pictures(bad).items():
         save(drawing, tmp_path / f"{name}.png")
@@ -198,7 +200,7 @@ def test_command_writes_page_pictures_and_numbers(small, tmp_path, monkeypatch, 
     assert main(["validate", "--out", str(out), "--seed", "5", "--quiet"]) == 0
     content = json.loads((out / "validation.json").read_text())
     assert content["n_trials"] == 4
-    assert len(content["checks"]) == 23
+    assert len(content["checks"]) == 25
     assert content["trials"]["found"].count(None) == 1
     page = (out / "validation.html").read_text()
     assert page.count("data:image/png") == 4

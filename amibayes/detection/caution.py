@@ -1,0 +1,35 @@
+"""What else than a companion may look like the point that was found."""
+
+from __future__ import annotations
+
+from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.result import SearchResult
+
+LARGEST_STAR_MAS = 60.0
+"""No star but the Sun looks larger: R Doradus has 57 ± 5 mas (Bedding et al. 1997,
+MNRAS 286, 957)."""
+
+
+def caution_of(result: SearchResult) -> str:
+    """Say why a point that fits may be no companion; empty where nothing speaks against one.
+
+    A star is a uniform or darkened disc in the search. A spot on it is a point inside it; a ring
+    or a crescent around it is taken for its disc, larger than any star, and a point; and
+    below λ/2B a point cannot be told from an elongated star.
+    """
+    rho = result.companion.separation_mas
+    diameter = result.nuisance("diameter_mas")
+    half = 0.5 * resolution_mas(result.likelihood)
+    if rho < 0.5 * diameter:
+        return f"it lies inside the star's disc of {diameter:.3g} mas, where a spot fits as well"
+    if diameter > LARGEST_STAR_MAS:
+        return (
+            f"the star's disc of {diameter:.3g} mas is larger than any star: light around it, such "
+            "as a crescent, may fit as well (--models)"
+        )
+    if rho < half:
+        return (
+            f"it is nearer than λ/2B, {half:.3g} mas, where an elongated star or a crescent may "
+            "fit as well (--models)"
+        )
+    return ""

@@ -1,0 +1,37 @@
+"""Answers of many trials, kept in a file as they come: a script that was cut off goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Answer = dict[str, Any]
+
+
+def known_answers(path: Path) -> list[Answer]:
+    """Read the answers of a file, one JSON object a line; a line that was cut short is none."""
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    return [json.loads(line) for line in lines]
+
+
+def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
+    """Give the answers of trials 0 to n − 1: those of the file, then new ones, put there at once.
+
+    Parameters
+    ----------
+    path : path
+    n : int
+    trial : callable
+        Its answer depends on the number alone, so that any n goes on from any other.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    known = known_answers(path)
+    whole = "".join(json.dumps(answer) + "\n" for answer in known)
+    path.write_text(whole, encoding="utf-8")
+    for k in range(len(known), n):
+        known.append(trial(k))
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(known[-1]) + "\n")
+    return known[:n]
