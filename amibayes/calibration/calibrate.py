@@ -11,6 +11,7 @@ from amibayes.calibration.applying import apply_response
 from amibayes.calibration.freedom import response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, foreign, keys_of
+from amibayes.calibration.narrowing import narrowed
 from amibayes.calibration.population import population_response
 from amibayes.calibration.transfer import (
     Diameter,
@@ -173,6 +174,10 @@ def calibrate(
     used = [calibrators[j] for j in serving]
     kept = _consistent([seen[j] for j in serving], keys, None if chosen == "population" else clip)
     mjd = [mean_mjd(c) for c in (target, *used)]
+    # Response that depends on the charge, or shared errors that do: one of them is fitted.
+    told = narrowed(kept) if covariate is None else None
+    if told is not None:
+        target, kept = told.of_target(target), [told.of_transfer(t) for t in kept]
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response = replace(response, freedom=response_freedom(used, kept))
     notes = tuple(note for c in used if (note := foreign(c, keys)))
