@@ -174,10 +174,7 @@ def calibrate(
     used = [calibrators[j] for j in serving]
     kept = _consistent([seen[j] for j in serving], keys, None if chosen == "population" else clip)
     mjd = [mean_mjd(c) for c in (target, *used)]
-    # Response that depends on the charge, or shared errors that do: one of them is fitted.
-    told = narrowed(kept) if covariate is None else None
-    if told is not None:
-        target, kept = told.of_target(target), [told.of_transfer(t) for t in kept]
+    target, kept = _told(target, kept, covariate)
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response = replace(response, freedom=response_freedom(used, kept))
     notes = tuple(note for c in used if (note := foreign(c, keys)))
@@ -189,6 +186,16 @@ def calibrate(
         tuple(len(p.setups) for p in parts),
         response.tau,
     )
+
+
+def _told(
+    target: Observables, kept: list[Transfer], covariate: FloatArray | None
+) -> tuple[Observables, list[Transfer]]:
+    """Shared errors narrowed by the calibrators; a response that goes with charge has its own."""
+    told = narrowed(kept) if covariate is None else None
+    if told is None:
+        return target, kept
+    return told.of_target(target), [told.of_transfer(t) for t in kept]
 
 
 def mean_mjd(observables: Observables) -> float:
