@@ -176,8 +176,7 @@ def calibrate(
     mjd = [mean_mjd(c) for c in (target, *used)]
     target, kept = _told(target, kept, covariate)
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
-    response = replace(response, freedom=response_freedom(used, kept))
-    notes = tuple(note for c in used if (note := foreign(c, keys)))
+    response, notes = replace(response, freedom=response_freedom(used, kept)), _notes(used, keys)
     return Calibration(
         apply_response(target, keys, response, calibrators, notes),
         chosen,
@@ -186,6 +185,10 @@ def calibrate(
         tuple(len(p.setups) for p in parts),
         response.tau,
     )
+
+
+def _notes(used: list[Observables], keys: Keys) -> tuple[str, ...]:
+    return tuple(note for c in used if (note := foreign(c, keys)))
 
 
 def _told(
