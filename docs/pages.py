@@ -1,23 +1,59 @@
-"""Tables that scripts make, between the lines of a page that mark them."""
+"""Tables that scripts make, between the lines of a page that mark them.
+
+    python -m benchmarks.survey_study cost | python docs/pages.py howto/survey.md \\
+        "benchmarks/survey_study.py cost"
+
+puts the tables that a script prints (lines that begin with ``|``) where the page has the marks
+``table: benchmarks/survey_study.py cost`` and, for a second table, the same with `` 2``. Scripts of
+this folder call `put_table` themselves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import groupby
 from pathlib import Path
 
+import made_with
 
-def put_table(page: str, lines: Sequence[str], mark: str = "table") -> None:
-    """Replace what is between ``<!-- mark -->`` and ``<!-- end of mark -->``.
+
+def put_table(page: str, lines: Sequence[str], made_by: str) -> None:
+    """Replace what is between ``<!-- table: made_by -->`` and ``<!-- end of table: made_by -->``.
+
+    Which code it was made with is recorded, see `made_with`.
 
     Parameters
     ----------
     page : str
-        Name of a page of the documentation.
+        A page of the documentation, relative to this folder.
     lines : sequence of str
-    mark : str
+    made_by : str
+        The script, relative to the root of the clone, and words that tell its tables apart.
+
+    Raises
+    ------
+    ValueError
+        Where the page has no such mark.
     """
-    path = Path(__file__).with_name(page)
-    head, _, rest = path.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")
-    tail = rest.partition(f"<!-- end of {mark} -->\n")[2]
-    text = "\n".join([f"<!-- {mark} -->", "", *lines, "", f"<!-- end of {mark} -->", ""])
+    path = Path(__file__).parent / page
+    begin, end = (f"<!-- {what}: {made_by} -->\n" for what in ("table", "end of table"))
+    head, found, rest = path.read_text(encoding="utf-8").partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"{page} has no lines {begin.strip()} and {end.strip()}")
+    text = "\n".join([begin, *lines, "", end])
     path.write_text(head + text + tail, encoding="utf-8")
+    made_with.record(made_by.split()[0])
+
+
+def put_tables(page: str, printed: Iterable[str], made_by: str) -> None:
+    """Put the tables that a script printed at its marks: ``made_by``, ``made_by 2`` and so on."""
+    runs = groupby(printed, key=lambda line: line.startswith("|"))
+    tables = [[line.rstrip() for line in lines] for is_table, lines in runs if is_table]
+    for n, table in enumerate(tables, start=1):
+        put_table(page, table, made_by if n == 1 else f"{made_by} {n}")
+
+
+if __name__ == "__main__":
+    put_tables(sys.argv[1], sys.stdin, sys.argv[2])

@@ -6,7 +6,7 @@ Closure phases of NIRISS in F480M, independent errors of the baselines' phases, 
 between 50 and 400 mas. amibayes' criterion is a false-alarm probability of 1 %; CANDID's is
 nσ > 3 or 5, with the 35 closure phases taken as independent, as is the habit, and the noise
 correlated as it is. Their false-alarm rates are measured on null data sets. Writes power.png
-and prints the table.
+and the table of statistics.md.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from pages import put_table
 
 from amibayes import BinaryModel, Likelihood, Observables, TemplateBank, load_instrument
 from amibayes.companion_search.grid import make_grid
@@ -115,14 +116,20 @@ def picture(share: dict[str, FloatArray], rates: dict[str, float]) -> Figure:
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "static"
     share, rates = measure()
+    rows = [
+        "| criterion | true false-alarm rate | contrast found half of the time "
+        "| 95 % of the time |",
+        "|---|---|---|---|",
+    ]
     for name in CRITERIA:
         low, high = clopper_pearson(round(rates[name] * NULLS), NULLS)
         half = np.interp(0.5, share[name], CONTRASTS)
         most = np.interp(0.95, share[name], CONTRASTS)
-        print(
+        rows.append(
             f"| {name} | {100 * rates[name]:.2f} % ({100 * low:.2f}–{100 * high:.2f}) "
             f"| {half:.4f} | {most:.4f} |"
         )
+    put_table("statistics.md", rows, "docs/power.py")
     picture(share, rates).savefig(folder / "power.png", dpi=130)
 
 

@@ -22,7 +22,11 @@ def make() -> SimpleNamespace:
     return SimpleNamespace(**runpy.run_path(str(FOLDER / "make.py")))
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.stem)
+DEAR = ("survey",)  # four searches with limits
+EACH = [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in DEAR), id=p.stem) for p in SCRIPTS]
+
+
+@pytest.mark.parametrize("script", EACH)
 def test_a_notebook_runs(script: Path, monkeypatch, capsys) -> None:
     """Its assertions hold what it says of the truth."""
     monkeypatch.chdir(ROOT)

@@ -1,0 +1,88 @@
+"""Tables go to their marks, and what they were made with is told apart from what came later."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from conftest import ROOT
+from helpers import script_of_docs
+
+MARKS = [
+    (page.relative_to(ROOT / "docs").as_posix(), made_by)
+    for page in sorted((ROOT / "docs").rglob("*.md"))
+    for made_by in re.findall(r"^<!-- table: (.+) -->$", page.read_text(encoding="utf-8"), re.M)
+]
+
+BEGIN, END = "<!-- table: docs/script.py -->", "<!-- end of table: docs/script.py -->"
+
+
+@pytest.fixture
+def made_with(tmp_path: Path, monkeypatch) -> ModuleType:
+    """The module on a small project: a script that uses one of two packages."""
+    module = script_of_docs("made_with")
+    texts = {
+        "docs/script.py": "from amibayes.used import f\n",
+        "docs/lazy.py": "import amibayes as ab\nprint(ab.f)\n",
+        "docs/page.md": f"a\n{BEGIN}\nold\n{END}\nb\n",
+        "amibayes/__init__.pyi": "from .used import f as f\n",
+        "amibayes/used/__init__.py": "from amibayes.deeper.part import g\n\ndef f(): return g()\n",
+        "amibayes/deeper/part.py": "def g(): return 1\n",
+        "amibayes/other.py": "h = 1\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(module, "KEPT", tmp_path / "made_with.json")
+    module._public.cache_clear()
+    yield module
+    module._public.cache_clear()
+
+
+@pytest.mark.parametrize("script", ["docs/script.py", "docs/lazy.py"])
+def test_only_code_that_a_script_uses_makes_it_old(made_with: ModuleType, script: str) -> None:
+    root = made_with.ROOT
+    made_with.record(script)
+    assert made_with.changed() == {script: []}
+    (root / "amibayes/other.py").write_text("h = 2\n")
+    (root / "amibayes/deeper/part.py").write_text('def g():\n    """Say."""\n    return 1  # one\n')
+    made_with._tree.cache_clear()
+    assert made_with.changed() == {script: []}
+    (root / "amibayes/deeper/part.py").write_text("def g(): return 2\n")
+    made_with._tree.cache_clear()
+    assert made_with.changed() == {script: ["deeper"]}
+    made_with.record(script)
+    assert made_with.changed() == {script: []}
+
+
+def test_a_table_goes_to_its_mark(made_with: ModuleType, monkeypatch) -> None:
+    pages = script_of_docs("pages")
+    monkeypatch.setattr(pages, "made_with", made_with)
+    monkeypatch.setattr(pages, "__file__", str(made_with.ROOT / "docs" / "pages.py"))
+    for _ in range(2):
+        pages.put_tables(
+            "page.md", ["made in 3 s\n", "| x |\n", "|---|\n", "end\n"], "docs/script.py"
+        )
+        page = (made_with.ROOT / "docs/page.md").read_text()
+        assert page == f"a\n{BEGIN}\n\n| x |\n|---|\n\n{END}\nb\n"
+    assert list(made_with.changed()) == ["docs/script.py"]
+    with pytest.raises(ValueError, match="no lines"):
+        pages.put_table("page.md", [], "docs/other.py")
+
+
+@pytest.mark.parametrize(("page", "made_by"), MARKS)
+def test_every_mark_names_a_script_and_ends(page: str, made_by: str) -> None:
+    assert (ROOT / made_by.split()[0]).is_file()
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    between = text.partition(f"<!-- table: {made_by} -->")[2]
+    assert between.partition(f"<!-- end of table: {made_by} -->")[0].count("|---|") >= 1
+
+
+def test_scripts_are_found_with_what_they_measure() -> None:
+    made_with = script_of_docs("made_with")
+    assert {"companion_search", "detection"} <= made_with.digests(ROOT / "docs/power.py").keys()
+    for name in made_with.changed():
+        assert (ROOT / name).is_file(), f"{name} has gone: take it out of docs/made_with.json"
