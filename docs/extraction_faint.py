@@ -96,7 +96,7 @@ def table() -> list[str]:
 
 def main() -> int:
     """Put the table where it belongs."""
-    put_table("extraction.md", table(), "docs/extraction_faint.py")
+    put_table("extraction.md", table(), "table: docs/extraction_faint.py")
     return 0
 
 

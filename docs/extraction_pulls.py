@@ -229,7 +229,7 @@ def row(label: str, photons: float, method: str, found: Pulls) -> str:
 
 def main() -> int:
     """Put the table where it belongs."""
-    put_table("extraction.md", table(), "docs/extraction_pulls.py")
+    put_table("extraction.md", table(), "table: docs/extraction_pulls.py")
     return 0
 
 

@@ -159,7 +159,7 @@ def table() -> list[str]:
 
 
 def main() -> int:
-    put_table("extraction.md", table(), "docs/extraction_table.py")
+    put_table("extraction.md", table(), "table: docs/extraction_table.py")
     return 0
 
 

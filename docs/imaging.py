@@ -64,7 +64,7 @@ def table(found: dict[str, list[tuple[ab.ReconstructedImage, np.ndarray]]]) -> N
         lines.append(
             f"| {name} | {r:.2f} | {flux:.2f} | {chi2r:.2f} | {left:.2f} | {10**weight:.3g} |"
         )
-    put_table("howto/imaging.md", lines, "docs/imaging.py")
+    put_table("howto/imaging.md", lines, "table: docs/imaging.py")
 
 
 @styled()

@@ -1,11 +1,11 @@
 """Tables that scripts make, between the lines of a page that mark them.
 
     python -m benchmarks.survey_study cost | python docs/pages.py howto/survey.md \\
-        "benchmarks/survey_study.py cost"
+        "cost: benchmarks/survey_study.py"
 
 puts the tables that a script prints (lines that begin with ``|``) where the page has the marks
-``table: benchmarks/survey_study.py cost`` and, for a second table, the same with `` 2``. Scripts of
-this folder call `put_table` themselves.
+``cost: benchmarks/survey_study.py`` and, for a second table, the same with `` 2``. Scripts of this
+folder call `put_table` themselves.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from pathlib import Path
 import made_with
 
 
-def put_table(page: str, lines: Sequence[str], made_by: str) -> None:
-    """Replace what is between ``<!-- table: made_by -->`` and ``<!-- end of table: made_by -->``.
+def put_table(page: str, lines: Sequence[str], mark: str) -> None:
+    """Replace what is between ``<!-- mark -->`` and ``<!-- end of mark -->``.
 
-    Which code it was made with is recorded, see `made_with`.
+    With which code it was made is recorded, see `made_with`.
 
     Parameters
     ----------
     page : str
         A page of the documentation, relative to this folder.
     lines : sequence of str
-    made_by : str
-        The script, relative to the root of the clone, and words that tell its tables apart.
+    mark : str
+        Name of the table and the script that makes it: ``table: docs/power.py``.
 
     Raises
     ------
@@ -37,22 +37,22 @@ def put_table(page: str, lines: Sequence[str], made_by: str) -> None:
         Where the page has no such mark.
     """
     path = Path(__file__).parent / page
-    begin, end = (f"<!-- {what}: {made_by} -->\n" for what in ("table", "end of table"))
+    begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->\n"
     head, found, rest = path.read_text(encoding="utf-8").partition(begin)
     _, closed, tail = rest.partition(end)
     if not (found and closed):
         raise ValueError(f"{page} has no lines {begin.strip()} and {end.strip()}")
     text = "\n".join([begin, *lines, "", end])
     path.write_text(head + text + tail, encoding="utf-8")
-    made_with.record(made_by.split()[0])
+    made_with.record(mark.partition(": ")[2].split()[0])
 
 
-def put_tables(page: str, printed: Iterable[str], made_by: str) -> None:
-    """Put the tables that a script printed at its marks: ``made_by``, ``made_by 2`` and so on."""
+def put_tables(page: str, printed: Iterable[str], mark: str) -> None:
+    """Put the tables that a script printed at its marks: ``mark``, ``mark 2`` and so on."""
     runs = groupby(printed, key=lambda line: line.startswith("|"))
     tables = [[line.rstrip() for line in lines] for is_table, lines in runs if is_table]
     for n, table in enumerate(tables, start=1):
-        put_table(page, table, made_by if n == 1 else f"{made_by} {n}")
+        put_table(page, table, mark if n == 1 else f"{mark} {n}")
 
 
 if __name__ == "__main__":

@@ -129,7 +129,7 @@ def main() -> None:
             f"| {name} | {100 * rates[name]:.2f} % ({100 * low:.2f}–{100 * high:.2f}) "
             f"| {half:.4f} | {most:.4f} |"
         )
-    put_table("statistics.md", rows, "docs/power.py")
+    put_table("statistics.md", rows, "table: docs/power.py")
     picture(share, rates).savefig(folder / "power.png", dpi=130)
 
 

@@ -20,7 +20,7 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.search import search_companion
 
-PAGE, SCRIPT = "public_verdicts.md", "docs/public_verdicts.py"
+PAGE, MARK = "public_verdicts.md", "table: docs/public_verdicts.py"
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def main(folder: Path) -> int:
         rows.append(row(case, report))
         wrong += faults(case, report)
         print(rows[-1], flush=True)
-    put_table(PAGE, rows, SCRIPT)
+    put_table(PAGE, rows, MARK)
     print("\n".join(wrong) or "every verdict is right")
     return 1 if wrong else 0
 

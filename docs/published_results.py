@@ -26,7 +26,7 @@ from amibayes.data.observables import Measurements, join
 from amibayes.extraction.reading import read_observations
 from amibayes.pipeline.options import SearchOptions
 
-PAGE, SCRIPT = "published_results.md", "docs/published_results.py"
+PAGE, MARK = "published_results.md", "table: docs/published_results.py"
 
 MAX_SIGMA = 3.0
 """Differences past this need a reason."""
@@ -450,7 +450,7 @@ def table(folder: Path) -> Iterator[str]:
 def main(folder: Path) -> int:
     """Write the table into the page; 1 where a number differs without a reason."""
     lines = list(table(folder))
-    put_table(PAGE, lines, SCRIPT)
+    put_table(PAGE, lines, MARK)
     return int(
         any(
             abs(float(x.split("|")[6])) > MAX_SIGMA and not x.split("|")[7].strip()

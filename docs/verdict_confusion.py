@@ -29,7 +29,7 @@ from trials import Answer, answers  # noqa: E402
 
 from amibayes.data.observables import Observables, join  # noqa: E402
 
-PAGE, SCRIPT = "public_verdicts.md", "docs/verdict_confusion.py"
+PAGE, MARK = "public_verdicts.md", "table: docs/verdict_confusion.py"
 STATEMENTS = ("companion", "no companion", "model rejected", "inconsistent data")
 
 Make = Callable[[np.random.Generator], Observables]
@@ -128,7 +128,7 @@ def main(n: int, folder: Path) -> None:
         count = Counter(a["statement"] for a in found)
         rows.append(f"| {name} | {' | '.join(str(count[s] or '') for s in STATEMENTS)} |")
         print(rows[-1], flush=True)
-    put_table(PAGE, rows, SCRIPT)
+    put_table(PAGE, rows, MARK)
 
 
 if __name__ == "__main__":

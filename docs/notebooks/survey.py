@@ -2,7 +2,8 @@
 # # A survey
 #
 # Many stars searched alike, and what their results mean together. The stars here are the target of
-# the example and its three calibrators, each calibrated with the others. Run from the root of a clone.
+# the example and its three calibrators, each calibrated with the others. Run from the root of a
+# clone.
 
 # %%
 import json

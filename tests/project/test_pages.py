@@ -11,9 +11,11 @@ from conftest import ROOT
 from helpers import script_of_docs
 
 MARKS = [
-    (page.relative_to(ROOT / "docs").as_posix(), made_by)
+    (page.relative_to(ROOT / "docs").as_posix(), mark)
     for page in sorted((ROOT / "docs").rglob("*.md"))
-    for made_by in re.findall(r"^<!-- table: (.+) -->$", page.read_text(encoding="utf-8"), re.M)
+    for mark in re.findall(
+        r"^<!-- (\w+: [\w/]+\.py.*) -->$", page.read_text(encoding="utf-8"), re.M
+    )
 ]
 
 BEGIN, END = "<!-- table: docs/script.py -->", "<!-- end of table: docs/script.py -->"
@@ -64,21 +66,21 @@ def test_a_table_goes_to_its_mark(made_with: ModuleType, monkeypatch) -> None:
     monkeypatch.setattr(pages, "__file__", str(made_with.ROOT / "docs" / "pages.py"))
     for _ in range(2):
         pages.put_tables(
-            "page.md", ["made in 3 s\n", "| x |\n", "|---|\n", "end\n"], "docs/script.py"
+            "page.md", ["made in 3 s\n", "| x |\n", "|---|\n", "end\n"], "table: docs/script.py"
         )
         page = (made_with.ROOT / "docs/page.md").read_text()
         assert page == f"a\n{BEGIN}\n\n| x |\n|---|\n\n{END}\nb\n"
     assert list(made_with.changed()) == ["docs/script.py"]
     with pytest.raises(ValueError, match="no lines"):
-        pages.put_table("page.md", [], "docs/other.py")
+        pages.put_table("page.md", [], "table: docs/other.py")
 
 
-@pytest.mark.parametrize(("page", "made_by"), MARKS)
-def test_every_mark_names_a_script_and_ends(page: str, made_by: str) -> None:
-    assert (ROOT / made_by.split()[0]).is_file()
+@pytest.mark.parametrize(("page", "mark"), MARKS)
+def test_every_mark_names_a_script_and_ends(page: str, mark: str) -> None:
+    assert (ROOT / mark.split()[1]).is_file()
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    between = text.partition(f"<!-- table: {made_by} -->")[2]
-    assert between.partition(f"<!-- end of table: {made_by} -->")[0].count("|---|") >= 1
+    between = text.partition(f"<!-- {mark} -->")[2]
+    assert f"<!-- end of {mark} -->" in between
 
 
 def test_scripts_are_found_with_what_they_measure() -> None:
