@@ -28,7 +28,9 @@ PEERS = (
     Peer("amical", "amical", ("threadpoolctl",)),
     Peer("virgil", "virgil-astro[pipeline]==0.4.1"),
     Peer("fouriever", "fouriever"),
-    Peer("pmoired", "pmoired"),
+    Peer("pmoired", "pmoired==26.10.1"),
+    # CANDID is not on PyPI; AMICAL up to 1.6 bundles it.
+    Peer("candid", "amical==1.6.0"),
     Peer("jwst", "jwst==3.0.0"),
 )
 

@@ -21,6 +21,7 @@ from pages import put_table
 from amibayes import BinaryModel, Likelihood, Observables, calibrate, read_oifits, search
 from amibayes.calibration import bin_channels
 from amibayes.companion_search.optimise import fit_single, single_likelihood
+from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import DiagonalCovariance
 from amibayes.data.observables import Measurements, join
 from amibayes.extraction.reading import read_observations
@@ -127,6 +128,13 @@ def companion(
     data: Observables, fitted: BinaryModel, field: tuple[float, float] | None = None
 ) -> Numbers:
     """Everything that a search finds; errors grow by √χ² where the stated ones are too small."""
+    return fitted_companion(data, fitted, field)[1]
+
+
+def fitted_companion(
+    data: Observables, fitted: BinaryModel, field: tuple[float, float] | None = None
+) -> tuple[SearchResult, Numbers]:
+    """The search, and what it finds."""
     result = search(Likelihood(data, fitted), field)
     grow = max(np.sqrt(result.chi2_binary / result.ndof), 1.0)
     c = result.companion
@@ -147,7 +155,7 @@ def companion(
         place = next((i for i, n in enumerate(names) if n.startswith(name)), None)
         if place is not None:
             found[label] = float(result.theta[place]), float(sigma[place])
-    return {q: (v, float(grow * e)) for q, (v, e) in found.items()}
+    return result, {q: (v, float(grow * e)) for q, (v, e) in found.items()}
 
 
 def star(data: Observables, fitted: BinaryModel) -> Numbers:

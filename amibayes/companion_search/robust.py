@@ -87,8 +87,8 @@ def search_robust(
     found = max(tried, key=lambda t: work.log_prob(t[0].theta))
     first, _, _, _ = found
     shared = shared_noise(first.likelihood, first.theta, prior or NoisePrior(), per_file=per_file)
-    correlated = with_shared(likelihood, shared)
-    if correlated is not likelihood:
+    correlated = with_shared(likelihood.expecting(first.theta), shared)
+    if correlated.observables.covariance is not data.covariance:
         likelihood = correlated
         work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
         found = work.converge(likelihood.residuals(first.theta)[:, 0])

@@ -285,7 +285,7 @@ def _best_noise(
     clean = Likelihood(stated, base.model)
     tried = []
     for fit in fits:
-        likelihood = clean.with_model(fit.model.likelihood.model)
+        likelihood = clean.with_model(fit.model.likelihood.model).expecting(fit.theta)
         found = fit_noise(likelihood, fit.theta, per_file=setting.per_file, prior=setting.prior)
         noisy = with_noise(likelihood, found)
         tried.append((float(noisy.log_prob(fit.theta[None])[0]), noisy, found, fit.hypothesis))

@@ -193,15 +193,18 @@ def test_extra_noise_is_bounded_by_its_prior(rng) -> None:
 def probabilities(n: int, draws: int, seed: int) -> np.ndarray:
     """False-alarm probabilities of null data with half of the variance common to channels.
 
-    Each data set has null draws of its own, with its own fitted noise.
+    Each data set has null draws of its own, with its own noise, fitted as a search does it: at
+    the best companion, gains in proportion to the V² that it predicts.
     """
     rng = np.random.default_rng(seed)
     sheet = pionier(8)
     noise = noise_with_channels(sheet, [share(0.5, 0.5)]).draw(n, rng)
     grid, out = make_grid(3.0, 12.0, 1.0), []
     for draw in noise.T:
-        stated = Likelihood(with_draw(sheet, draw))
-        likelihood = with_noise(stated, fit_noise(stated, np.array([10.0, 5.0, 0.0])))
+        stated = Likelihood(with_draw(sheet, draw)).expecting(np.array([10.0, 5.0, 0.0]))
+        (best,) = make_statistic(stated, grid, np.empty(0)).strongest
+        stated = stated.expecting(best)
+        likelihood = with_noise(stated, fit_noise(stated, best))
         statistic = make_statistic(likelihood, grid, np.empty(0))
         null = statistic.draw_null(draws, rng)
         out.append((1 + (null >= statistic.value).sum()) / (draws + 1.0))
@@ -210,7 +213,7 @@ def probabilities(n: int, draws: int, seed: int) -> np.ndarray:
 
 def test_false_alarms_are_uniform_with_half_of_the_noise_common() -> None:
     """24 null sets: KS p > 1e-4; 9 below 0.1 are a 1e-4 accident."""
-    p = probabilities(24, 200, 1)
+    p = probabilities(24, 100, 1)
     assert stats.kstest(p, "uniform").pvalue > 1e-4
     assert (p < 0.1).sum() < 9
 
@@ -223,14 +226,15 @@ def test_false_alarms_are_uniform_with_half_of_the_noise_common() -> None:
     ],
 )
 def test_false_alarms_of_many_null_sets(n: int, draws: int) -> None:
-    """Measured in 200: 7 % below 0.05, 1 % below 0.01. Noise fitted to 8 exposures costs that.
+    """Measured in 300: 4.0 % below 0.05, 1.3 % below 0.01.
 
-    Bounds are those with binomial 1e-4 on top of shares of 8 and 2 %.
+    (With gains in proportion to the measured V² 11 and 3 %: the direction of a gain then goes
+    along with the errors, Peelle's puzzle.) Bounds are those with binomial 1e-4.
     """
     p = probabilities(n, draws, 2)
-    for level, most in ((0.05, 0.08), (0.01, 0.02)):
+    for level in (0.05, 0.01):
         hits = int((p < level).sum())
-        assert stats.binomtest(hits, len(p), most, alternative="greater").pvalue > 1e-4
+        assert stats.binomtest(hits, len(p), level, alternative="greater").pvalue > 1e-4
 
 
 def test_gains_that_channels_share_do_not_shrink_the_visibility(rng) -> None:

@@ -1,0 +1,45 @@
+"""CANDID, as AMICAL 1.6 bundles it: a binary of two discs, fitted from a grid of places.
+
+Arguments: an OIFITS file, inner and outer edge of the field and step of the grid in mas, and
+diameters at which fits begin. Prints one line of JSON.
+"""
+
+import contextlib
+import io
+import json
+import sys
+import time
+
+from amical.externals import candid
+
+if __name__ == "__main__":
+    path, (inner, outer, step, star, companion) = sys.argv[1], map(float, sys.argv[2:7])
+    candid.CONFIG["long exec warning"] = None
+    begin = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        data = candid.Open(path)
+        data.observables = ["v2", "cp"]
+        data.fitMap(
+            step=step,
+            rmin=inner,
+            rmax=outer,
+            ncore=1,
+            fig=0,
+            fratio=20.0,
+            addParam={"diam*": star, "diamc": companion},
+        )
+    fit = data.bestFit
+    names = {
+        "east (mas)": "x",
+        "north (mas)": "y",
+        "flux ratio (%)": "f",
+        "diameter (mas)": "diam*",
+        "companion's diameter (mas)": "diamc",
+    }
+    found = {}
+    for label, name in names.items():
+        value, error = float(fit["best"][name]), float(fit["uncer"][name])
+        found[label] = [abs(value) if "diam" in name else value, error]
+    found["reduced χ²"] = [float(fit["chi2"]), 0.0]
+    version = candid.__version__.split()[0]
+    print(json.dumps({"found": found, "cpu_s": time.process_time() - begin, "version": version}))

@@ -1,0 +1,47 @@
+"""PMOIRED: a binary of two discs, fitted from a grid of places.
+
+Arguments: an OIFITS file, inner and outer edge of the field and step of the grid in mas, and
+diameters at which fits begin. Prints one line of JSON.
+"""
+
+import contextlib
+import io
+import json
+import sys
+import time
+
+import pmoired
+
+if __name__ == "__main__":
+    path, (inner, outer, step, star, companion) = sys.argv[1], map(float, sys.argv[2:7])
+    begin = time.process_time()
+    with contextlib.redirect_stdout(io.StringIO()):
+        oi = pmoired.OI(path)
+        oi.setupFit({"obs": ["V2", "T3PHI"]})
+        model = {"*,ud": star, "*,f": 1.0, "c,ud": companion, "c,f": 0.2, "c,x": 0.0, "c,y": 0.0}
+        axis = (-outer, outer, step)
+        oi.gridFit(
+            {"grid": {"c,x": axis, "c,y": axis}},
+            model=model,
+            doNotFit=["*,f"],
+            multi=False,
+            constrain=[
+                ("np.sqrt(c,x**2+c,y**2)", ">=", inner),
+                ("np.sqrt(c,x**2+c,y**2)", "<=", outer),
+            ],
+        )
+    fit = oi.bestfit
+    names = {
+        "east (mas)": "c,x",
+        "north (mas)": "c,y",
+        "flux ratio (%)": "c,f",
+        "diameter (mas)": "*,ud",
+        "companion's diameter (mas)": "c,ud",
+    }
+    found = {}
+    for label, name in names.items():
+        scale = 100.0 if name == "c,f" else 1.0
+        value, error = float(fit["best"][name]), float(fit["uncer"][name])
+        found[label] = [scale * (abs(value) if "ud" in name else value), scale * error]
+    found["reduced χ²"] = [float(fit["chi2"]), 0.0]
+    print(json.dumps({"found": found, "cpu_s": time.process_time() - begin}))
