@@ -1,4 +1,4 @@
-"""Positions of a search: a lattice inside an annulus, symmetric about the star."""
+"""Positions of a search, a lattice inside an annulus, symmetric about the star; and rates."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.units import FloatArray, IntArray
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.units import MAS, FloatArray, IntArray
+
+RATE_STEPS_PER_FRINGE = 4
+"""Steps in rate per λ/B_max of the place at the date farthest from the reference date."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +76,20 @@ def make_grid(inner_mas: float, outer_mas: float, step_mas: float) -> Grid:
         np.concatenate([columns, -columns]),
         np.concatenate([rows, -rows]),
     )
+
+
+def rates_per_axis(likelihood: Likelihood) -> int:
+    """Number of rates that are tried along east, and along north."""
+    model, samples = likelihood.model, likelihood.samples
+    if not model.moves:
+        return 1
+    fringe = 1.0 / samples.frequency.max() / MAS
+    farthest = float(np.abs(samples.years(model.reference_mjd)).max())
+    return 2 * int(np.ceil(RATE_STEPS_PER_FRINGE * model.fastest_mas_yr * farthest / fringe)) + 1
+
+
+def trial_rates(likelihood: Likelihood) -> FloatArray:
+    """Rates along east and north that are tried, mas/yr, (n, 2), symmetric about 0."""
+    fastest, n = likelihood.model.fastest_mas_yr, rates_per_axis(likelihood)
+    axis = np.linspace(-fastest, fastest, n) if n > 1 else np.zeros(1)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -71,10 +71,19 @@ class ScaleGroups:
         Group of each whitened datum.
     share : float
         Degrees of freedom per datum: less than 1 where nuisance parameters took some.
+    count : (n_groups,) float array, optional
+        Data of every group, where a row stands for several.
     """
 
     label: IntArray
     share: float
+    count: FloatArray | None = None
+
+    @property
+    def degrees(self) -> FloatArray:
+        """Degrees of freedom of every group, (n_groups,)."""
+        count = np.bincount(self.label) if self.count is None else self.count
+        return np.asarray(self.share * count)
 
     @property
     def several(self) -> bool:
@@ -87,8 +96,8 @@ class ScaleGroups:
         return np.asarray(member.astype(values.dtype) @ values)
 
     def variances(self, data: FloatArray) -> FloatArray:
-        """Mean squares of whitened data (n_data, n), (n_groups, n), within `MAX_UNEQUAL`."""
-        count = self.share * self.sums(np.ones(len(data)))[:, None]
+        """Mean squares of whitened data (n_rows, n), (n_groups, n), within `MAX_UNEQUAL`."""
+        count = self.degrees[:, None]
         square = self.sums(data**2)
         mean = np.where(square.sum(axis=0) > 0.0, square.sum(axis=0) / count.sum(), 1.0)
         return np.asarray(np.clip(square / count, mean / MAX_UNEQUAL, mean * MAX_UNEQUAL))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from amibayes.companion_search.field import default_separation, resolution_mas
-from amibayes.companion_search.grid import Grid, make_grid
+from amibayes.companion_search.grid import Grid, make_grid, rates_per_axis
 from amibayes.companion_search.modes import distinct_modes, innermost_first
 from amibayes.companion_search.optimise import fit_single, global_check
 from amibayes.companion_search.result import RIVAL, Mode, SearchResult, companions_of, is_opposite
@@ -22,7 +22,7 @@ from amibayes.companion_search.seeds import (
     refine_all,
     trial_stars,
 )
-from amibayes.companion_search.template_bank import TemplateBank, rates_per_axis
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box

@@ -14,13 +14,15 @@ one sparse matrix before any position is looked at.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from amibayes.companion_search.grid import Grid
+from amibayes.companion_search.grid import Grid, trial_rates
 from amibayes.companion_search.phasors import WIDTH, LatticePhasors
+from amibayes.companion_search.reduction import Reduction, reduction_of
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.companion_search.templates import (
     BandTemplates,
@@ -31,32 +33,13 @@ from amibayes.companion_search.templates import (
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
+from amibayes.models.companion import fringes_into
 from amibayes.units import MAS, FloatArray, IntArray, SingleArray
-
-RATE_STEPS_PER_FRINGE = 4
-"""Steps in rate per λ/B_max of the place at the date farthest from the reference date."""
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
-
-
-def rates_per_axis(likelihood: Likelihood) -> int:
-    """Number of rates that are tried along east, and along north."""
-    model, samples = likelihood.model, likelihood.samples
-    if not model.moves:
-        return 1
-    fringe = 1.0 / samples.frequency.max() / MAS
-    farthest = float(np.abs(samples.years(model.reference_mjd)).max())
-    return 2 * int(np.ceil(RATE_STEPS_PER_FRINGE * model.fastest_mas_yr * farthest / fringe)) + 1
-
-
-def trial_rates(likelihood: Likelihood) -> FloatArray:
-    """Rates along east and north that are tried, mas/yr, (n, 2), symmetric about 0."""
-    fastest, n = likelihood.model.fastest_mas_yr, rates_per_axis(likelihood)
-    axis = np.linspace(-fastest, fastest, n) if n > 1 else np.zeros(1)
-    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 class TemplateBank:
@@ -92,7 +75,8 @@ class TemplateBank:
         model, samples = likelihood.model, likelihood.samples
         self.grid = grid
         self._kept: list[tuple[IntArray, FloatArray, Templates]] | None = None
-        self.n_data = likelihood.n_independent
+        self.n_data = self.n_rows = likelihood.n_independent
+        self.reduction: Reduction | None = None
         self.n_contrasts = model.n_contrasts
         self.rates_mas_yr = trial_rates(likelihood)
         self._samples, self._smearing, self._moves = samples, model.smearing, model.moves
@@ -102,8 +86,7 @@ class TemplateBank:
         self._even, self._odd, self._primary = response.even, response.odd, response.star
         self._disc = None if (response.disc == 1.0).all() else response.disc[:, None]
         self._offset = response.offset
-        both = np.intersect1d(self._even.rows, self._odd.rows, return_indices=True)
-        self._even_shared, self._odd_shared = both[1:]
+        self._find_shared()
         if beside is None:
             self.nuisance_basis = nuisance_directions(likelihood, nuisance)
         else:
@@ -121,7 +104,7 @@ class TemplateBank:
     def work(self) -> float:
         """Products that the search of one data set takes."""
         rates = len(self.rates_mas_yr) if self._moves else 1
-        return float(len(self)) * self.n_data * self.n_contrasts * rates
+        return float(len(self)) * self.n_rows * self.n_contrasts * rates
 
     @property
     def n_nuisance(self) -> int:
@@ -133,8 +116,54 @@ class TemplateBank:
         """Whether a position and its opposite predict the same: without closure phases."""
         return not len(self._odd.rows)
 
+    def _find_shared(self) -> None:
+        rows = self._even.rows, self._odd.rows
+        _, self._even_shared, self._odd_shared = np.intersect1d(*rows, return_indices=True)
+
+    def reduced(self, label: IntArray) -> Self:
+        """Make the same in the combinations of the data that templates span, where these are few.
+
+        ``label`` (n_data,) are groups of data that are not combined with each other.
+        """
+        half = len(self.grid) // 2
+        if self.joint or not half:
+            return self
+        east, north = self.grid.east_mas[:half], self.grid.north_mas[:half]
+
+        def templates(index: IntArray) -> FloatArray:
+            cosine, sine = self._waves_at(east[index], north[index])
+            out = np.zeros((2, self.n_data, len(index)))
+            out[0, self._even.rows] = self._even.matrix @ cosine - self._offset[:, None]
+            out[1, self._odd.rows] = self._odd.matrix @ sine
+            return np.hstack(list(out))
+
+        found = reduction_of(templates, half, self.nuisance_basis, label)
+        if found is None:
+            return self
+        new = copy.copy(self)
+        new.reduction, new.n_rows, new._kept = found, len(found.label), None
+        new._even, new._offset = found.of_part(self._even, self._offset, self.n_data)
+        new._odd, _ = found.of_part(self._odd, np.zeros(len(self._odd.rows)), self.n_data)
+        new.nuisance_basis = found.combined(self.nuisance_basis)
+        new._find_shared()
+        return new
+
+    def reduce(self, white: FloatArray) -> FloatArray:
+        """Whitened data (n_data, …) as the bank takes them, (n_rows, …)."""
+        return white if self.reduction is None else self.reduction(white)
+
+    def normals(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Data sets of unit normal deviates, (n_rows, n), in single precision as products are."""
+        if self.reduction is not None:
+            return self.reduction.normals(n, rng)
+        return rng.standard_normal((self.n_rows, n), dtype=np.float32).astype(float)
+
+    def added(self, noise: FloatArray, signal: FloatArray) -> FloatArray:
+        """Data sets of noise and of a signal each, (n_rows, n)."""
+        return noise + signal if self.reduction is None else self.reduction.added(noise, signal)
+
     def project(self, data: FloatArray) -> FloatArray:
-        """Take the nuisance directions out of whitened data (n_data, …)."""
+        """Take the nuisance directions out of whitened data (n_rows, …)."""
         basis = self.nuisance_basis
         return data - basis @ (basis.T @ data) if basis.size else data
 
@@ -266,7 +295,7 @@ class TemplateBank:
 
     def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
         """Yield the same of companions at rest, alike in every band; made once where they fit."""
-        if len(self) * self.n_data > 2 * NUMBERS_KEPT:
+        if len(self) * self.n_rows > 2 * NUMBERS_KEPT:
             yield from self._made()
             return
         if self._kept is None:
@@ -293,13 +322,8 @@ class TemplateBank:
         self, east_mas: FloatArray, north_mas: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Cosine and sine, (n_samples, m), of places (m,) or of moving ones (n_samples, m)."""
-        u, v = self._samples.u[:, None], self._samples.v[:, None]
-        angle = 2.0 * np.pi * MAS * (u * east_mas + v * north_mas)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        if self._smearing:
-            damping = np.sinc((0.5 / np.pi) * self._samples.relative_band[:, None] * angle)
-            cosine *= damping
-            sine *= damping
+        cosine, sine = np.empty((2, len(self._samples), np.shape(east_mas)[-1]))
+        fringes_into(cosine, sine, self._samples, east_mas, north_mas, self._smearing)
         self._seen(cosine, sine, east_mas, north_mas)
         return cosine, sine
 
@@ -365,7 +389,7 @@ class TemplateBank:
     def _in_bands(self, cosine: FloatArray, sine: FloatArray, *, mirrored: bool) -> BandTemplates:
         """Templates of each band at places and, with ``mirrored``, at their mirror images."""
         signs = np.array([1.0, -1.0] if mirrored else [1.0])
-        out = np.zeros((len(self._bands), self.n_data, len(signs) * cosine.shape[1]))
+        out = np.zeros((len(self._bands), self.n_rows, len(signs) * cosine.shape[1]))
         change = cosine - self._primary[:, None]
         for template, here in zip(out, self._bands, strict=True):
             even = self._even.matrix @ np.where(here, change, 0.0)

@@ -28,6 +28,7 @@ from amibayes.detection.treatments import (
     StudentScores,
 )
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.linear_response import companions_beside
 from amibayes.likelihood.rotation_null import rotation_null
 from amibayes.likelihood.student import SymmetricWhitening
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
@@ -196,7 +197,7 @@ class BankStatistic:
 
     def hits(self, white: FloatArray) -> Hits:
         """Search data sets, whitened residuals (n_data, n) of the fit without a companion."""
-        return self._hits(self.treatment.search(self.bank, white))
+        return self._hits(self.treatment.search(self.bank, self.bank.reduce(white)))
 
     def evaluate(self, white: FloatArray) -> FloatArray:
         """Statistic of whitened residuals (n_data, n), (n,)."""
@@ -209,16 +210,11 @@ class BankStatistic:
 
     def field(self, white: FloatArray) -> FloatArray:
         """Statistic of one data set (n_data,) everywhere, (n_grid,); its maximum is `value`."""
-        return self.ratio(*self.treatment.field(self.bank, white))
+        return self.ratio(*self.treatment.field(self.bank, self.bank.reduce(white)))
 
     def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
-        """Draw n data sets with the noise of the data, and search them; see `hits_in`.
-
-        Noise is drawn in single precision, as the products are done: a relative error of 1e-6
-        of the statistic, against a scatter between draws of tens of per cent.
-        """
-        normals = rng.standard_normal((self.bank.n_data, n), dtype=np.float32).astype(float)
-        return self.hits_in(self.noise(normals, rng), signal)
+        """Draw n data sets with the noise of the data, and search them; see `hits_in`."""
+        return self.hits_in(self.noise(self.bank.normals(n, rng), rng), signal)
 
     def noise(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Noise of data sets (n_data, n) out of unit normals; ``rng`` for what else is drawn."""
@@ -238,25 +234,24 @@ class BankStatistic:
         return Hits(self.ratio(found.gain, found.chi2), found.gain, found.position)
 
     def signal_of(self, companions: FloatArray) -> FloatArray:
-        """Whitened change of the data (n_data, n) by companions on top of the fit without one.
+        """Whitened change of the data (n_rows, n) by companions on top of the fit without one.
 
         ``companions`` (n, 3): east_mas, north_mas, contrast (the same in every band, at rest).
         """
-        return self.likelihood.noise.whiten(self.change_by(companions))
+        return self.bank.reduce(self.likelihood.noise.whiten(self.change_by(companions)))
 
     def change_by(self, companions: FloatArray) -> FloatArray:
         """Change of the data (n_data, n) by companions (n, 3), not whitened; see `signal_of`."""
         likelihood, single = self.likelihood, self.single
-        whole = likelihood.model.at_rest(companions)
-        full = np.hstack([whole, np.broadcast_to(single, (len(companions), len(single)))])
+        seen = likelihood.observe(companions_beside(likelihood, single, companions))
         alone = single_likelihood(likelihood).predict(np.atleast_2d(single))
-        return likelihood.wrapped(likelihood.predict(full) - alone)
+        return likelihood.wrapped(seen - alone)
 
     @property
     def strongest(self) -> FloatArray:
         """East and north, mas, and contrast of what the data show most of, (1, 3)."""
         at, grid = int(self.field(self.observed).argmax()), self.bank.grid
-        contrast = self.bank.scan(self.observed)[0][at]
+        contrast = self.bank.scan(self.bank.reduce(self.observed))[0][at]
         return np.array([[grid.east_mas[at], grid.north_mas[at], max(contrast, 0.0)]])
 
     def draw_null(
@@ -276,7 +271,7 @@ class BankStatistic:
         rng : numpy.random.Generator
         executor, progress, journal : optional, see `amibayes.parallel.run_job`
         """
-        sizes = pieces_of(n, self.bank.n_data)
+        sizes = pieces_of(n, self.bank.n_rows)
         pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
         work, where = partial(_null_piece, self), executor or SerialExecutor()
         done = run_job(work, pieces, where, journal=journal, progress=progress)
@@ -296,7 +291,8 @@ class BankStatistic:
 
     def with_noise_of(self, residuals: FloatArray) -> Self:
         """Make the same with the noise of other whitened residuals (n_data,)."""
-        return replace(self, treatment=self.treatment.with_noise_of(self.bank, residuals))
+        measured = self.treatment.with_noise_of(self.bank, self.bank.reduce(residuals))
+        return replace(self, treatment=measured)
 
     @property
     def null_rests_on_residuals(self) -> bool:
@@ -367,7 +363,7 @@ def make_statistic(
     fit = (single_likelihood(likelihood), single) if beside is None else (likelihood, beside)
     residual = fit[0].difference(np.atleast_2d(fit[1]))[:, 0]
     observed = likelihood.noise.whiten(residual)
-    treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)
+    bank, treatment = _treatment(likelihood, bank, observed, stated_errors, whitening)
     ratio = _ratio(likelihood, bank, known=stated_errors and whitening is None)
     return BankStatistic(likelihood, single, bank, treatment, ratio, residual)
 
@@ -378,17 +374,21 @@ def _treatment(
     observed: FloatArray,
     stated_errors: bool,
     whitening: SymmetricWhitening | None,
-) -> ErrorTreatment:
+) -> tuple[TemplateBank, ErrorTreatment]:
+    """What is known of the errors, and the bank that searches in few numbers where it can."""
     if whitening is not None:
-        return StudentScores(whitening)
+        return bank, StudentScores(whitening)
     null = rotation_null(likelihood.noise, bank.project(observed))
     if null is not None:
-        return Rotations(null)
+        return bank, Rotations(null)
     if stated_errors:
-        return KnownErrors()
+        return bank, KnownErrors()
     groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.common_rows)
     least = 1.0 if likelihood.noise.floor else 0.0
-    return FreeScale.measured(groups, bank, observed, least)
+    reduced = bank.reduced(groups.label)
+    if reduced.reduction is not None:
+        groups = replace(groups, label=reduced.reduction.label, count=groups.degrees / groups.share)
+    return reduced, FreeScale.measured(groups, reduced, reduced.reduce(observed), least)
 
 
 def _ratio(likelihood: Likelihood, bank: TemplateBank, *, known: bool) -> Ratio:

@@ -64,7 +64,7 @@ class ErrorTreatment(Protocol):
         signal : (n_data, n) float array, optional
             What is in the data beside noise, whitened.
         """
-        return self.search(bank, noise if signal is None else noise + signal)
+        return self.search(bank, noise if signal is None else bank.added(noise, signal))
 
     def noise_of(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Make noise of whitened data sets (n_data, n) out of unit normals: these as they are.
@@ -126,7 +126,7 @@ class KnownErrors(ErrorTreatment):
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""
-        return bank.scan_at(np.zeros(bank.n_data), *places.T)[1]
+        return bank.scan_at(np.zeros(bank.n_rows), *places.T)[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,12 +217,10 @@ class FreeScale(ErrorTreatment):
         gives to it, is as stated.
         """
         out = np.empty((len(self.groups.label), n))
-        for group in range(int(self.groups.label.max(initial=0)) + 1):
+        for group, degrees in enumerate(self.groups.degrees.tolist()):
             here = self.groups.label == group
             measured = float(self.scale[here][0])
-            drawn = drawn_scale(
-                measured, self.groups.share * here.sum(), n, rng, stated_probable=stated_probable
-            )
+            drawn = drawn_scale(measured, degrees, n, rng, stated_probable=stated_probable)
             out[here] = np.maximum(drawn, np.sqrt(self.least)) / measured
         return out
 

@@ -126,8 +126,7 @@ class Likelihood(Shown):
 
     def predict(self, theta: ArrayLike) -> FloatArray:
         """Model of the data: V², then closure phases in radians, (n_data, n)."""
-        visibility = self.model.visibility(self.samples, self._sets(theta))
-        return self._observe(visibility)
+        return self.observe(self.model.visibility(self.samples, self._sets(theta)))
 
     def expecting(self, theta: FloatArray) -> Likelihood:
         """The same with V² of a fit (n_dim,) as what is expected of the data.
@@ -140,7 +139,7 @@ class Likelihood(Shown):
         size2 = np.maximum(np.abs(visibility[:, 0]) ** 2, FAINTEST**2)
         vis2 = replace(
             data.vis2,
-            expected=self._observe(visibility)[: self._n2, 0],
+            expected=self.observe(visibility)[: self._n2, 0],
             coherent_slope=np.sqrt(points.squares @ (4.0 * size2)),
         )
         has_phases = self._n2 < len(data.data)
@@ -164,7 +163,7 @@ class Likelihood(Shown):
 
     def chi2_of(self, visibility: ComplexArray) -> FloatArray:
         """χ² of complex visibilities (n_samples, n) of any model, (n,)."""
-        white = self.noise.whiten(self._difference(self._observe(visibility)))
+        white = self.noise.whiten(self._difference(self.observe(visibility)))
         return np.asarray((white**2).sum(axis=0))
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
@@ -174,7 +173,7 @@ class Likelihood(Shown):
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""
         value, slopes = self.model.gradient(self.samples, self._sets(theta))
-        difference = self._difference(self._observe(value))
+        difference = self._difference(self.observe(value))
         weighted = self.noise.solve(difference)
         chi2 = (difference * weighted).sum(axis=0)
         # Reverse mode: fold the data's weights back onto the samples once, so that the
@@ -242,7 +241,8 @@ class Likelihood(Shown):
             )
         return sets
 
-    def _observe(self, visibility: ComplexArray) -> FloatArray:
+    def observe(self, visibility: ComplexArray) -> FloatArray:
+        """Data (n_data, n) of complex visibilities (n_samples, n) of any model."""
         power = self.samples.squares @ (visibility.real**2 + visibility.imag**2)
         if not self.samples.legs.shape[0]:
             return np.asarray(power)

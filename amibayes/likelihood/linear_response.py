@@ -8,7 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.likelihood.likelihood import SMALL_DISC, Likelihood
-from amibayes.units import MAS, FloatArray, IntArray
+from amibayes.models.companion import point_visibility
+from amibayes.units import MAS, ComplexArray, FloatArray, IntArray
 
 DENSE_ENOUGH = 0.15
 """Share of non-zeros above which a dense product is the faster one."""
@@ -103,3 +104,29 @@ def nuisance_directions(likelihood: Likelihood, nuisance: FloatArray) -> FloatAr
     length = np.linalg.norm(columns, axis=0)
     seen = length * (high - low) > UNSEEN
     return np.asarray(np.linalg.qr(columns[:, seen] / length[seen])[0])
+
+
+def companions_beside(
+    likelihood: Likelihood, nuisance: FloatArray, companions: FloatArray
+) -> ComplexArray:
+    """Visibilities (n_samples, n) of a star with each of some companions, not linearised.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Free discs and colours of its companions are those of a point.
+    nuisance : (n_nuisance,) float array
+        The star is made once for all.
+    companions : (n, 3) float array
+        east_mas, north_mas, contrast: at rest, alike in every band.
+    """
+    model, samples = likelihood.model, likelihood.samples
+    if samples.off_axis is not None:
+        rest = np.broadcast_to(nuisance, (len(companions), len(nuisance)))
+        return model.visibility(samples, np.hstack([model.at_rest(companions), rest]))
+    response, contrast = model.linear_response(samples, nuisance), companions[:, 2]
+    light = point_visibility(samples, companions[:, 0], companions[:, 1], model.smearing)
+    light *= np.outer(response.scale * response.disc, contrast)
+    light += (response.star + 1j * response.across)[:, None]
+    light /= 1.0 + np.outer(response.scale, contrast)
+    return light

@@ -38,9 +38,10 @@ beams of the outermost ring need not be resolved for."""
 LEAST_PER_PLACE = 2
 """Draws of noise at every place: their differences are the Monte Carlo error."""
 
-AFFORDABLE = 2.5e11
-"""Positions times data of all injected companions together: some eight seconds of one core. Large
-data on wide fields get fewer companions."""
+AFFORDABLE, SIGNAL_WORK = 1e11, 2000.0
+"""Positions times data of all injected companions together, and how many of them the visibility of
+a companion at one point is worth: some five seconds of one core. Large data on wide fields get
+fewer companions."""
 
 COMPLETENESS = 0.95
 
@@ -166,7 +167,8 @@ def _planned(
 ) -> tuple[Rings, Draws]:
     """Rings and how much noise is drawn at each place of theirs."""
     n = n_separations if separation_mas is None else len(separation_mas)
-    afforded = AFFORDABLE / (n * SEARCHES * test.bank.work)
+    work = test.bank.work + SIGNAL_WORK * len(test.likelihood.samples)
+    afforded = AFFORDABLE / (n * SEARCHES * work)
     trials = min(trials, max(int(afforded), LEAST_TRIALS))
     most = int(np.clip(trials // LEAST_PER_PLACE, 1, MOST_ANGLES))
     rings = make_rings(result, n_separations, separation_mas, most_angles=most)

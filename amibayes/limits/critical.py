@@ -197,7 +197,7 @@ def _noise(
     level = (cell + rng.uniform(size=shape)) / n_angles
     along = ndtri(level).swapaxes(1, 2).ravel()
     own = np.repeat(test.bank.templates_at(*part.places.T), draws.per_place, axis=1)
-    normals = rng.standard_normal(own.shape, dtype=np.float32).astype(float)
+    normals = test.bank.normals(len(along), rng)
     normals += own * (along - (own * normals).sum(axis=0))
     scatter = test.scatter_posterior(len(along), rng, stated_probable=draws.stated_probable)
     return test.noise(normals * scatter, rng), along

@@ -13,12 +13,12 @@ from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
 from amibayes.companion_search.field import resolution_mas
-from amibayes.companion_search.grid import make_grid
+from amibayes.companion_search.grid import make_grid, trial_rates
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
-from amibayes.companion_search.template_bank import TemplateBank, trial_rates
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.covariance import DiagonalCovariance, dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
