@@ -1,197 +1,304 @@
-"""Change operators of the package one at a time and ask whether the nearest tests notice.
+"""Change the numerical packages in one small place at a time; the nearest tests should notice.
 
-    python tests/mutation_check.py [--count 200] [--seed 1] [--workers 2] [--package likelihood …]
+    python tests/mutation_check.py WORK map                  # which test runs which line, once
+    python tests/mutation_check.py WORK run [--count 200]    # 200 changes; goes on where it stopped
+    python tests/mutation_check.py WORK again TEST …         # the survivors, with tests of today
+    python tests/mutation_check.py WORK same KEY REASON      # no behaviour differs: by hand
+    python tests/mutation_check.py WORK table
 
-Each mutant lives in a copy of the checkout of its own. The nearest tests of a module are the
-test files that import it, or else those of its package; a mutant that they all pass, within the
-time that the unchanged module allows, survives and is printed with its line. Run by hand: 200
-mutants take about an hour on two cores.
+WORK holds a copy of the checkout, the map and the record. The nearest tests of a change are those
+that run its line, those of the package's own folder first and the fastest of them first, up to
+`BUDGET` seconds of a processor; a change that they all pass survives. Run by hand: the map takes
+half an hour of a processor, 200 changes take another half.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
+import importlib
+import json
+import multiprocessing
 import os
 import resource
 import shutil
 import subprocess
 import sys
-import tempfile
+import time
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
 import numpy as np
+import pytest
+from mutants import Mutant, mutants_of, mutated
 
 ROOT = Path(__file__).resolve().parent.parent
 NUMERICAL = (
-    *("calibration", "companion_search", "cube", "data", "detection", "extraction", "likelihood"),
-    *("limits", "models", "oifits", "optics", "posterior", "scene", "simulation"),
+    *("calibration", "companion_search", "comparison", "cube", "data", "detection", "extraction"),
+    *("imaging", "kpfits", "likelihood", "limits", "models", "oifits", "optics", "posterior"),
+    *("ramps", "scene", "simulation", "survey"),
 )
-SWAPPED: dict[type[ast.AST], type[ast.AST]] = {
-    ast.Add: ast.Sub,
-    ast.Sub: ast.Add,
-    ast.Mult: ast.Div,
-    ast.Div: ast.Mult,
-    ast.Pow: ast.Mult,
-    ast.MatMult: ast.Mult,
-    ast.Lt: ast.GtE,
-    ast.LtE: ast.Gt,
-    ast.Gt: ast.LtE,
-    ast.GtE: ast.Lt,
-    ast.Eq: ast.NotEq,
-    ast.NotEq: ast.Eq,
-    ast.And: ast.Or,
-    ast.Or: ast.And,
-    ast.USub: ast.UAdd,
-    ast.BitAnd: ast.BitOr,
-    ast.BitOr: ast.BitAnd,
-}
-SECONDS = 300
-"""Longest run of the nearest tests, in time of a processor, which does not depend on what else the
-machine does; a mutant that takes longer counts as noticed."""
+BUDGET = 25.0
+"""Seconds of a processor that the nearest tests of one change may take, unchanged."""
+
+LIBRARIES = (
+    *("numpy", "scipy.stats", "scipy.optimize", "scipy.linalg", "scipy.sparse", "scipy.special"),
+    *("scipy.interpolate", "scipy.ndimage", "astropy.io.fits", "astropy.table", "astropy.time"),
+    *("astropy.coordinates", "threadpoolctl", "arviz", "matplotlib.pyplot"),
+)
+
+PATIENCE = 3.0
+"""A change that makes its tests this many times slower, and half a minute, counts as noticed."""
 
 
-@dataclass(frozen=True)
-class Mutant:
-    """One operator of one file: its place among those of the file, and its line."""
+# As a plugin of pytest, under `coverage run`: which test runs which line, and how long it takes.
 
-    path: Path
-    number: int
-    line: int
+_seconds: dict[str, float] = {}
 
 
-class _Swap(ast.NodeTransformer):
-    """Swap the operator that stands at one place among those of a file."""
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    import coverage
 
-    def __init__(self, number: int) -> None:
-        self.number, self.count, self.lines = number, 0, []
-
-    def _one(self, node: ast.AST, operator: ast.AST) -> ast.AST:
-        swapped = SWAPPED.get(type(operator))
-        if swapped is None:
-            return operator
-        self.lines.append(getattr(node, "lineno", 0))
-        self.count += 1
-        return swapped() if self.count - 1 == self.number else operator
-
-    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
-        # A union of types is no arithmetic.
-        if not (isinstance(node.op, ast.BitOr) and _is_type(node)):
-            node.op = self._one(node, node.op)
-        return self.generic_visit(node)
-
-    def visit_AugAssign(self, node: ast.AugAssign) -> ast.AST:
-        node.op = self._one(node, node.op)
-        return self.generic_visit(node)
-
-    def visit_BoolOp(self, node: ast.BoolOp) -> ast.AST:
-        node.op = self._one(node, node.op)
-        return self.generic_visit(node)
-
-    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.AST:
-        node.op = self._one(node, node.op)
-        return self.generic_visit(node)
-
-    def visit_Compare(self, node: ast.Compare) -> ast.AST:
-        node.ops = [self._one(node, operator) for operator in node.ops]
-        return self.generic_visit(node)
-
-
-def _is_type(node: ast.BinOp) -> bool:
-    sides = (node.left, node.right)
-    names = [getattr(s, "id", getattr(s, "attr", getattr(s, "value", ""))) for s in sides]
-    return None in names or any(isinstance(n, str) and n[:1].isupper() for n in names)
-
-
-def mutants_of(path: Path) -> Iterator[Mutant]:
-    """Every operator of a file that can be swapped."""
-    swap = _Swap(-1)
-    swap.visit(ast.parse(path.read_text(encoding="utf-8")))
-    for number, line in enumerate(swap.lines):
-        yield Mutant(path, number, line)
-
-
-def nearest_tests(path: Path) -> list[str]:
-    """Test files that import a module, or else all of its package's."""
-    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-    package = path.relative_to(ROOT / "amibayes").parts[0]
-    tests = sorted((ROOT / "tests").rglob("test_*.py"))
-    own = [t for t in tests if t.parent.name == package]
-    direct = [t for t in tests if module in t.read_text(encoding="utf-8")]
-    return [str(t.relative_to(ROOT)) for t in dict.fromkeys([*direct, *own])]
-
-
-def passes(folder: Path, tests: list[str]) -> bool:
-    """Whether the tests pass in a copy of the checkout."""
-    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    running = coverage.Coverage.current()
+    if running is not None:
+        running.switch_context(item.nodeid)
+    start = time.process_time()
     try:
-        done = subprocess.run(
-            command,
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            timeout=20 * SECONDS,  # for those that wait and do not work
-            preexec_fn=_limited,
+        return (yield)
+    finally:
+        _seconds[item.nodeid] = time.process_time() - start
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    if report.outcome != "passed":
+        _seconds[report.nodeid] = np.inf
+
+
+def pytest_runtest_logfinish(nodeid: str) -> None:
+    with open(os.environ["TEST_SECONDS"], "a", encoding="utf-8") as stream:
+        stream.write(json.dumps([nodeid, _seconds[nodeid]]) + "\n")
+
+
+class Work:
+    """The folder of a check: copies of the checkout, the map, the record."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.record = folder, folder / "record.jsonl"
+        self.copy, self.seconds, self.cover = (folder / n for n in ("0", "seconds", "coverage"))
+
+    def copied(self, name: str) -> Path:
+        """A copy of the checkout, made on the first call."""
+        to = self.folder / name / "checkout"
+        if not to.is_dir():
+            # Every copy is one of the first, so that all hold the same code.
+            source = ROOT if name == "0" else self.copied("0")
+            skipped = shutil.ignore_patterns(".git", ".venv*", "_build", ".*_cache", "__pycache__")
+            shutil.copytree(source, to, ignore=skipped)
+            (to.parent / "shared").symlink_to(ROOT.parent / "shared")
+        return to
+
+    def entries(self) -> dict[str, dict]:
+        """What was tried, the last word on each."""
+        if not self.record.is_file():
+            return {}
+        lines = self.record.read_text(encoding="utf-8").splitlines()
+        return {entry["key"]: entry for entry in map(json.loads, lines)}
+
+    def write(self, entry: dict) -> None:
+        with self.record.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(entry) + "\n")
+        print(
+            f"{entry['outcome']:9} {entry['key']:50} {entry['kind']:12} "
+            f"{entry['before']}  →  {entry['after']}",
+            flush=True,
         )
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode == 0
 
 
-def _limited() -> None:
-    resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
+def make_map(work: Work) -> None:
+    """Run the default suite of the numerical packages under coverage."""
+    folder = work.copied("0")
+    command = [
+        *(sys.executable, "-m", "coverage", "run", "--rcfile=/dev/null", "--source=amibayes"),
+        *(f"--data-file={work.cover}", "-m", "pytest", "-q", "-p", "no:cacheprovider"),
+        *("-p", "mutation_check", *(f"tests/{name}" for name in NUMERICAL)),
+    ]
+    environment = _environment(folder) | {"TEST_SECONDS": str(work.seconds)}
+    subprocess.run(command, cwd=folder, env=environment, check=False)
 
 
-def survives(mutant: Mutant, folders: SimpleQueue[Path]) -> bool:
-    """Run the nearest tests of a mutant in a free copy of the checkout."""
+def _environment(folder: Path) -> dict[str, str]:
+    paths = os.pathsep.join([str(folder), str(folder / "tests"), os.environ.get("PYTHONPATH", "")])
+    return os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+class Nearest:
+    """Which tests run a line, and how long they take."""
+
+    def __init__(self, work: Work) -> None:
+        import coverage
+
+        self.data = coverage.CoverageData(str(work.cover))
+        self.data.read()
+        lines = work.seconds.read_text(encoding="utf-8").splitlines()
+        self.seconds = {name: s for name, s in map(json.loads, lines) if np.isfinite(s)}
+        self.root = work.copied("0")
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Those of a change, within the budget; of code that runs on import, those of its file."""
+        by_line = self.data.contexts_by_lineno(str(self.root / mutant.path))
+        first, last = mutant.lines
+        found = {t for line, tests in by_line.items() if first <= line <= last for t in tests}
+        package = f"tests/{mutant.path.parts[1]}/"
+        order = sorted(
+            found & self.seconds.keys(), key=lambda t: (not t.startswith(package), self.seconds[t])
+        )
+        total = np.cumsum([self.seconds[t] for t in order])
+        return [t for k, t in enumerate(order) if k == 0 or total[k] <= BUDGET]
+
+
+def passes(folder: Path, tests: list[str], seconds: float) -> bool:
+    """Whether the tests pass in a copy of the checkout, in a time of a processor.
+
+    They run in a fork of this process, which has loaded the libraries: half the time if short.
+    """
+    limit = int(PATIENCE * seconds + 30.0)
+    child = multiprocessing.get_context("fork").Process(target=_child, args=(folder, tests, limit))
+    child.start()
+    child.join(10 * limit)  # for those that wait and do not work
+    if child.is_alive():
+        child.kill()
+        child.join()
+    return child.exitcode == 0
+
+
+def _child(folder: Path, tests: list[str], limit: int) -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+    os.setpgrp()
+    os.chdir(folder)
+    os.environ.update(_environment(folder))
+    sys.path[:0] = [str(folder), str(folder / "tests")]
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+        os._exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests])))
+
+
+def _load_libraries() -> None:
+    for name in LIBRARIES:
+        importlib.import_module(name)
+
+
+def tried(
+    work: Work, mutant: Mutant, tests: list[str], seconds: float, folders: SimpleQueue[Path]
+) -> None:
+    """Make one change in a free copy of the checkout, run the tests, record what they did."""
     folder = folders.get()
-    target = folder / mutant.path.relative_to(ROOT)
+    target = folder / mutant.path
     original = target.read_text(encoding="utf-8")
-    tree = _Swap(mutant.number).visit(ast.parse(original))
+    start = time.monotonic()
     try:
-        target.write_text(ast.unparse(ast.fix_missing_locations(tree)), encoding="utf-8")
-        return passes(folder, nearest_tests(mutant.path))
+        target.write_text(mutated(original, mutant.number), encoding="utf-8")
+        alive = not tests or passes(folder, tests, seconds)
     finally:
         target.write_text(original, encoding="utf-8")
         folders.put(folder)
+    work.write(
+        {
+            **{"key": _key(mutant), "kind": mutant.kind, "before": mutant.before},
+            **{"after": mutant.after, "outcome": "survived" if alive else "killed"},
+            **{"tests": len(tests), "seconds": round(time.monotonic() - start, 1)},
+        }
+    )
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+def _key(mutant: Mutant) -> str:
+    return f"{mutant.path}:{mutant.line}:{mutant.number}"
+
+
+def every_mutant(work: Work) -> dict[str, Mutant]:
+    """All changes of the numerical packages, by their keys."""
+    root = work.copied("0")
+    paths = sorted(p for name in NUMERICAL for p in (root / "amibayes" / name).rglob("*.py"))
+    return {_key(m): m for path in paths for m in mutants_of(path, root)}
+
+
+def run(work: Work, count: int, seed: int, workers: int) -> None:
+    """Try changes drawn at random, those that were not tried yet."""
+    every = every_mutant(work)
+    names, rng = list(every), np.random.default_rng(seed)
+    drawn = [names[k] for k in rng.permutation(len(names))[:count]]
+    nearest, done = Nearest(work), work.entries()
+    jobs = [(every[k], nearest.tests(every[k])) for k in drawn if k not in done]
+    _try_all(work, [(m, t, sum(nearest.seconds[n] for n in t)) for m, t in jobs], workers)
+
+
+def again(work: Work, tests: list[str], workers: int) -> None:
+    """Try the survivors with tests of the checkout as it is now."""
+    alive = [key for key, entry in work.entries().items() if entry["outcome"] == "survived"]
+    every = every_mutant(work)
+    for k in range(workers):
+        shutil.copytree(ROOT / "tests", work.copied(str(k)) / "tests", dirs_exist_ok=True)
+    _try_all(work, [(every[key], tests, 10.0 * BUDGET) for key in alive], workers)
+
+
+def _try_all(work: Work, jobs: list[tuple[Mutant, list[str], float]], workers: int) -> None:
+    _load_libraries()
+    folders: SimpleQueue[Path] = SimpleQueue()
+    for k in range(workers):
+        folders.put(work.copied(str(k)))
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda job: tried(work, *job, folders), jobs))
+
+
+def table(work: Work) -> None:
+    """Print outcomes by kind of change, and the survivors."""
+    counts: dict[str, Counter] = defaultdict(Counter)
+    for entry in work.entries().values():
+        counts[entry["kind"]][entry["outcome"]] += 1
+        counts["all"][entry["outcome"]] += 1
+    outcomes = ("killed", "same", "survived")
+    print(f"{'change':14}" + "".join(f"{name:>10}" for name in ("tried", *outcomes)))
+    for kind, row in sorted(counts.items(), key=lambda item: -sum(item[1].values())):
+        print(f"{kind:14}{sum(row.values()):10}" + "".join(f"{row[name]:10}" for name in outcomes))
+    for entry in work.entries().values():
+        if entry["outcome"] != "killed":
+            print(
+                entry["outcome"],
+                entry["key"],
+                entry["before"],
+                "→",
+                entry["after"],
+                entry.get("reason", ""),
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("work", type=lambda name: Work(Path(name).resolve()))
+    parser.add_argument("what", choices=("map", "run", "again", "same", "table"))
+    parser.add_argument("words", nargs="*")
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--package", nargs="*", default=NUMERICAL)
     options = parser.parse_args()
-    paths = [p for name in options.package for p in (ROOT / "amibayes" / name).rglob("*.py")]
-    every = [mutant for path in sorted(paths) for mutant in mutants_of(path)]
-    rng = np.random.default_rng(options.seed)
-    chosen = [every[k] for k in rng.permutation(len(every))[: options.count]]
-    folders: SimpleQueue[Path] = SimpleQueue()
-    with tempfile.TemporaryDirectory() as work:
-        for k in range(options.workers):
-            folder = Path(work) / f"{k}" / "checkout"
-            shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", ".venv*", "_build"))
-            (folder.parent / "shared").symlink_to(ROOT.parent / "shared")
-            folders.put(folder)
-        survivors = 0
-        with ThreadPoolExecutor(options.workers) as pool:
-            for mutant, alive in zip(
-                chosen, pool.map(lambda m: survives(m, folders), chosen), strict=True
-            ):
-                survivors += alive
-                text = mutant.path.read_text(encoding="utf-8").split("\n")[mutant.line - 1]
-                where = f"{mutant.path.relative_to(ROOT)}:{mutant.line} ({mutant.number})"
-                outcome = "survives" if alive else "noticed "
-                print(f"{outcome}  {where}  {text.strip()}", flush=True)
-    print(f"{len(chosen) - survivors} of {len(chosen)} mutants noticed")
-    return 0
+    work = options.work
+    if options.what == "map":
+        make_map(work)
+    elif options.what == "run":
+        run(work, options.count, options.seed, options.workers)
+    elif options.what == "again":
+        again(work, options.words, options.workers)
+    elif options.what == "same":
+        key, reason = options.words
+        work.write({**work.entries()[key], "outcome": "same", "reason": reason})
+    else:
+        table(work)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -2,8 +2,10 @@
 
 The scatter of N integrations knows N − 1 directions of p; for few of them its inverse is
 far too sure of itself. The covariance is given an inverse-Wishart prior whose mean is the
-covariance that photons and read noise make, each kind of observable with a scale of its
-own, and as many degrees of freedom as the scatter itself supports (marginal likelihood).
+covariance that photons and read noise make, each kind of observable with a scale of its own,
+and a change that all V² share (jitter, flux, gains of the holes), which photons do not make
+and which looks like a companion's contrast. Scales, shared change and degrees of freedom are
+those that the scatter itself supports best (marginal likelihood).
 """
 
 from __future__ import annotations
@@ -106,10 +108,9 @@ def shrunk_covariance(
         inner, prior, freedom = _scatter_alone(white), 0.0, float(n - p)
         scales = _scales(white @ white.T / (n - 1), groups)
     else:
-        prior, scales = _most_likely(white, groups)
-        psi = (prior - p - 1.0) * np.where(groups, scales[0], scales[1])
+        prior, scales, mean = _most_likely(white, groups, _shared(lower, basis, n_vis2))
         freedom = prior + n - p
-        inner = (np.diag(psi) + white @ white.T) / (freedom - 2.0)
+        inner = ((prior - p - 1.0) * mean + white @ white.T) / (freedom - 2.0)
     spread = basis @ lower
     matrix = spread @ inner @ spread.T
     scatter = spread @ (white @ white.T / max(n - 1, 1)) @ spread.T
@@ -133,47 +134,68 @@ def _scales(inner: FloatArray, groups: BoolArray) -> tuple[float, float]:
     return mean[0], mean[1]
 
 
-def _most_likely(white: FloatArray, groups: BoolArray) -> tuple[float, tuple[float, float]]:
-    """Prior degrees of freedom and the two scales of greatest marginal likelihood."""
+def _shared(lower: FloatArray, basis: FloatArray, n_vis2: int) -> FloatArray:
+    """Whitened direction, of length one, in which all V² change by as much, (p,)."""
+    vis2 = np.abs(basis[:, :n_vis2]).max(axis=1, initial=0.0) > 0.0
+    white = solve_triangular(lower, basis.T @ vis2.astype(float), lower=True)
+    return np.asarray(white / max(np.linalg.norm(white), 1e-300))
+
+
+def _most_likely(
+    white: FloatArray, groups: BoolArray, shared: FloatArray
+) -> tuple[float, tuple[float, float], FloatArray]:
+    """Degrees of freedom, scales and mean (p, p) of the prior of greatest marginal likelihood."""
     p, n = white.shape
     scatter = white @ white.T
     start = np.log(np.maximum(_scales(scatter / (n - 1), groups), 1e-3))
+    most = np.log(max(shared @ scatter @ shared / (n - 1), 1e-3))
     bounds = [(-2.0, np.log(MAX_FREEDOM)), *((s - 2.0, s + 2.0) for s in start)]
+    # From e⁻⁷ of the V²'s own variance, which is nothing, to well above what was measured.
+    bounds.append((start[0] - 7.0, max(most, start[0]) + 2.0))
     tries = [
         minimize(
             _loss,
-            [first, *start],
-            args=(scatter, n - 1, groups),
+            [first, *start, most - 1.0],
+            args=(scatter, n - 1, groups, shared),
             jac=True,
             bounds=bounds,
             method="L-BFGS-B",
         )
         for first in (1.0, 4.0, 7.0)
     ]
-    best = min(tries, key=lambda t: float(t.fun)).x
-    return float(p + 2.0 + np.exp(best[0])), (float(np.exp(best[1])), float(np.exp(best[2])))
+    best = np.exp(min(tries, key=lambda t: float(t.fun)).x)
+    mean = np.diag(np.where(groups, *best[1:3])) + best[3] * np.outer(shared, shared)
+    return float(p + 2.0 + best[0]), (float(best[1]), float(best[2])), mean
 
 
 def _loss(
-    at: FloatArray, scatter: FloatArray, m: int, groups: BoolArray
+    at: FloatArray, scatter: FloatArray, m: int, groups: BoolArray, shared: FloatArray
 ) -> tuple[float, FloatArray]:
     """−ln of the marginal likelihood of a scatter of m degrees of freedom, and its gradient.
 
-    ``at`` holds ln(ν0 − p − 2) and the logarithms of the two scales.
+    ``at`` holds the logarithms of ν0 − p − 2, of the two scales and of the variance shared.
     """
-    p = len(scatter)
-    nu, scale = p + 2.0 + np.exp(at[0]), np.where(groups, np.exp(at[1]), np.exp(at[2]))
-    psi = (nu - p - 1.0) * scale
-    total = np.diag(psi) + scatter
-    logdet = float(np.linalg.slogdet(total)[1])
+    p, (excess, vis2, closure, common) = len(scatter), np.exp(at)
+    nu, own = p + 2.0 + excess, np.where(groups, vis2, closure)
+    k = nu - p - 1.0
+    total = k * (np.diag(own) + common * np.outer(shared, shared)) + scatter
+    logdet, inverse = float(np.linalg.slogdet(total)[1]), np.linalg.inv(total)
+    # Of Ψ, diagonal but for one direction, by the formula of Sherman and Morrison.
+    scaled = shared / own
+    share = float(shared @ scaled)
+    lost = common / (1.0 + common * share)
+    before = p * np.log(k) + np.log(own).sum() + np.log1p(common * share)
     steps = -0.5 * np.arange(p)
     gammas = gammaln(0.5 * nu + steps) - gammaln(0.5 * (nu + m) + steps)
-    loss = gammas.sum() - 0.5 * nu * np.log(psi).sum() + 0.5 * (nu + m) * logdet
-    by_psi = 0.5 * (nu + m) * np.diag(np.linalg.inv(total)) - 0.5 * nu / psi
+    loss = gammas.sum() - 0.5 * nu * before + 0.5 * (nu + m) * logdet
     digammas = digamma(0.5 * nu + steps) - digamma(0.5 * (nu + m) + steps)
-    by_nu = 0.5 * (digammas.sum() - np.log(psi).sum() + logdet) + by_psi @ scale
-    pull = by_psi * psi
-    slope = [by_nu * np.exp(at[0]), pull[groups].sum(), pull[~groups].sum()]
+    after = 0.5 * (nu + m) * k
+    pull = after * inverse.diagonal() * own - 0.5 * nu * (1.0 - lost * scaled**2 * own)
+    along = common * (after * (shared @ inverse @ shared) - 0.5 * nu * share * (1.0 - lost * share))
+    by_nu = 0.5 * (digammas.sum() - before + logdet)
+    by_nu += (after * (inverse.diagonal() @ own + common * (shared @ inverse @ shared))) / k
+    by_nu -= 0.5 * nu * p / k
+    slope = [by_nu * excess, pull[groups].sum(), pull[~groups].sum(), along]
     return float(loss), np.array(slope)
 
 

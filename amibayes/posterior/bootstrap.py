@@ -23,13 +23,11 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import reweighted
 from amibayes.models.parameters import Box, Parameters
 from amibayes.parallel import Progress
+from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.units import (
     FloatArray,
     IntArray,
-    contrast_to_delta_mag,
-    position_angle_deg,
     read_only,
-    separation,
 )
 
 MIN_EXPOSURES = 5
@@ -64,25 +62,14 @@ class Bootstrap:
 
     def column(self, name: str) -> FloatArray:
         """Fits of a parameter, or of separation_mas, position_angle_deg or delta_mag."""
+        if name not in DERIVED:
+            return self.samples[:, self.parameters.index(name)]
         east, north = self.samples[:, self.parameters.place()].T
-        if name == "separation_mas":
-            return separation(east, north)
-        if name == "position_angle_deg":
-            return position_angle_deg(east, north)
-        if name == "delta_mag":
-            first = self.parameters.contrasts[0]
-            return contrast_to_delta_mag(np.maximum(self.samples[:, first], 1e-300))
-        return self.samples[:, self.parameters.index(name)]
+        return derived(name, east, north, self.samples[:, self.parameters.contrasts[0]])
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
         """(median, lower, upper) of a quantity; angles are cut opposite their mean."""
-        values, cut = self.column(name), 0.0
-        if name == "position_angle_deg":
-            cut = float(np.angle(np.exp(1j * np.radians(values)).mean(), deg=True)) - 180.0
-            values = (values - cut) % 360.0
-        low, mid, high = np.quantile(values, [0.5 - level / 2, 0.5, 0.5 + level / 2]) + cut
-        turn = 360.0 * (mid // 360.0) if name == "position_angle_deg" else 0.0
-        return float(mid - turn), float(low - turn), float(high - turn)
+        return interval(name, self.column(name), level)
 
 
 def bootstrap(

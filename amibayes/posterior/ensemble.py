@@ -25,6 +25,7 @@ from amibayes.posterior.chain import (
     thinning,
     times,
 )
+from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
@@ -36,17 +37,11 @@ from amibayes.support.notebook import html_table
 from amibayes.support.optional import optional_package
 from amibayes.units import (
     FloatArray,
-    contrast_to_delta_mag,
-    position_angle_deg,
-    separation,
 )
 
 START_WIDTH = 0.05
 """Longest scatter of the walkers' start, in units of the field."""
 
-
-DERIVED = ("separation_mas", "position_angle_deg", "delta_mag")
-"""Quantities that follow from the parameters of the companion."""
 
 Progress = Callable[[int, int], None]
 
@@ -111,14 +106,10 @@ class Posterior:
 
     def column(self, name: str) -> FloatArray:
         """Samples of a parameter, or of separation_mas, position_angle_deg or delta_mag."""
-        if name == "separation_mas":
-            return separation(self.column("east_mas"), self.column("north_mas"))
-        if name == "position_angle_deg":
-            return position_angle_deg(self.column("east_mas"), self.column("north_mas"))
-        if name == "delta_mag":
-            return contrast_to_delta_mag(self.column("contrast"))
         one_of("Posterior.column", "name", name, (*self.names, *DERIVED))
-        return self.samples[:, self.names.index(name)]
+        if name in self.names:
+            return self.samples[:, self.names.index(name)]
+        return derived(name, *(self.column(n) for n in ("east_mas", "north_mas", "contrast")))
 
     def interval(self, name: str, level: float = 0.68) -> tuple[float, float, float]:
         """(median, lower, upper) of a quantity.
@@ -126,13 +117,7 @@ class Posterior:
         Position angles are cut opposite their mean; the median lies in [0, 360) and the
         limits on both sides of it.
         """
-        values, cut = self.column(name), 0.0
-        if name == "position_angle_deg":
-            cut = float(np.angle(np.exp(1j * np.radians(values)).mean(), deg=True)) - 180.0
-            values = (values - cut) % 360.0
-        low, mid, high = np.quantile(values, [0.5 - level / 2, 0.5, 0.5 + level / 2]) + cut
-        turn = 360.0 * (mid // 360.0) if name == "position_angle_deg" else 0.0
-        return float(mid - turn), float(low - turn), float(high - turn)
+        return interval(name, self.column(name), level)
 
     def to_table(self) -> QTable:
         """All samples as an astropy table with units, with separation, angle and Δmag."""

@@ -283,6 +283,21 @@ def _plug_in(found, p: int) -> float:
     return (n - 1.0) / (n - p - 2.0) if found.prior_freedom == 0.0 else 1.0
 
 
+def test_what_all_vis2_share_is_learned_from_fewer_integrations_than_data(rng) -> None:
+    """Gains of the holes, which the expectation does not have, against the recipe's covariance.
+
+    The variance of the mean V², which 40 times 20 integrations know to √(2/19/40) = 5 %.
+    """
+    recipe, along = Recipe(gain=0.003), np.r_[np.ones(21), np.zeros(35)]
+    found = [
+        shrunk_covariance((d - d.mean(axis=1, keepdims=True)).T, EVEN.covariance(), basis(), 21)
+        for d in (recipe.draw(rng, 20) for _ in range(40))
+    ]
+    ratio = [along @ f.matrix @ along / (along @ recipe.covariance() @ along) for f in found]
+    # Four times that, and some percent for the prior; without the shared change it is 0.38.
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
+
+
 @pytest.mark.parametrize("n_integrations", [20, 200])
 @pytest.mark.parametrize("name", ["even", "uneven"])
 def test_intervals_cover_at_few_integrations(name: str, n_integrations: int) -> None:
@@ -292,19 +307,11 @@ def test_intervals_cover_at_few_integrations(name: str, n_integrations: int) -> 
     assert stats.binomtest(hits, 100, 0.68).pvalue > 1e-4, hits
 
 
-SHORT = "a wrong expectation and fewer integrations than data: 54 % are covered, not 68 %"
-
-
 @pytest.mark.parametrize(
     "n", [pytest.param(600, marks=pytest.mark.slow), pytest.param(2000, marks=pytest.mark.release)]
 )
 @pytest.mark.parametrize(
-    ("name", "n_integrations"),
-    [
-        *(("even", n) for n in (20, 50, 200)),
-        *(("uneven", n) for n in (50, 200)),
-        pytest.param("uneven", 20, marks=pytest.mark.xfail(strict=True, reason=SHORT)),
-    ],
+    ("name", "n_integrations"), [(name, n) for name in ("even", "uneven") for n in (20, 50, 200)]
 )
 def test_intervals_cover_in_many_trials(name: str, n_integrations: int, n: int) -> None:
     """Within the Monte Carlo error (1 %); a wrong expectation may cost 3 % beside it."""
