@@ -97,7 +97,7 @@ def shrunk_covariance(
     DataError
         Where the scatter alone is asked for and has not more than p + 2 integrations.
     """
-    lower = np.linalg.cholesky(basis.T @ physical @ basis)
+    lower = np.asarray(np.linalg.cholesky(basis.T @ physical @ basis), dtype=float)
     white = solve_triangular(lower, basis.T @ deviation.T, lower=True)
     white, block, correlation = _uncorrelated(white)
     p, n = white.shape

@@ -29,7 +29,7 @@ from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
     FITS_MODEL,
     IMPLANEIA,
-    Given,
+    Contents,
     is_product_header,
     open_products,
     product_of,
@@ -61,35 +61,6 @@ class ImageOptions:
     header: Mapping[str, Any] = field(default_factory=dict)
     maps: Mapping[str, MaskMap | None] = field(default_factory=dict)
     charges: Mapping[str, CubeMigration] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Contents:
-    """What a file holds, without its data.
-
-    Parameters
-    ----------
-    path : str
-    header : mapping
-        Of the primary HDU.
-    names : tuple of str
-        EXTNAME of every HDU, in capitals.
-    shapes : tuple of (int, ...)
-        Shape of every HDU that is an image; empty for others.
-    columns : frozenset of str
-        Names of the columns of all tables, in capitals.
-    """
-
-    path: str
-    header: Mapping[str, Any]
-    names: tuple[str, ...]
-    shapes: tuple[tuple[int, ...], ...]
-    columns: frozenset[str] = frozenset()
-
-    @property
-    def has_oifits(self) -> bool:
-        """Whether there is a table of OIFITS."""
-        return any(name.startswith("OI_") for name in self.names)
 
 
 def contents_of(path: str | Path) -> Contents:
@@ -312,15 +283,10 @@ def check_together(
     UsageError
         Where two files are of one exposure, or what is calibrated is given calibrators.
     """
-    ours, theirs = ([_given(path) for path in paths] for paths in (targets, calibrators))
+    ours, theirs = ([contents_of(path) for path in paths] for paths in (targets, calibrators))
     refuse_calibrating_again(ours, theirs)
     refuse_twice([*ours, *theirs])
     return uncalibrated(ours, theirs)
-
-
-def _given(path: str | Path) -> Given:
-    contents = contents_of(path)
-    return Given(contents.path, contents.header, contents.names, contents.columns)
 
 
 def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None) -> ImageOptions:

@@ -135,6 +135,9 @@ def test_a_table_of_the_jsdc_gives_the_diameter_in_the_band_of_the_data(path: Pa
     assert diameters_of(table, [star]) == [(0.50, 0.03)]
     infrared = replace(star, setups=(replace(setup, wavelength_m=np.array([2.2e-6])),))
     assert diameters_of(table, [infrared]) == [(0.51, 0.03)]
+    thermal = replace(star, setups=(replace(setup, wavelength_m=np.array([3.7e-6, 3.9e-6])),))
+    table.write_text("Name,LDD,e_LDD,UDDH,UDDK,UDDL,UDDM\nHD 100,0.52,0.03,0.50,0.51,0.53,0.54\n")
+    assert diameters_of(table, [thermal]) == [(0.53, 0.03)]
     table.write_text("Name,LDD\nHD 100,0.52\n")
     with pytest.raises(DataError, match="or those of the JSDC"):
         diameters_of(table, [star])

@@ -468,6 +468,11 @@ def test_motion_needs_two_dates_and_all_of_them() -> None:
     undated = epoch(mjd=0.0, source="undated.oifits")
     with pytest.raises(DataError, match=r"undated.oifits: has data without a date"):
         free(join([epoch(), undated]), motion=True)
+    once = epoch()
+    mjd = np.where(np.arange(once.n_vis2) == 3, np.nan, once.vis2.mjd)
+    one = replace(once, vis2=replace(once.vis2, mjd=mjd))
+    with pytest.raises(DataError, match="has data without a date"):
+        dates(one)
     first, last, mean = dates(three_epochs(None))
     assert (first, last) == (MJD[0], MJD[2])
     assert mean == pytest.approx(np.mean(MJD))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -181,3 +183,5 @@ def test_spread_holds_two_thirds_of_the_angles(results) -> None:
     assert ((inside.mean(axis=1) > 0.64) & (inside.mean(axis=1) < 0.72)).all()
     np.testing.assert_allclose(middle, np.median(limit.contrast_at, axis=1), rtol=0.05)
     assert "3 sigma" in limit.criterion
+    # Δχ² of noise is Gaussian about the signal's own, s, with the error 2√s: s = 3 · 2√s is 36.
+    assert "(delta chi2 36)" in replace(limit, method="closure-phase").criterion

@@ -147,6 +147,13 @@ def test_distances_and_masses_give_physical_units(tmp_path: Path) -> None:
         for o in outcomes
     ]
     assert "delta_mag" in survey_json("search", 1, without, whole=True)["completeness_au"]
+    near = [
+        Outcome(o.name, "done", row=o.row, facts={"distance_pc": pc}, detection=o.detection)
+        for o, pc in zip(outcomes, (20.0, 10.0, 40.0), strict=True)
+    ]
+    across = survey_json("search", 1, near, whole=True)["completeness_au"]["separation_au"]
+    # From 80 mas at 10 pc to 240 mas at 40 pc.
+    np.testing.assert_allclose([across[0], across[-1]], [0.8, 9.6])
 
 
 def test_a_survey_that_sees_nothing_counts_nothing() -> None:

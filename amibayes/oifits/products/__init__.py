@@ -16,7 +16,7 @@ from amibayes.oifits.products.recognise import (
 )
 from amibayes.oifits.products.repairs import Repair, repaired
 from amibayes.oifits.products.together import (
-    Given,
+    Contents,
     refuse_calibrating_again,
     refuse_twice,
     uncalibrated,
@@ -25,7 +25,7 @@ from amibayes.oifits.products.together import (
 __all__ = [
     "FITS_MODEL",
     "IMPLANEIA",
-    "Given",
+    "Contents",
     "Product",
     "Repair",
     "exposure_of",

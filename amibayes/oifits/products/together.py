@@ -11,8 +11,8 @@ from amibayes.oifits.products.recognise import exposure_of, is_normalized, is_pr
 
 
 @dataclass(frozen=True)
-class Given:
-    """A file on the command line, as far as its headers tell.
+class Contents:
+    """What a file holds, as far as its headers tell.
 
     Parameters
     ----------
@@ -20,15 +20,23 @@ class Given:
     header : mapping
         Of the primary HDU.
     names : tuple of str
-        EXTNAME of every HDU.
+        EXTNAME of every HDU, in capitals.
+    shapes : tuple of (int, ...)
+        Shape of every HDU that is an image; empty for others.
     columns : frozenset of str
-        Names of the columns of all tables.
+        Names of the columns of all tables, in capitals.
     """
 
     path: str
     header: Mapping[str, Any]
     names: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
     columns: frozenset[str] = frozenset()
+
+    @property
+    def has_oifits(self) -> bool:
+        """Whether there is a table of OIFITS."""
+        return any(name.startswith("OI_") for name in self.names)
 
     @property
     def is_ramp(self) -> bool:
@@ -46,7 +54,7 @@ class Given:
         return self.is_product and is_normalized(self.header, self.columns)
 
 
-def refuse_twice(files: Sequence[Given]) -> None:
+def refuse_twice(files: Sequence[Contents]) -> None:
     """Refuse a product, or ramps, together with another file of their exposure.
 
     Raises
@@ -69,7 +77,7 @@ def refuse_twice(files: Sequence[Given]) -> None:
                 )
 
 
-def refuse_calibrating_again(targets: Sequence[Given], calibrators: Sequence[Given]) -> None:
+def refuse_calibrating_again(targets: Sequence[Contents], calibrators: Sequence[Contents]) -> None:
     """Refuse calibrators for what the pipeline has calibrated already.
 
     Raises
@@ -86,7 +94,7 @@ def refuse_calibrating_again(targets: Sequence[Given], calibrators: Sequence[Giv
         )
 
 
-def uncalibrated(targets: Sequence[Given], calibrators: Sequence[Given]) -> tuple[str, ...]:
+def uncalibrated(targets: Sequence[Contents], calibrators: Sequence[Contents]) -> tuple[str, ...]:
     """Name the products that nobody has calibrated."""
     if calibrators:
         return ()
