@@ -126,6 +126,17 @@ def test_together_counts_rates_and_frequency() -> None:
     assert names.index("false_discovery_rate") == names.index("false_alarm_probability") + 1
 
 
+def test_false_positives_are_no_companions() -> None:
+    """Of tests at 20 %, a fifth of stars without companions are detected: f is about 0."""
+    outcomes = survey(60, np.random.default_rng(2), companions=12)
+    for outcome in outcomes:
+        outcome.row["alpha"] = 0.2
+    found = survey_json("search", 1, outcomes, whole=True)["companion_frequency"]
+    # A completeness p and 12 of 60: σ of f is √(0.2 · 0.8/60)/(p − 0.2), 0.08.
+    assert found["interval_68"][0] < 0.08
+    assert found["median"] < 0.12
+
+
 def test_distances_and_masses_give_physical_units(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     (tmp_path / "m.csv").write_text("mass_mjup,absolute_mag\n100,8\n10,14\n")
