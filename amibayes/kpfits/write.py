@@ -85,7 +85,7 @@ def of_setups(observables: Observables, chosen: BoolArray) -> Observables:
 def _hdus(observables: Observables) -> fits.HDUList:
     models = [s.kernel for s in observables.setups]
     first, table = models[0], observables.closure_phase
-    if first is None or any(m is None or m.matrix.shape != first.matrix.shape for m in models):
+    if first is None or not all(m and np.array_equal(m.matrix, first.matrix) for m in models):
         raise DataError("KPFITS holds kernel phases of one pupil", source=observables.source)
     n_frames, n, n_channels = len(models), len(first.matrix), len(observables.setups[0].band_m)
     if len(table) != n_frames * n * n_channels or table.flag.any():

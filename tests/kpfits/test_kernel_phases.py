@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from helpers import niriss
 from pupil_images import Pupil, write_kernel_file
 from scipy import stats
 
@@ -16,6 +17,7 @@ from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.companion_search.grid import make_grid
 from amibayes.data.covariance import sparse_covariance
+from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
 from amibayes.kpfits.audit import audit_kpfits
@@ -190,6 +192,10 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
     assert Likelihood(again).chi2(theta)[0] < 1e-6
     with pytest.raises(ab.DataError, match="OIFITS has no place for kernel phases"):
         ab.write_oifits(tmp_path / "c.oifits", data)
+    mirrored = kernel_observables(kernel_file(tmp_path / "m.fits", KER_MAT=PUPIL.kernel[:, ::-1]))
+    for other in (niriss(), join([data, mirrored])):
+        with pytest.raises(ab.DataError, match="kernel phases of one pupil"):
+            write_kpfits(tmp_path / "d.fits", other)
 
 
 def test_older_files_without_an_axis_of_wavelengths(tmp_path: Path) -> None:
