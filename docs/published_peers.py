@@ -62,7 +62,7 @@ class Binary:
     field : (inner, outer)
         mas.
     step_mas : float
-        Of the grid at which fits of the other programs begin, λ/B_max or less.
+        Of the grid at which fits of the other programs begin: CANDID's default is √2 λ/B_max.
     published : str
         Flux ratio.
     """
@@ -75,7 +75,7 @@ class Binary:
 
 
 BINARIES = (
-    Binary("ι Peg, MIRC, 4 telescopes", iota_peg, (1.0, 13.0), 1.0, "22–26 %"),
+    Binary("ι Peg, MIRC, 4 telescopes", iota_peg, (1.0, 13.0), 1.4, "22–26 %"),
     Binary("o Leo, GRAVITY, 20220302", lambda d: o_leo(d, "20220302"), (1.0, 10.0), 2.5, "25.4 %"),
 )
 
