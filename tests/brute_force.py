@@ -26,7 +26,7 @@ CHARA = np.array([[0, 0], [-8, 34], [125, 306], [70, 270], [-176, 216], [-69, 20
 COVERAGES = ("pionier", "gravity", "mirc4t", "mirc6t", "niriss")
 
 DRAWN = 40_000
-"""Points of which the best are fitted: some ten for each λ/B_max squared of the widest field."""
+"""At most so many points of which the best are fitted: some ten for each λ/B_max squared of the widest field."""
 
 ROUNDS, KEPT = (5, 8, 30), (0.25, 0.1)
 """Steps of the fits, and which part of them goes on after the first and the second round."""
@@ -119,13 +119,13 @@ def case(name: str, seed: int, *, smeared: bool = False, disc: bool = False) -> 
 
 
 def brute_force(case: Case, starts: int, rng: np.random.Generator) -> tuple[float, FloatArray]:
-    """Least χ² of many fits, and where: from the truth, and from the best of `DRAWN` points.
+    """Least χ² of many fits, and where: from the truth, and from the best of random points.
 
     Of every interval of the contrast as many are fitted.
     """
     work = _Fits(case)
-    drawn = work.points(DRAWN, rng)
-    parts = np.array_split(drawn, DRAWN // 2000)
+    drawn = work.points(min(DRAWN, 200 * starts), rng)
+    parts = np.array_split(drawn, len(drawn) // 2000)
     chi2 = np.concatenate([case.likelihood.chi2(part) for part in parts])
     faint = np.floor(2.0 * np.log10(np.maximum(drawn[:, 2], 1.001e-3)))
     order = np.lexsort((chi2, faint))

@@ -43,6 +43,11 @@ TRIAL_DISCS = (0.0, 0.35, 0.7)
 """Diameters of the star, in units of λ/B_max, at which the exact map is made where it is free;
 from halfway between them a local fit arrives."""
 
+ALIASES = 0.05
+"""Part of the best gain within which peaks of a map are fitted: of a mask on a lattice (NIRISS) far
+positions predict nearly the same data, a bright companion's linear map ranks them wrongly by some
+per cent, and a free disc of a companion makes up for much of what is left."""
+
 MAX_COARSE_DATA = 2000
 """Data above which local fits begin with channels averaged."""
 
@@ -180,8 +185,8 @@ def peaks(
 ) -> IntArray:
     """Positions of the highest distinct local maxima of a map, best first.
 
-    At least ``least`` (if there are as many), further ones while within `MODE_LIMIT` of the
-    best, at most ``most``.
+    At least ``least`` (if there are as many), further ones while within `MODE_LIMIT` or
+    `ALIASES` of the best, at most ``most``.
     """
     image = grid.image(gain)
     lowest = np.where(np.isnan(image), -np.inf, image)
@@ -190,8 +195,10 @@ def peaks(
     candidates = np.flatnonzero(on_grid)
     candidates = candidates[np.argsort(-gain[candidates], kind="stable")]
     chosen: list[int] = []
+    best = float(gain[candidates[0]]) if len(candidates) else 0.0
+    lowest_gain = best - max(MODE_LIMIT, ALIASES * best)
     for i in candidates:
-        enough = len(chosen) >= least and gain[i] < gain[candidates[0]] - MODE_LIMIT
+        enough = len(chosen) >= least and gain[i] < lowest_gain
         if enough or len(chosen) == most:
             break
         away = np.hypot(grid.columns[chosen] - grid.columns[i], grid.rows[chosen] - grid.rows[i])

@@ -37,3 +37,9 @@ def test_no_fit_of_many_is_better_than_the_search_by_more_than_1(
 def test_bright_companion_of_a_resolved_star_whose_size_alone_is_far_off() -> None:
     """Contrast 0.68, star of 2.1 mas, which alone would be fitted with 7.1 mas."""
     assert excess(case("pionier", 107), 40, 107) < 1.0
+
+
+@pytest.mark.parametrize("seed", [1054, 1055])
+def test_bright_companion_among_many_places_that_look_alike(seed: int) -> None:
+    """NIRISS to 3 arcsec: forty places are nearly aliases, and disc and smearing look alike."""
+    assert excess(case("niriss", seed, smeared=True, disc=True), 40, seed) < 1.0
