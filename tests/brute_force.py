@@ -26,7 +26,8 @@ CHARA = np.array([[0, 0], [-8, 34], [125, 306], [70, 270], [-176, 216], [-69, 20
 COVERAGES = ("pionier", "gravity", "mirc4t", "mirc6t", "niriss")
 
 DRAWN = 40_000
-"""At most so many points of which the best are fitted: some ten for each λ/B_max squared of the widest field."""
+"""At most so many points of which the best are fitted: some ten for each (λ/B_max)² of the widest
+field."""
 
 ROUNDS, KEPT = (5, 8, 30), (0.25, 0.1)
 """Steps of the fits, and which part of them goes on after the first and the second round."""
