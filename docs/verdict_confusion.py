@@ -3,8 +3,9 @@
     python docs/verdict_confusion.py 80 FOLDER
 
 takes 80 data sets of each kind; the answers are kept in ``FOLDER``, and the next run, of as many or
-more, goes on from them. The objects are those of `tests/detection/test_verdict.py`, whose
-visibilities come from formulas of their own; NIRISS coverage, α = 0.01, 2000 null searches.
+more, goes on from them (0: the table of what is there). The objects are those of
+`tests/detection/test_verdict.py`, whose visibilities come from formulas of their own; NIRISS
+coverage, α = 0.01, 2000 null searches.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "detection")]
 from helpers import niriss  # noqa: E402
 from pages import put_table  # noqa: E402
 from test_verdict import KINDS, Visibility, observed, points, searched, star  # noqa: E402
-from trials import Answer, answers  # noqa: E402
+from trials import Answer, answers, known_answers  # noqa: E402
 
 from amibayes.data.observables import Observables, join  # noqa: E402
 
@@ -120,13 +121,24 @@ def answer(number: int, make: Make, k: int) -> Answer:
     }
 
 
+def row_of(name: str, found: list[Answer]) -> str:
+    """A line of the table: how often each verdict is given, and how often with a caution."""
+    count = Counter(a["statement"] for a in found)
+    warned = sum(bool(a["caution"]) for a in found)
+    cells = (count["companion"] - warned, warned, *(count[s] for s in STATEMENTS[1:]))
+    return f"| {name} | {len(found)} | {' | '.join(str(c or '') for c in cells)} |"
+
+
+HEAD = ("object", "cases", "companion", "companion, with a caution", *STATEMENTS[1:])
+
+
 def main(n: int, folder: Path) -> None:
-    """Write the table."""
-    rows = [f"| object | {' | '.join(STATEMENTS)} |", "|---" * (len(STATEMENTS) + 1) + "|"]
+    """Write the table, of the answers that are there for n = 0."""
+    rows = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for number, (name, make) in enumerate(OBJECTS.items()):
-        found = answers(folder / f"{number:02d}.jsonl", n, partial(answer, number, make))
-        count = Counter(a["statement"] for a in found)
-        rows.append(f"| {name} | {' | '.join(str(count[s] or '') for s in STATEMENTS)} |")
+        path = folder / f"{number:02d}.jsonl"
+        ask = partial(answer, number, make)
+        rows.append(row_of(name, answers(path, n, ask) if n else known_answers(path)))
         print(rows[-1], flush=True)
     put_table(PAGE, rows, MARK)
 
