@@ -129,6 +129,17 @@ def test_errors_are_true(kind: str, tmp_path: Path, rng: np.random.Generator) ->
         assert 0.97 < ratio < 1.03
 
 
+def test_closure_errors_of_faint_fringes_are_those_of_their_noise(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Target and calibrator of |V| = 0.6: three phases each, of errors σ/|V| and their mean's."""
+    two = [integrations(np.full(21, 0.6 + 0j), SIGMA, 200, rng) for _ in range(2)]
+    found = read_oifits(write_product(tmp_path / "a.fits", "aminorm-oi", *two))
+    quoted = np.sqrt(found.covariance.variance[21:].mean())
+    # 2 · 200 integrations of 35 triangles tell a scatter to 1 to 4 %.
+    assert quoted == pytest.approx(np.sqrt(2 * 3 / 200) * SIGMA / 0.6, rel=0.1)
+
+
 def test_noise_bias_of_vis2_is_taken_off(tmp_path: Path, rng: np.random.Generator) -> None:
     noisy = integrations(np.full(21, 0.5 + 0j), 0.1, 400, rng)
     found = read_oifits(write_product(tmp_path / "a.fits", "amimulti-oi", noisy))
