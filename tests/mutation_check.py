@@ -118,7 +118,7 @@ class Work:
 
 
 def make_map(work: Work) -> None:
-    """Run the default suite of the numerical packages under coverage."""
+    """Run the default suite of the numerical packages' own folders under coverage."""
     folder = work.copied("0")
     command = [
         *(sys.executable, "-m", "coverage", "run", "--rcfile=/dev/null", "--source=amibayes"),
