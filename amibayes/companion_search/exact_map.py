@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.companion_search.grid import Grid
-from amibayes.companion_search.phasors import WIDTH, LatticePhasors
+from amibayes.companion_search.grid import WIDTHS, Grid
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.companion import fringes_into
 from amibayes.units import FloatArray, IntArray
 
 LADDER = (0.05, 0.12, 0.25, 0.45, 0.7, 0.95)
@@ -78,15 +78,43 @@ def _pieces(
         yield from _by_model(likelihood, grid, nuisance, contrasts)
         return
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
-    scale, star = response.scale[:, None], (response.star + 1j * response.across)[:, None]
+    scale, star, across = (
+        part[:, None] for part in (response.scale, response.star, response.across)
+    )
     wave = scale * response.disc[:, None]
     for index, cosine, sine in lattice_waves(likelihood, grid):
+        cosine *= wave
+        sine *= wave
+        # Light and flux in units of the star's and the background's: V₀ + cD·E and 1 + c.
+        if not across.any():
+            pairs = [
+                _chi2_of_pair(likelihood, star + c * cosine, c * sine, 1.0 + c * scale)
+                for c in contrasts
+            ]
+            both = np.concatenate([index, index + len(grid) // 2])
+            yield both, [np.concatenate(pair) for pair in pairs]
+            continue
         for where, sign in ((index, -1.0), (index + len(grid) // 2, 1.0)):
-            fringes = np.empty(cosine.shape, dtype=complex)
-            fringes.real, fringes.imag = wave * cosine, sign * wave * sine
-            # Light and flux in units of the star's and the background's: V₀ + cD·E and 1 + c.
-            seen = ((star + c * fringes) / (1.0 + c * scale) for c in contrasts)
+            fringes = cosine + 1j * sign * sine
+            seen = ((star + 1j * across + c * fringes) / (1.0 + c * scale) for c in contrasts)
             yield where, [likelihood.chi2_of(np.asarray(v)) for v in seen]
+
+
+def _chi2_of_pair(
+    likelihood: Likelihood, real: FloatArray, imaginary: FloatArray, flux: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """χ² of light (real − i·imaginary)/flux, (n_samples, n), and of its complex conjugate.
+
+    V² are the same, and phases change their sign.
+    """
+    points = likelihood.samples
+    power = points.squares @ ((real * real + imaginary * imaginary) / (flux * flux))
+    if not points.legs.shape[0]:
+        chi2 = likelihood.chi2_of_model(np.asarray(power))
+        return chi2, chi2
+    phase = points.legs @ np.arctan2(imaginary, real)
+    first, second = (np.concatenate([power, sign * phase]) for sign in (-1.0, 1.0))
+    return likelihood.chi2_of_model(first), likelihood.chi2_of_model(second)
 
 
 def _by_model(
@@ -95,7 +123,7 @@ def _by_model(
     """Yield the same from the model itself, which knows the response off the axis."""
     rest = np.broadcast_to(nuisance, (len(grid), len(nuisance)))
     places = np.column_stack([grid.east_mas, grid.north_mas, np.ones(len(grid))])
-    for index in np.array_split(np.arange(len(grid)), 1 + len(grid) // WIDTH):
+    for index in np.array_split(np.arange(len(grid)), 1 + len(grid) // WIDTHS[1]):
         three = [places[index] * [1.0, 1.0, c] for c in contrasts]
         sets = [np.hstack([likelihood.model.at_rest(x), rest[index]]) for x in three]
         yield index, [likelihood.chi2(theta) for theta in sets]
@@ -105,12 +133,8 @@ def lattice_waves(
     likelihood: Likelihood, grid: Grid
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Yield positions (m,) of one half plane with cosine and sine of a point's fringes."""
-    half, n = len(grid) // 2, grid.half_width
-    axis = np.linspace(-n, n, 2 * n + 1) * grid.step_mas
-    waves = LatticePhasors(likelihood.samples, axis, likelihood.model.smearing)
-    columns, rows = grid.columns[:half] + n, grid.rows[:half] + n
-    breaks = (np.diff(rows) != 0) | (np.diff(columns) != 1) | (columns[1:] % WIDTH == 0)
-    for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
-        span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
-        cosine, sine = waves(span, int(rows[index[0]]))
+    for index in grid.half_plane(len(likelihood.samples)):
+        cosine, sine = np.empty((2, len(likelihood.samples), len(index)))
+        places = grid.east_mas[index], grid.north_mas[index]
+        fringes_into(cosine, sine, likelihood.samples, *places, likelihood.model.smearing)
         yield index, cosine, sine

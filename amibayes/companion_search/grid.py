@@ -9,6 +9,10 @@ import numpy as np
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.units import MAS, FloatArray, IntArray
 
+WIDTHS, CACHED = (16, 128), 65536
+"""Fewest and most positions that are worked on at once, and numbers that fit a processor's cache,
+several times."""
+
 RATE_STEPS_PER_FRINGE = 4
 """Steps in rate per λ/B_max of the place at the date farthest from the reference date."""
 
@@ -51,6 +55,11 @@ class Grid:
     def half_width(self) -> int:
         """Number of lattice points from the star to the edge of the map."""
         return int(self.outer_mas / self.step_mas)
+
+    def half_plane(self, n_samples: int) -> list[IntArray]:
+        """Positions of one half plane, in pieces whose fringes at so many points stay in cache."""
+        half, width = np.arange(len(self) // 2), int(np.clip(CACHED // n_samples, *WIDTHS))
+        return np.split(half, range(width, len(half), width)) if len(half) else []
 
     def image(self, values: FloatArray) -> FloatArray:
         """Lay values (n,) out as a map [north, east], NaN outside the annulus."""

@@ -266,7 +266,7 @@ def global_check(
     many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
     ``coarse``, the same data or those with their channels averaged.
     """
-    residuals = single_likelihood(coarse).residuals(single)[:, 0]
+    residuals = bank.reduce(single_likelihood(coarse).residuals(single)[:, 0])
     best_at = bank.matched_filter(residuals)
 
     def inside(position: FloatArray) -> bool:

@@ -173,6 +173,7 @@ def _checked(
     coarse = coarse_likelihood(likelihood, box)
     if coarse is not likelihood:
         bank = TemplateBank(coarse, make_grid(box.inner_mas, box.outer_mas, box.fringe_mas), single)
+    bank = bank.reduced(np.zeros(bank.n_data, dtype=np.intp))
     return global_check(likelihood, coarse, bank, box, single, deviance_single)
 
 

@@ -7,9 +7,9 @@ the gain is that of the best contrasts, none below zero; where a companion moves
 tried on a lattice and the largest gain counts. The statistic of the data and of null draws
 is the same.
 
-Three facts make the grid cheap: exp(−2πi(uα + vδ)) is a product of a factor for α and one
-for δ, a position and its mirror image share everything, and the whitening is folded into
-one sparse matrix before any position is looked at.
+Three facts make the grid cheap: a position and its mirror image share everything, the whitening
+is folded into one sparse matrix before any position is looked at, and what templates of the whole
+field span are few numbers (`amibayes.companion_search.reduction`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any, Self
 import numpy as np
 
 from amibayes.companion_search.grid import Grid, trial_rates
-from amibayes.companion_search.phasors import WIDTH, LatticePhasors
 from amibayes.companion_search.reduction import Reduction, reduction_of
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.companion_search.templates import (
@@ -34,7 +33,7 @@ from amibayes.companion_search.templates import (
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
 from amibayes.models.companion import fringes_into
-from amibayes.units import MAS, FloatArray, IntArray, SingleArray
+from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
@@ -351,21 +350,11 @@ class TemplateBank:
 
         ``drift`` is how far east and north, mas, the companion has moved at each sample.
         """
-        half, n = len(self.grid) // 2, self.grid.half_width
-        axis = np.linspace(-n, n, 2 * n + 1) * self.grid.step_mas
-        u, v = self._samples.u, self._samples.v
-        turn = None if drift is None else 2.0 * np.pi * MAS * (u * drift[0] + v * drift[1])
-        waves = LatticePhasors(self._samples, axis, self._smearing, turn)
-        columns, rows = self.grid.columns[:half] + n, self.grid.rows[:half] + n
-        breaks = (np.diff(rows) != 0) | (np.diff(columns) != 1) | (columns[1:] % WIDTH == 0)
-        for index in np.split(np.arange(half), np.flatnonzero(breaks) + 1) if half else []:
-            span = slice(int(columns[index[0]]), int(columns[index[-1]]) + 1)
-            cosine, sine = waves(span, int(rows[index[0]]))
+        for index in self.grid.half_plane(len(self._samples)):
             east, north = self.grid.east_mas[index], self.grid.north_mas[index]
             if drift is not None:
                 east, north = east + drift[0][:, None], north + drift[1][:, None]
-            self._seen(cosine, sine, east, north)
-            yield index, cosine, sine
+            yield index, *self._waves_at(east, north)
 
     def _mirrored(self, cosine: FloatArray, sine: FloatArray) -> MirroredTemplates:
         """Templates of one contrast at places and at their mirror images."""

@@ -164,13 +164,10 @@ def _colouring(covariance: Covariance) -> Any:
     return np.linalg.pinv(covariance.whitening.toarray())
 
 
-def channel_covariance(
-    base: Covariance,
-    layout: ChannelLayout,
-    shares: Sequence[ChannelShare],
-    floors: Sequence[Systematics] = (),
-) -> ChannelCovariance:
-    """Correlate the channels of a covariance as the shares and floors of their files say."""
+def channel_rows(
+    layout: ChannelLayout, shares: Sequence[ChannelShare], floors: Sequence[Systematics] = ()
+) -> ChannelRows:
+    """Rows of channels that are correlated as the shares and floors of their files say."""
     by_file = {s.source: s for s in shares}
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
     for k, name in enumerate(layout.names):
@@ -179,7 +176,7 @@ def channel_covariance(
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour
     floor = floor_of_rows(layout, floors)
-    return ChannelCovariance(base, layout.turned(common, neighbour, floor))
+    return layout.turned(common, neighbour, floor)
 
 
 def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:
@@ -207,7 +204,7 @@ def noise_with_channels(
     layout = channel_layout(data)
     if not (layout.any or floors):
         return noise_of(data)
-    covariance = channel_covariance(data.covariance, layout, shares, floors)
+    covariance = ChannelCovariance(data.covariance, channel_rows(layout, shares, floors))
     return GaussianNoise(covariance, rows=covariance.rows, floor=bool(floors))
 
 

@@ -163,8 +163,12 @@ class Likelihood(Shown):
 
     def chi2_of(self, visibility: ComplexArray) -> FloatArray:
         """χ² of complex visibilities (n_samples, n) of any model, (n,)."""
-        white = self.noise.whiten(self._difference(self.observe(visibility)))
-        return np.asarray((white**2).sum(axis=0))
+        return self.chi2_of_model(self.observe(visibility))
+
+    def chi2_of_model(self, model: FloatArray) -> FloatArray:
+        """χ² of a model of the data (n_data, n), closure phases in radians, (n,)."""
+        white = self.noise.whiten(self._difference(model))
+        return np.asarray(np.einsum("dn,dn->n", white, white))
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""

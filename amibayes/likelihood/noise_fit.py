@@ -13,12 +13,13 @@ from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_noise import (
     COMMON,
+    ChannelCovariance,
     ChannelShare,
     Correlation,
-    channel_covariance,
+    channel_rows,
     correlation_of,
 )
-from amibayes.likelihood.channel_rows import ChannelLayout, channel_layout
+from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import (
     BOUND,
@@ -122,8 +123,15 @@ class _Kind:
         data = self._with(amount)
         if shared.value == 0.0 and not self.floors:
             return data.covariance
-        shares = [ChannelShare(shared, shared)]
-        return channel_covariance(data.covariance, self._layout, shares, self._own_floors)
+        if shared not in self._rows:
+            shares = [ChannelShare(shared, shared)]
+            self._rows[shared] = channel_rows(self._layout, shares, self._own_floors)
+        return ChannelCovariance(data.covariance, self._rows[shared])
+
+    @cached_property
+    def _rows(self) -> dict[Correlation, ChannelRows]:
+        """Of the shares that were tried: the amount of noise does not change them."""
+        return {}
 
     def _with(self, amount: float) -> Observables:
         """The data with an amount of extra noise, channels independent."""

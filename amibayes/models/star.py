@@ -11,7 +11,7 @@ from amibayes.models.limb_darkening import power_law_disc, power_law_slopes
 from amibayes.models.parameters import Parameter
 from amibayes.models.source import Slope, Source
 from amibayes.models.uv_points import UVPoints
-from amibayes.scene.disc import uniform_disc
+from amibayes.scene.disc import disc_visibility, uniform_disc
 from amibayes.units import FloatArray
 
 MAX_LIMB_DARKENING = 2.0
@@ -53,6 +53,8 @@ class Star:
             still = (Slope(),) * len(values)
             return Source(1.0, np.ones((len(samples), n), dtype=complex), slopes=still)
         frequency = samples.frequency[:, None]
+        if not slopes and self.limb_darkening == 0.0:
+            return Source(1.0, disc_visibility(frequency, diameter).astype(complex))
         if self.limb_darkening == 0.0:
             wave, by_diameter = uniform_disc(frequency, diameter)
             found = [by_diameter]

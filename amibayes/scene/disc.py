@@ -9,6 +9,13 @@ from scipy.special import j0, j1
 from amibayes.units import MAS, FloatArray
 
 
+def disc_visibility(frequency: FloatArray, diameter_mas: ArrayLike) -> FloatArray:
+    """Visibility 2 J1(z)/z of uniform discs; see `uniform_disc`, which costs twice as much."""
+    z = np.pi * MAS * np.asarray(frequency, dtype=float) * np.asarray(diameter_mas, dtype=float)
+    size = np.maximum(np.abs(z), 1e-8)  # where it is 1 to rounding
+    return np.asarray(2.0 * j1(size) / size)
+
+
 def uniform_disc(frequency: FloatArray, diameter_mas: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Visibility 2 J1(z)/z, z = πθ|u|, of uniform discs, and its derivative per mas.
 

@@ -278,7 +278,7 @@ def test_a_coherent_error_changes_v2_and_closure_phase_as_the_slopes_say(rng) ->
     data, points, size = likelihood.observables, likelihood.samples, 1e-5
     visibility = likelihood.model.visibility(points, np.array([[3.0]]))
     error = size * rng.standard_normal((2, len(points), 4000))
-    change = likelihood._observe(visibility + error[0] + 1j * error[1]) - likelihood._observe(
+    change = likelihood.observe(visibility + error[0] + 1j * error[1]) - likelihood.observe(
         visibility
     )
     slope = np.concatenate([data.vis2.coherent_slope, data.closure_phase.coherent_slope])
