@@ -38,6 +38,10 @@ from amibayes.units import FloatArray, IntArray, SingleArray
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
 
+UNMEASURED = 1e-12
+"""Part of a template's square that rounding leaves of one which star and background make whole:
+what is left of its data, of 1e-16, then gains nothing."""
+
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
 
 
@@ -372,8 +376,10 @@ class TemplateBank:
         if self.nuisance_basis.size:
             basis = self.nuisance_basis
             along = at_both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
+            whole = both.copy()
             both -= (along**2).sum(axis=0)
-        return both
+            return np.asarray(np.maximum(both, UNMEASURED * whole + 1e-300))
+        return np.asarray(np.maximum(both, 1e-300))
 
     def _in_bands(self, cosine: FloatArray, sine: FloatArray, *, mirrored: bool) -> BandTemplates:
         """Templates of each band at places and, with ``mirrored``, at their mirror images."""

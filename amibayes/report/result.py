@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 
 import numpy as np
@@ -289,26 +288,30 @@ def prior_json(prior: Prior, nuisance: tuple[str, ...]) -> Json:
     } | {name: list(range_) for name, range_ in zip(nuisance, prior.nuisance, strict=True)}
 
 
+PRIOR_MADE = 0.5
+"""Part of the bound by the prior alone above which a bound tells little of the data."""
+
+
 def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
     """Contrast below which a companion is, where none was detected; null where one was.
 
-    At the stated prior, and with a contrast uniform in the same range, which unlike a
-    log-uniform one does not depend on its lower end.
+    With a contrast uniform in the range of the prior: a log-uniform one gives a bound that its
+    lower end makes, as low as one likes. Null where it takes the chain's samples, which have one
+    prior, and where the data do not lower the bound of the prior alone to half.
     """
     tested, posterior, grid = report.significance, report.posterior, report.grid
-    if posterior is None or (tested is not None and tested.detected):
+    if posterior is None or grid is None or (tested is not None and tested.detected):
         return None
-    if grid is None:
-        contrast, uniform = float(np.quantile(posterior.column("contrast"), level)), math.nan
-    else:
-        contrast, uniform = grid.upper_limit(level), grid.upper_limit(level, uniform=True)
+    contrast = grid.upper_limit(level, uniform=True)
+    low, high = posterior.prior.contrast_min, posterior.prior.contrast_max
+    if contrast > PRIOR_MADE * (low + level * (high - low)):
+        return None
     return {
         "level": level,
         "contrast": contrast,
         "delta_mag": float(contrast_to_delta_mag(contrast)),
-        "contrast_uniform_prior": number(uniform),
-        "prior": posterior.prior.description,
-        "method": "chain" if grid is None else "grid",
+        "contrast_stated_prior": grid.upper_limit(level),
+        "prior": f"contrast uniform from {low:.2g} to {high:.2g}",
     }
 
 

@@ -106,3 +106,15 @@ def test_candid_n_sigma_is_plain_where_it_can_be_and_finite_elsewhere() -> None:
     assert candid_n_sigma(100.0, 33.0, 33) == pytest.approx(stats.norm.isf(p / 2))
     assert candid_n_sigma(10.0, 10.0, 33) < 1.0
     assert 1e3 < candid_n_sigma(1e9, 1e3, 1e3) < 1e5
+
+
+def test_a_template_that_the_star_makes_whole_gains_nothing(rng) -> None:
+    """Rounding leaves squares of either sign of it: neither NaN nor a gain without bounds."""
+    likelihood = Likelihood(simulated(niriss(), [0.0, 0.0, 0.0], rng))
+    bank = TemplateBank(likelihood, make_grid(50.0, 400.0, 20.0), np.empty(0))
+    bank.nuisance_basis = np.linalg.qr(rng.standard_normal((bank.n_data, bank.n_data)))[0]
+    gain, _ = bank.largest_gain(rng.standard_normal((bank.n_data, 5)).astype(np.float32))
+    assert np.isfinite(gain).all()
+    contrast, sigma = bank.scan_at(rng.standard_normal(bank.n_data), np.array([99.0]), np.zeros(1))
+    assert np.isfinite(contrast).all()
+    assert abs(contrast[0] / sigma[0]) < 1e-3

@@ -193,8 +193,8 @@ def test_no_detection_states_a_limit(content) -> None:
         "detected": False, "false_alarm_probability": 0.34, "false_alarm_interval": [0.32, 0.36],
     }  # fmt: skip
     none["posterior"]["upper_limit"] = {
-        "level": 0.95, "contrast": 0.001, "delta_mag": 7.5, "prior": "uniform in area",
-        "contrast_uniform_prior": 0.002, "method": "grid",
+        "level": 0.95, "contrast": 0.001, "delta_mag": 7.5, "prior": "contrast uniform",
+        "contrast_stated_prior": 0.002,
     }  # fmt: skip
     said = statement_of(none)
     assert said.kind == "none"
