@@ -17,13 +17,37 @@ from amibayes.support.options import PEAK_LIMIT_E, PLAN_SEPARATION_MAS, RampPres
 
 if TYPE_CHECKING:
     from amibayes.pipeline.migration_plan import MigrationExpectation
-    from amibayes.pipeline.planning import ContrastCurve, Expectation, Plan
+    from amibayes.pipeline.planning import (
+        ContrastCurve,
+        Expectation,
+        Floor,
+        FloorExpectation,
+        Plan,
+    )
 
 EPILOG = """examples:
   amibayes plan --filter F430M --photons 1e8 --mag 6
   amibayes plan --filter F380M --mag 7.5 --time 3600
   amibayes plan --filter F480M --photons 1e10 --mag 6 --preset paper
+  amibayes plan --filter F430M --photons 1e9 --mag 6 --floor drift_nm=20,calibrators=5
 """
+
+
+SEARCH = "calibrated search, 95 %"
+"""Of the line with the limit of a search."""
+
+FLOOR_NAMES = (
+    "flat",
+    "dither_mas",
+    "brightness",
+    "piston_nm",
+    "drift_nm",
+    "tilt_drift_mas",
+    "vis2",
+    "closure_deg",
+    "calibrators",
+)
+"""Of `amibayes.pipeline.plan_floor.Floor`, which is not imported to show the options."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +85,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MIN:MAX",
         help="range of the contrast curve in mas (default: 50:400)",
     )
+    parser.add_argument(
+        "--floor",
+        type=floor,
+        default="default",
+        metavar="NAME=VALUE,...",
+        help="errors that photons do not average out, for the limit of a calibrated search: flat, "
+        "dither_mas, brightness (of calibrators), piston_nm, drift_nm, tilt_drift_mas, vis2, "
+        "closure_deg, calibrators; or none (default: flat=0.001,dither_mas=15,brightness=0.5,"
+        "piston_nm=30,drift_nm=5,calibrators=3)",
+    )
     add_output_options(parser, "plan")
+
+
+def floor(text: str) -> str | dict[str, float]:
+    """Parse ``default``, ``none`` or ``NAME=VALUE,…``."""
+    if text in ("default", "none"):
+        return text
+    found = {}
+    for part in text.split(","):
+        name, equals, value = part.partition("=")
+        if not equals or name not in FLOOR_NAMES:
+            raise argparse.ArgumentTypeError(
+                f"'{part}' is not NAME=VALUE of {', '.join(FLOOR_NAMES)}"
+            )
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"'{value}' of {name} is not a number") from None
+    return found
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -89,12 +141,25 @@ def run(arguments: argparse.Namespace) -> int:
             source="--separation",
             remedy="narrow the range",
         )
-    expected = expect(plan, arguments.separation)
+    expected = expect(plan, arguments.separation, floor=_floor(arguments.floor))
     content = as_json(plan, expected, arguments.mag)
     folder = output_folder(arguments.out, ["plan.json"], overwrite=arguments.overwrite)
     write_json(folder / "plan.json", content)
     finish(arguments, content, lambda: summary(plan, expected))
     return 0
+
+
+def _floor(given: str | dict[str, float]) -> Floor | None:
+    """The floor that was asked for."""
+    from amibayes.pipeline.planning import Floor
+
+    if given == "none":
+        return None
+    whole = {} if isinstance(given, str) else dict(given)
+    count = whole.pop("calibrators", Floor.calibrators)
+    if count != int(count):
+        raise UsageError(f"{count:g} calibrators", source="--floor", remedy="a whole number")
+    return Floor(**whole, calibrators=int(count))
 
 
 def as_json(plan: Plan, expected: Expectation, magnitude: float | None) -> dict[str, Any]:
@@ -127,6 +192,7 @@ def as_json(plan: Plan, expected: Expectation, magnitude: float | None) -> dict[
         "sigma_closure_phase_photons_deg": float(np.degrees(expected.closure_phase_photons_rad)),
         "sigma_vis2": expected.vis2,
         "charge_migration": None if expected.migration is None else _migration(expected.migration),
+        "floor": None if expected.floor is None else _floor_json(expected.floor),
         "contrast_curve": _curve(expected.curve),
         "closure_phase_curve": _curve(expected.closure_curve),
         "warnings": list(plan.warnings),
@@ -141,6 +207,41 @@ def _migration(found: MigrationExpectation) -> dict[str, float | int | None]:
         "error_per_e": found.error_per_e,
         "best_groups": found.best_groups,
     }
+
+
+def _floor_json(found: FloorExpectation) -> dict[str, Any]:
+    import numpy as np
+
+    return {
+        "vis2": found.vis2,
+        "closure_phase_deg": {
+            name: float(np.degrees(value)) for name, value in found.closure_phase_rad.items()
+        },
+        "calibrated_sigma_vis2": found.calibrated_vis2,
+        "calibrated_sigma_closure_phase_deg": float(np.degrees(found.calibrated_closure_phase_rad)),
+        "separation_mas": found.separation_mas.tolist(),
+        "delta_mag": [float(m) if np.isfinite(m) else None for m in found.delta_mag],
+        "false_positive_rate": found.alpha,
+        "completeness": found.completeness,
+    }
+
+
+def _floor_lines(found: FloorExpectation | None) -> list[str]:
+    """Errors that photons do not average out, the largest first, and the errors after all."""
+    import numpy as np
+
+    if found is None:
+        return []
+    parts = [
+        f"{name} {found.vis2[name]:.1g}, {np.degrees(found.closure_phase_rad[name]):.1g} deg"
+        for name in sorted(found.vis2, key=found.vis2.__getitem__, reverse=True)
+        if found.vis2[name] or found.closure_phase_rad[name]
+    ]
+    closure = np.degrees(found.calibrated_closure_phase_rad)
+    return [
+        f"floor           {'; '.join(parts) or 'none'}",
+        f"calibrated      V² {found.calibrated_vis2:.2g}, closure phase {closure:.2g} deg",
+    ]
 
 
 def _migration_line(found: MigrationExpectation | None) -> list[str]:
@@ -171,6 +272,11 @@ def summary(plan: Plan, expected: Expectation) -> list[str]:
     groups, curve, closures = plan.groups, expected.curve, expected.closure_curve
     at = np.unique(np.linspace(0, len(curve.separation_mas) - 1, 5).astype(int))
 
+    found = expected.floor
+    reached = None
+    if found is not None:
+        reached = np.interp(curve.separation_mas, found.separation_mas, found.delta_mag)
+
     def row(name: str, values: Any) -> str:
         return f"{name:<28}" + " ".join(f"{values[k]:6.1f}" for k in at)
 
@@ -189,8 +295,10 @@ def summary(plan: Plan, expected: Expectation) -> list[str]:
         f"{degrees[1]:.4f} deg)",
         f"V²              {expected.vis2:.2g}",
         *_migration_line(expected.migration),
+        *_floor_lines(expected.floor),
         row("separation (mas)", curve.separation_mas),
         row("3σ, V² + closure phase (mag)", curve.delta_mag),
         row("3σ, closure phase (mag)", closures.delta_mag),
+        *([] if reached is None else [row(SEARCH, reached)]),
         *(f"warning: {warning}" for warning in plan.warnings),
     ]

@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amibayes.data.closure import closure_matrix
 from amibayes.extraction.preparation import SMOOTH_FLOOR
 from amibayes.instrument import ChargeMigration
-from amibayes.optics import fringe_basis
+from amibayes.optics import FringeBasis, fringe_basis
 from amibayes.ramps.curvature import expected_curvature
 from amibayes.ramps.fit import fit_migration
 from amibayes.ramps.transfer import SIDES, gains
@@ -89,21 +90,43 @@ def light_of(plan: Plan) -> FloatArray:
 
 def vis2_change(plan: Plan, detector: Detector) -> FloatArray:
     """Change of V² (n_baselines,) that a coefficient of 1 per electron makes of a point source."""
-    basis = fringe_basis(plan.instrument, star_channels(plan.instrument))
-    light = light_of(plan)
+    return migration_change(plan, detector)[: plan.instrument.mask.n_baselines]
+
+
+def migration_change(
+    plan: Plan, detector: Detector, centre_px: tuple[float, float] = (0.0, 0.0)
+) -> FloatArray:
+    """Change of V² and closure phases (rad) by a coefficient of 1 per electron, (n_data,).
+
+    Of a point source at ``centre_px`` of the middle of the image; closure phases change where
+    the pixels do not lie evenly about it.
+    """
+    basis = fringe_basis(plan.instrument, star_channels(plan.instrument), centre_px=centre_px)
+    image = np.asarray(basis.image())
+    side = round(float(np.sqrt(image.size)))
+    light = plan.count_rate_e_s * image.reshape(side, side)
     reads = detector.n_reads(plan.n_groups)
     middle = 0.5 * plan.options.frame_time_s * (reads + 1 - 2 * detector.zero_read)
     moved = gains(SIDES, middle * light, light).sum(axis=0).ravel()
-    columns = np.column_stack([plan.count_rate_e_s * basis.matrix, np.ones(light.size)])
-    # As in the extraction's own fit, the envelope has the weights, not its fringes: these would
-    # halve the bias, as migration is strongest where fringes are bright.
+    found = envelope_fit(basis) @ moved / plan.count_rate_e_s
+    n = (len(found) - 1) // 2
+    closures = closure_matrix(plan.instrument.mask.triangles)[0]
+    return np.concatenate([2.0 * (found[1 : 1 + n] - found[0]), closures @ found[1 + n :]])
+
+
+def envelope_fit(basis: FringeBasis) -> FloatArray:
+    """From an image (n_pixels,) to flux and fringes, (1 + 2 n_baselines, n_pixels).
+
+    As in the extraction's own fit, the envelope has the weights, not its fringes: these would
+    halve the bias by migration, which is strongest where fringes are bright. A pedestal is free.
+    """
+    columns = np.column_stack([basis.matrix, np.ones(len(basis.matrix))])
     envelope = np.asarray(basis.matrix[:, 0])
     weight = 1.0 / (envelope + SMOOTH_FLOOR * envelope.max())
     scale = np.sqrt((columns**2 * weight[:, None]).sum(axis=0))
     normal = (columns / scale).T @ (columns / scale * weight[:, None])
-    found = np.linalg.solve(normal, (columns / scale).T @ (weight * moved)) / scale
-    n = (len(found) - 2) // 2
-    return np.asarray(2.0 * (found[1 : 1 + n] - found[0]))
+    fit = np.linalg.solve(normal, (columns / scale).T * weight) / scale[:, None]
+    return np.asarray(fit[:-1])
 
 
 def coefficient_error(plan: Plan, detector: Detector) -> float | None:

@@ -2,8 +2,8 @@
 
 The image is a sum of envelope and fringes (the linear fringe model), every pixel has the
 variance of its slope fit, and weighted least squares gives the covariance of the complex
-visibilities, read noise included. Noise that target and calibrator share (the flat field)
-and errors of the wavefront are not in it, nor is the calibrator's own noise.
+visibilities, read noise included. What calibrators and errors that photons do not average out
+make of it, and what a search then reaches, is in `amibayes.pipeline.plan_floor`.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.optics import fringe_basis
 from amibayes.pipeline.migration_plan import MigrationExpectation, expect_migration
+from amibayes.pipeline.plan_floor import Floor, FloorExpectation, expect_floor
+from amibayes.scene.orientation import Orientation
 from amibayes.simulation import PRESETS, Detector
 from amibayes.simulation.budget import PAPER, Plan, PlanOptions, make_plan, star_channels
 from amibayes.simulation.slopes import electron_variance, slope_weights
@@ -31,7 +33,17 @@ from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import PLAN_SEPARATION_MAS
 from amibayes.units import FloatArray, contrast_to_delta_mag
 
-__all__ = ["PAPER", "ContrastCurve", "Expectation", "Plan", "PlanOptions", "expect", "make_plan"]
+__all__ = [
+    "PAPER",
+    "ContrastCurve",
+    "Expectation",
+    "Floor",
+    "FloorExpectation",
+    "Plan",
+    "PlanOptions",
+    "expect",
+    "make_plan",
+]
 
 DELTA_CHI2 = 9.0
 """3σ of the contrast at a known position."""
@@ -77,6 +89,8 @@ class Expectation:
         From closure phases alone.
     migration : MigrationExpectation, optional
         Bias by charge that passes between pixels.
+    floor : FloorExpectation, optional
+        What a calibrated search reaches, with errors that photons do not average out.
     """
 
     closure_phase_rad: float
@@ -85,6 +99,7 @@ class Expectation:
     curve: ContrastCurve
     closure_curve: ContrastCurve
     migration: MigrationExpectation | None = None
+    floor: FloorExpectation | None = None
 
 
 @checks_arguments
@@ -92,6 +107,7 @@ def expect(
     plan: Plan,
     separation_mas: tuple[float, float] = PLAN_SEPARATION_MAS,
     detector: Detector | None = None,
+    floor: Floor | None = None,
 ) -> Expectation:
     """Predict the errors and the contrast curve of a plan.
 
@@ -103,6 +119,8 @@ def expect(
         Range of the curve.
     detector : Detector, optional
         The paper's unless given.
+    floor : Floor, optional
+        Errors beside photon and read noise; without it the limits of a search are not predicted.
 
     Returns
     -------
@@ -123,13 +141,18 @@ def expect(
             remedy="a brighter star or more photons",
         )
     photons = np.sqrt(1.5) * plan.instrument.mask.n_holes / np.sqrt(plan.total_photons)
+    curve = contrast_curve(observables, separation_mas)
+    reached = None
+    if floor is not None:
+        reached = expect_floor(plan, detector, observables, separation_mas, floor)
     return Expectation(
         float(np.median(sigma_closure)),
         float(np.median(sigma_vis2)),
         float(photons),
-        contrast_curve(observables, separation_mas),
+        curve,
         contrast_curve(observables.only(("cp",)), separation_mas),
         expect_migration(plan, detector, float(np.median(sigma_vis2))),
+        reached,
     )
 
 
@@ -162,7 +185,7 @@ def expected_observables(plan: Plan, detector: Detector) -> Observables:
     covariance = jacobian @ visibility_covariance(plan, detector) @ jacobian.T
     basis = block_diag(np.eye(mask.n_baselines), kernel_basis(closures))
     blank = point_source(
-        mask.holes_m,
+        Orientation().baselines_to_sky(mask.holes_m),
         star_channels(plan.instrument).mean_m,
         bandpass.effective_width_m,
         vis2_error=1.0,

@@ -251,6 +251,8 @@ def test_numbers_that_are_none(alone: Path, tmp_path: Path, capsys) -> None:
         (
             (
                 "plan",
+                "--floor",
+                "none",
                 "--filter",
                 "F430M",
                 "--mag",

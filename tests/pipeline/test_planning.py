@@ -178,6 +178,7 @@ def test_visibility_covariance_is_positive_and_symmetric() -> None:
 
 def test_command_writes_what_it_prints(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["plan", "--filter", "F430M", "--photons", "1e8", "--mag", "6", "--out", str(tmp_path)]
+    words += ["--floor", "none"]
     assert main([*words, "--preset", "paper", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed == json.loads((tmp_path / "plan.json").read_text())

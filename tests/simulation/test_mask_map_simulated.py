@@ -104,6 +104,7 @@ def test_what_is_mapped_once_is_not_mapped_again() -> None:
 
 def test_a_plan_is_one_of_the_mask_as_built(tmp_path: Path) -> None:
     words = ["plan", "--filter", "F430M", "--photons", "1e8", "--mag", "6", "--quiet"]
+    words += ["--floor", "none"]
     plans = {}
     for preset in ("default", "paper"):
         out = tmp_path / preset
