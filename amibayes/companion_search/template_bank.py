@@ -29,6 +29,7 @@ from amibayes.companion_search.templates import (
     MirroredTemplates,
     Templates,
     at_both,
+    floored,
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
@@ -37,10 +38,6 @@ from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
-
-UNMEASURED = 1e-12
-"""Part of a template's square that rounding leaves of one which star and background make whole:
-what is left of its data, of 1e-16, then gains nothing."""
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
 
@@ -376,10 +373,8 @@ class TemplateBank:
         if self.nuisance_basis.size:
             basis = self.nuisance_basis
             along = at_both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
-            whole = both.copy()
-            both -= (along**2).sum(axis=0)
-            return np.asarray(np.maximum(both, UNMEASURED * whole + 1e-300))
-        return np.asarray(np.maximum(both, 1e-300))
+            return floored(both - (along**2).sum(axis=0), both)
+        return floored(both, both)
 
     def _in_bands(self, cosine: FloatArray, sine: FloatArray, *, mirrored: bool) -> BandTemplates:
         """Templates of each band at places and, with ``mirrored``, at their mirror images."""

@@ -190,6 +190,16 @@ class MirroredTemplates:
         return np.asarray(np.maximum(match[0], 0.0) ** 2 * ratio)
 
 
+UNMEASURED = 1e-12
+"""Part of a template's square that rounding leaves of one which star and background make whole:
+what is left of its data, of 1e-16, then gains nothing."""
+
+
+def floored(left: FloatArray, whole: FloatArray) -> FloatArray:
+    """Squares of templates of which a part was taken out, kept above what rounding makes."""
+    return np.asarray(np.maximum(left, UNMEASURED * whole + 1e-300))
+
+
 def at_both(even: NDArray[Any], odd: NDArray[Any]) -> NDArray[Any]:
     """Values at positions and at their mirror images, one after the other."""
     return np.concatenate([even + odd, even - odd], axis=-1)
