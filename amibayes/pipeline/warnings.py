@@ -76,8 +76,8 @@ def vetting_warnings(vetting: Vetting | None) -> list[str]:
     ]
 
 
-def _outliers(result: SearchResult) -> list[str]:
-    """Name the data that a robust search hardly used."""
+def _outliers(result: SearchResult, noise: ExtraNoise) -> list[str]:
+    """Name the data that a robust search hardly used, and what they do beside shared noise."""
     if result.robustness is None or not (outliers := result.robustness.outliers):
         return []
     kinds = {"vis2": "V2", "closure_phase": "closure phase"}
@@ -87,10 +87,17 @@ def _outliers(result: SearchResult) -> list[str]:
         for o in outliers[:MAX_NAMED]
     ]
     more = f" and {len(outliers) - MAX_NAMED} more" if len(outliers) > MAX_NAMED else ""
-    return [
+    found = [
         f"{len(outliers)} of {len(result.robustness.weights)} data are outliers that lost more "
         f"than three quarters of their weight: {', '.join(names)}{more}"
     ]
+    if noise.channels:
+        # A third of null sets with outliers has a probability below 0.05: docs/statistics.md.
+        found.append(
+            "with outliers among data whose channels share some of their noise the false-alarm "
+            "probability is too small: take the outliers out (--flag) and leave --robust out"
+        )
+    return found
 
 
 def _of_covariance(result: SearchResult) -> list[str]:
@@ -237,7 +244,7 @@ def search_warnings(
             f"{tested.alpha:g}: no detection is claimed or denied (give --null-draws "
             f"{draws_needed(tested.alpha)} or more)"
         )
-    found += _outliers(result)
+    found += _outliers(result, noise)
     found += _correlated(result)
     excluded = [] if posterior is None else _of_prior(result, posterior.prior)
     found += excluded
