@@ -3,7 +3,7 @@
 `docs/jwst_pipeline.py` makes the tables. A visit is a target and a calibrator of the same
 brightness, each in a ``calints`` file as `amibayes simulate` writes it. The step ``ami_analyze``
 takes 2 s of CPU for an integration, nearly all of it for the fringe model at that integration's
-centre; with ``reuse`` a model is kept for centres that agree to a hundredth of a pixel, which
+centre; with ``reuse`` a model is kept for centres that agree to a twentieth of a pixel, which
 takes a tenth of that where the pointing does not jitter.
 """
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes import Observables, analytic_limit, calibrate, load_instrument, read_oifits
+from amibayes import Observables, analytic_limit, calibrate, load_instrument
 from amibayes.extraction.reading import ImageOptions, of_one_visit, read_observations
 from amibayes.optics import PupilMap
 from amibayes.parallel import SerialExecutor
@@ -136,10 +136,10 @@ def amibayes_route(paths: Sequence[Path]) -> tuple[Observables, float]:
 def product_route(folder: Path, route: str) -> Observables:
     """Products as amibayes reads them, calibrated where the pipeline has not done it."""
     if route == "aminorm-oi":
-        return read_oifits(folder / "target_aminorm-oi.fits")
+        return read_observations([folder / "target_aminorm-oi.fits"])[0]
     psf = "" if route == "amimulti-oi" else "psf-"
     target, calibrator = (
-        read_oifits(folder / name)
+        read_observations([folder / name])[0]
         for name in (f"target_{route}.fits", f"calibrator_{psf}{route}.fits")
     )
     return calibrate([target], [calibrator], method="weighted").observables

@@ -100,19 +100,19 @@ def trials() -> list[dict[str, Any]]:
     return [json.loads(line) for line in FILE.read_text().splitlines()] if FILE.exists() else []
 
 
-def missing(kinds: tuple[str, ...]) -> Iterator[tuple[str, float, float, int]]:
+def missing(kinds: list[str], photons: list[float]) -> Iterator[tuple[str, float, float, int]]:
     """Trials that are not there, seed by seed: all cells keep nearly the same number."""
     there = {(t["kind"], t["photons"], t["ratio"], t["seed"]) for t in trials()}
     for seed in itertools.count():
-        for key in itertools.product(kinds, PHOTONS, RATIOS, (seed,)):
+        for key in itertools.product(kinds, photons, RATIOS, (seed,)):
             if key not in there:
                 yield key
 
 
-def run(minutes: float, kinds: tuple[str, ...]) -> None:
+def run(minutes: float, kinds: list[str], photons: list[float]) -> None:
     """Add trials while there is time."""
     FILE.parent.mkdir(exist_ok=True)
-    for key in missing(kinds):
+    for key in missing(kinds, photons):
         if time.process_time() > 60.0 * minutes:
             return
         before = time.process_time()
@@ -199,7 +199,7 @@ def limit_table(lines: list[dict[str, Any]]) -> list[str]:
         limit = np.array([g["limit_mag"] for g in got])
         gains = [limit[k] - limit[1] for k in (2, 3)]
         cells = [f"{m:.2f}" for m in np.median(limit, axis=1)]
-        cells += [f"{np.median(g):+.2f} ± {g.std(ddof=1) / np.sqrt(len(g)):.2f}" for g in gains]
+        cells += [f"{g.mean():+.2f} ± {g.std() / np.sqrt(max(len(g) - 1, 1)):.2f}" for g in gains]
         rows.append(f"| {photons:.0e} | {ratio:g} | {' | '.join(cells)} |")
     return rows
 
@@ -217,9 +217,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=0.0, help="CPU time for more trials")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--photons", nargs="+", type=float, default=list(PHOTONS))
     parser.add_argument("--no-tables", action="store_true", help="trials only")
     arguments = parser.parse_args()
-    run(arguments.minutes, tuple(arguments.only))
+    run(arguments.minutes, arguments.only, arguments.photons)
     if arguments.no_tables:
         return 0
     for name, table in TABLES.items():

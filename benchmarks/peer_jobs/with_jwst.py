@@ -71,11 +71,14 @@ def analyze(path, folder, throughput, nrm):
 
 
 def reuse_models():
-    """Keep the fringe model of centres that agree to a hundredth of a pixel."""
+    """Keep the fringe model of centres that agree to a twentieth of a pixel.
+
+    Sines and cosines take up what fringes are off by; the envelope is 18 pixels wide.
+    """
     make, kept = lg_model.LgModel.make_model, {}
 
     def make_model(self, fov, psf_offset=(0, 0)):
-        key = (fov, *np.round(psf_offset, 2))
+        key = (fov, *(np.round(np.multiply(psf_offset, 20.0)) / 20.0))
         if key not in kept:
             before = set(vars(self))
             make(self, fov, key[1:])
