@@ -224,7 +224,9 @@ def main() -> int:
     if arguments.no_tables:
         return 0
     for name, table in TABLES.items():
-        put_table(PAGE, table(trials()), f"{name}: docs/migration_trials.py")
+        lines = table(trials())
+        if len(lines) > len(("head", "rule")):
+            put_table(PAGE, lines, f"{name}: docs/migration_trials.py")
     return 0
 
 

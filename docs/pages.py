@@ -26,11 +26,7 @@ def put_table(page: str, lines: Sequence[str], mark: str) -> None:
     Parameters
     ----------
     page : str
-<<<<<<< HEAD
         A page of the documentation, relative to this folder.
-=======
-        Of the documentation, from its folder.
->>>>>>> 67f2f75 (The jwst package beside amibayes, positions behind the mask as built, charge migration at every depth: tables and their scripts)
     lines : sequence of str
     mark : str
         Name of the table and the script that makes it: ``table: docs/power.py``.
@@ -40,7 +36,6 @@ def put_table(page: str, lines: Sequence[str], mark: str) -> None:
     ValueError
         Where the page has no such mark.
     """
-<<<<<<< HEAD
     path = Path(__file__).parent / page
     begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->\n"
     head, found, rest = path.read_text(encoding="utf-8").partition(begin)
@@ -48,12 +43,6 @@ def put_table(page: str, lines: Sequence[str], mark: str) -> None:
     if not (found and closed):
         raise ValueError(f"{page} has no lines {begin.strip()} and {end.strip()}")
     text = "\n".join([begin, *lines, "", end])
-=======
-    path = Path(__file__).resolve().parent / page
-    head, _, rest = path.read_text(encoding="utf-8").partition(f"<!-- {mark} -->\n")
-    tail = rest.partition(f"<!-- end of {mark} -->\n")[2]
-    text = "\n".join([f"<!-- {mark} -->", "", *lines, "", f"<!-- end of {mark} -->", ""])
->>>>>>> 67f2f75 (The jwst package beside amibayes, positions behind the mask as built, charge migration at every depth: tables and their scripts)
     path.write_text(head + text + tail, encoding="utf-8")
     made_with.record(mark.partition(": ")[2].split()[0])
 
