@@ -190,8 +190,8 @@ def main(arguments: Any) -> None:
     if not arguments.table:
         run(folder, FULL, np.inf if arguments.full else arguments.minutes)
     found = {name: known_answers(file_of(folder, name)) for name in CONDITIONS}
-    answers = {name: a for name, a in found.items() if a}
-    put_table("validation.md", lines_of(answers), "table: docs/validation.py")
+    kept = {name: a for name, a in found.items() if a}
+    put_table("validation.md", lines_of(kept), "table: docs/validation.py")
 
 
 if __name__ == "__main__":

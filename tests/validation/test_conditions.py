@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trial_answers
 from conftest import script
 from poppy_stars import PoppyExposure
+from trial_answers import PLAN
 
 from amibayes import read_oifits
 from amibayes.cli import main
@@ -117,3 +119,15 @@ def test_answers_go_on_from_a_line_that_was_cut_short(tmp_path: Path) -> None:
     assert asked == [0, 1, 2, 2, 3, 4]
     assert answers(path, 2, trial) == [{"k": 0}, {"k": 1}]
     assert len(path.read_text().splitlines()) == 5
+
+
+def test_the_table_names_the_checks_that_fail_of_a_condition() -> None:
+    table = script("validation")
+
+    def row(**spoilt: float) -> str:
+        each = zip(trial_answers.answers(PLAN, 3, **spoilt), PLAN.kinds, strict=True)
+        return table.row_of("one", [answer | {"kind": kind} for answer, kind in each])
+
+    assert row().endswith("| none |")
+    assert "**68% interval of separation_mas; " in row(coverage=0.8)
+    assert row().count("|") == len(table.HEAD) + 1
