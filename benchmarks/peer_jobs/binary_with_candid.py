@@ -41,5 +41,5 @@ if __name__ == "__main__":
         value, error = float(fit["best"][name]), float(fit["uncer"][name])
         found[label] = [abs(value) if "diam" in name else value, error]
     found["reduced χ²"] = [float(fit["chi2"]), 0.0]
-    version = candid.__version__.split()[0]
+    version = sys.modules[candid.Open.__module__].__version__.split()[0]
     print(json.dumps({"found": found, "cpu_s": time.process_time() - begin, "version": version}))
