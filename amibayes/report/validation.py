@@ -137,7 +137,7 @@ def validation_pictures(validation: Validation) -> dict[str, Drawing]:
     alone = validation.false_alarm_probability[validation.of_kind("alone")]
     companions = validation.of_kind(*RANGES)
     return {
-        "ranks": rank_plot(ranks, ("East", "North", "contrast")[: len(RANKED)]),
+        "ranks": rank_plot(ranks, ("East", "North", "Contrast")[: len(RANKED)]),
         "false_alarms": alarm_plot(alone),
         "coverage": coverage_plot(coverage),
         "completeness": completeness_plot(
