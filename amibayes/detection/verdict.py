@@ -11,6 +11,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
 from amibayes.data.systematics import calibration_errors
+from amibayes.detection.alternatives import Alternative
 from amibayes.detection.caution import caution_of
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
@@ -64,6 +65,7 @@ def verdict(
     *,
     structured: bool = True,
     shape: float = 0.0,
+    other: Alternative | None = None,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -82,6 +84,9 @@ def verdict(
         `within_calibration`. Structure that is not does not speak against the model.
     shape : float
         Of `fit_probability`: `SHAPE` where noise was fitted.
+    other : Alternative, optional
+        A source without a companion that fits as well: the companion is not detected then. A star
+        that changes with wavelength is one star; light around it is outside of the model.
 
     Notes
     -----
@@ -102,6 +107,11 @@ def verdict(
         return Verdict("inconsistent data", _apart(split), p_model)
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
+    if tested.detected and other is not None:
+        against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
+        if other.kind == "chromatic star":
+            return Verdict("no companion", f"{other.words}, {against}", p_model)
+        return Verdict("model rejected", f"{other.words} {against}: compare by --models", p_model)
     if tested.detected:
         caution = caution_of(result)
         left += f"; but {caution}" if caution else ""

@@ -10,6 +10,7 @@ import numpy as np
 from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
+from amibayes.detection.alternatives import alternative
 from amibayes.detection.consistency import Consistency, consistency
 from amibayes.detection.false_alarm import Significance, draws_needed, significance
 from amibayes.detection.randomised import Randomised, randomised
@@ -156,4 +157,6 @@ def verdict_of(
     rest = structure(test, options, rng, executor)
     structured = rest.probability > options.alpha or not within_calibration(test)
     shape = SHAPE if options.extra_noise else 0.0
-    return verdict(result, tested, rest, splits, structured=structured, shape=shape), splits
+    other = alternative(result) if tested.detected else None
+    found = verdict(result, tested, rest, splits, structured=structured, shape=shape, other=other)
+    return found, splits

@@ -1,0 +1,152 @@
+"""Stars without a companion that fit the data as well as one with a companion.
+
+The null hypothesis of a search is one disc, alike at all wavelengths. Data of real stars may ask
+for more and need no companion: molecules make cool giants larger in some channels than in others,
+and discs and shells surround hot stars. Both have point symmetry, so that their closure phases are
+0 or 180°: where those of the data are not, nothing needs to be fitted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.result import SearchResult
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.extended import Extended
+from amibayes.models.limb_darkening import power_law_disc
+from amibayes.units import FloatArray
+
+CLEARLY = 10.0
+"""Δχ² by which a companion is the better explanation: odds of 150 to 1, before they pay for the
+choice among the field's positions."""
+
+MAX_NODES = 32
+"""Wavelengths at which a diameter is free, linear in between; all channels' if there are fewer."""
+
+STEPS = 40
+"""Evaluations of the Jacobian: a fit from the grey star's diameter takes 5 to 20."""
+
+LADDER = np.linspace(0.94, 1.06, 121)
+"""Factors that are tried of the diameter at one wavelength: where a baseline is at a null its
+closure phases turn by 180° at once, and a fit by slopes does not see the other side."""
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """A point-symmetric source that fits as well as a star with a companion.
+
+    Parameters
+    ----------
+    kind : {"chromatic star", "extended light"}
+    chi2 : float
+        With the noise of the search, and 1 more for each parameter beyond those of the companion's
+        model: so much a parameter takes of noise.
+    words : str
+        What it is, for the reason of a verdict.
+    """
+
+    kind: str
+    chi2: float
+    words: str
+
+
+def alternative(result: SearchResult) -> Alternative | None:
+    """The first of these sources that fits nearly as well as the best companion does, or None.
+
+    Parameters
+    ----------
+    result : SearchResult
+        With its noise. Data without V² or closure phases have no alternative.
+    """
+    likelihood, most = result.likelihood, result.chi2_binary + CLEARLY
+    data = likelihood.observables
+    both = 0 < data.n_vis2 < len(data.data)
+    if not both or symmetric_chi2(likelihood) > most:
+        return None
+    star = _chromatic_star(likelihood, result)
+    if star is not None and star.chi2 <= most:
+        return star
+    around = _extended_light(likelihood)
+    return around if around.chi2 <= most else None
+
+
+def symmetric_chi2(likelihood: Likelihood) -> float:
+    """χ² that closure phases leave at least with any point-symmetric source, its V² free.
+
+    Each phase is compared with the nearer one of 0 and 180°, kernel phases with 0. (With
+    correlated errors another choice may be better by the square of one error or so.)
+    """
+    data = likelihood.observables
+    nearest = likelihood.wrapped(2.0 * data.data) / 2.0
+    closure = np.arange(data.n_vis2, len(data.data))
+    part = likelihood.noise.covariance.select(closure)
+    return float((part.whiten(nearest[closure]) ** 2).sum())
+
+
+def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative | None:
+    """A star with a diameter of its own at several wavelengths."""
+    coloured = likelihood.with_model(
+        replace(likelihood.model, companions=0, contrast_slope="free", surroundings=())
+    )
+    points = coloured.samples
+    wavelengths = np.asarray(points.wavelength_m)
+    channels = np.unique(wavelengths)
+    grey = result.nuisance("diameter_mas")
+    if len(channels) < 3 or grey <= 0.0:
+        return None
+    nodes = np.linspace(channels[0], channels[-1], min(MAX_NODES, len(channels)))
+    exponent, background = (result.nuisance(name) for name in ("limb_darkening", "background"))
+    n_vis2 = likelihood.observables.n_vis2
+    size = np.sqrt(likelihood.noise.covariance.variance[:n_vis2])
+
+    def difference(diameters: FloatArray) -> FloatArray:
+        at = np.array([np.interp(wavelengths, nodes, one) for one in diameters.T]).T
+        wave = power_law_disc(points.frequency[:, None], at, np.array(exponent))
+        model = coloured.observe((wave / (1.0 + background)).astype(complex))
+        return coloured.wrapped(likelihood.observables.data[:, None] - model)
+
+    def by_vis2(diameters: FloatArray) -> FloatArray:
+        return np.asarray(difference(diameters[:, None])[:n_vis2, 0] / size)
+
+    def white(diameters: FloatArray) -> FloatArray:
+        return np.asarray(likelihood.noise.whiten(difference(diameters[:, None]))[:, 0])
+
+    # V² have no walls at nulls, and lead near to the right side of each.
+    bounds = (0.3 * grey, 3.0 * grey)
+    best = least_squares(by_vis2, np.full(len(nodes), grey), bounds=bounds, max_nfev=STEPS).x
+    for k in np.tile(np.arange(len(nodes)), 2):
+        tried = np.repeat(best[:, None], len(LADDER), axis=1)
+        tried[k] *= LADDER
+        chi2 = (likelihood.noise.whiten(difference(tried)) ** 2).sum(axis=0)
+        best = tried[:, np.argmin(chi2)]
+    best = np.clip(best, *bounds)
+    fit = least_squares(white, best, bounds=bounds, max_nfev=STEPS)
+    more = len(nodes) - len(result.theta)
+    words = (
+        f"a star whose diameter changes with wavelength, from {fit.x.min():.4g} to "
+        f"{fit.x.max():.4g} mas"
+    )
+    return Alternative("chromatic star", 2.0 * float(fit.cost) + max(more, 0), words)
+
+
+def _extended_light(likelihood: Likelihood) -> Alternative:
+    """An inclined Gaussian disc around the star."""
+    disc = Extended("gaussian", "halo", smearing=likelihood.model.smearing)
+    around = (*likelihood.model.surroundings, disc)
+    model = replace(likelihood.model, companions=0, surroundings=around)
+    wide = likelihood.with_model(model)
+    theta, chi2 = fit_single(wide)
+    found = dict(zip(wide.parameters.names, theta, strict=True))
+    size = found[f"halo_{disc.size}"]
+    ratio = size / resolution_mas(likelihood)
+    words = (
+        f"light around the star (an inclined disc of {size:.3g} mas, {ratio:.2g} λ/B, "
+        f"{100.0 * found['halo_flux']:.3g} % of the star's light)"
+    )
+    more = len(theta) - len(likelihood.parameters)
+    return Alternative("extended light", chi2 + max(more, 0), words)

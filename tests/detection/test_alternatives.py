@@ -1,0 +1,86 @@
+"""Stars without a companion that fit as well as one with: told from companions, by direct code."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from brute_force import coverage
+from interferometer import darkened_disc, visibilities
+
+from amibayes.companion_search.search import search
+from amibayes.data.observables import Observables
+from amibayes.detection.alternatives import alternative, symmetric_chi2
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.binary import BinaryModel
+from amibayes.units import MAS
+
+Visibility = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+MODEL = BinaryModel(diameter_mas="free", smearing=False)
+
+
+def observed(source: Visibility, seed: int, name: str = "pionier") -> Observables:
+    """Data of a source with errors of 0.01 in V² and 0.5° in closure phase."""
+    sheet = coverage(name, 0.01, np.radians(0.5))
+    both, legs = visibilities(sheet, source)
+    exact = np.concatenate([np.abs(both) ** 2, np.angle(legs.prod(axis=1))])
+    data = exact + sheet.covariance.draw(np.random.default_rng(seed), 1)[:, 0]
+    vis2, closure = np.split(data, [sheet.n_vis2])
+    return replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=vis2),
+        closure_phase=replace(sheet.closure_phase, value=closure),
+    )
+
+
+def chromatic(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+    """A star 6 % larger in a molecular band."""
+    band = np.exp(-0.5 * ((wavelength - 1.7e-6) / 0.05e-6) ** 2)
+    x = 3.5 * (1.0 + 0.06 * band)
+    return darkened_disc(1.0, 0.0, x * u, x * v) + 0j
+
+
+def halo(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    """A star with an inclined Gaussian disc of a tenth of its light."""
+    across = (np.pi * MAS * 2.5) ** 2 * (u**2 + 0.3 * v**2) / (4.0 * np.log(2.0))
+    return (darkened_disc(0.5, 0.0, u, v) + 0.1 * np.exp(-across)) / 1.1 + 0j
+
+
+def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    """A star and a companion of 3 %."""
+    shift = np.exp(-2j * np.pi * MAS * (4.0 * u - 3.0 * v))
+    return (darkened_disc(0.5, 0.0, u, v) + 0.03 * shift) / 1.03
+
+
+@pytest.mark.parametrize(
+    ("source", "kind"),
+    [(chromatic, "chromatic star"), (halo, "extended light"), (binary, None)],
+)
+def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | None) -> None:
+    """The grey star is refused by each; only the binary needs its companion."""
+    result = search(Likelihood(observed(source, 1), MODEL), (0.7, 10.0))
+    n = result.likelihood.n_independent
+    assert result.chi2_single > n + 3.0 * np.sqrt(2.0 * n)
+    found = alternative(result)
+    assert (None if found is None else found.kind) == kind
+    if found is not None:
+        assert abs(found.chi2 - n) < 4.0 * np.sqrt(2.0 * n)  # it is the true kind of source
+
+
+def test_closure_phases_of_a_symmetric_source_leave_their_noise() -> None:
+    """χ² of independent closure phases, also where the source's are 180°; more for a binary."""
+    flips = [symmetric_chi2(Likelihood(observed(chromatic, k), MODEL)) for k in range(20)]
+    likelihood = Likelihood(observed(chromatic, 0), MODEL)
+    closure = np.arange(likelihood.observables.n_vis2, len(likelihood.observables.data))
+    rank = likelihood.noise.covariance.select(closure).rank
+    assert abs(np.mean(flips) - rank) < 4.0 * np.sqrt(2.0 * rank / 20)
+    assert symmetric_chi2(Likelihood(observed(binary, 0), MODEL)) > 2.0 * rank
+
+
+def test_one_kind_of_data_has_no_alternative() -> None:
+    data = observed(halo, 1)
+    result = search(Likelihood(data.only("vis2"), MODEL), (0.7, 10.0))
+    assert result.delta_chi2 > 40.0
+    assert alternative(result) is None
