@@ -122,14 +122,14 @@ def answer(number: int, make: Make, k: int) -> Answer:
 
 
 def row_of(name: str, found: list[Answer]) -> str:
-    """A line of the table: how often each verdict is given, and how often with a caution."""
+    """A line of the table: how often each verdict is given, and how often with a note."""
     count = Counter(a["statement"] for a in found)
-    warned = sum(bool(a["caution"]) for a in found)
+    warned = sum(bool(a["note"]) for a in found)
     cells = (count["companion"] - warned, warned, *(count[s] for s in STATEMENTS[1:]))
     return f"| {name} | {len(found)} | {' | '.join(str(c or '') for c in cells)} |"
 
 
-HEAD = ("object", "cases", "companion", "companion, with a caution", *STATEMENTS[1:])
+HEAD = ("object", "cases", "companion", "companion, with a note", *STATEMENTS[1:])
 
 
 def main(n: int, folder: Path) -> None:

@@ -12,9 +12,9 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
-from amibayes.detection.caution import caution_of
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.note import note_of
 from amibayes.detection.statistic import BankStatistic
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.residuals import files_of
@@ -47,14 +47,14 @@ class Verdict:
         Probability of data that fit as badly, were the best model of the family and its noise
         the true one: the smaller one of χ² and of structure in the residuals, times two;
         structure within the errors of the calibration does not count.
-    caution : str
-        Of a companion: what else may look like it, see `caution_of`; also part of the reason.
+    note : str
+        Of a companion: what else may look like it, see `note_of`; also part of the reason.
     """
 
     statement: Statement
     because: str
     p_model: float
-    caution: str = ""
+    note: str = ""
 
 
 def verdict(
@@ -113,9 +113,9 @@ def verdict(
             return Verdict("no companion", f"{other.words}, {against}", p_model)
         return Verdict("model rejected", f"{other.words} {against}: compare by --models", p_model)
     if tested.detected:
-        caution = caution_of(result)
-        left += f"; but {caution}" if caution else ""
-        return Verdict("companion", _found(tested) + left, p_model, caution)
+        note = note_of(result)
+        left += f"; but {note}" if note else ""
+        return Verdict("companion", _found(tested) + left, p_model, note)
     return Verdict("no companion", _nothing(tested) + left, p_model)
 
 

@@ -42,7 +42,7 @@ def statement_of(content: Json) -> Statement:
     kind = {True: "found", False: "none", None: "open"}[detected]
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
     sentences = [
-        _caution(content),
+        _note(content),
         _chance(content),
         _others(content),
         _limits(content),
@@ -61,10 +61,10 @@ def _refused(content: Json) -> Statement | None:
     return Statement("open", label, because, (advice, _chance(content)))
 
 
-def _caution(content: Json) -> str:
+def _note(content: Json) -> str:
     """What else may look like the companion that is stated."""
-    caution = (content.get("verdict") or {}).get("caution", "")
-    return f"{caution[0].upper()}{caution[1:]}." if caution else ""
+    note = (content.get("verdict") or {}).get("note", "")
+    return f"{note[0].upper()}{note[1:]}." if note else ""
 
 
 def place(content: Json) -> str:

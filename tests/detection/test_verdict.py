@@ -16,9 +16,9 @@ from scipy.stats import chi2
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables, join
-from amibayes.detection.caution import caution_of
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.note import note_of
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, verdict, within_calibration
 from amibayes.likelihood.likelihood import Likelihood
@@ -131,7 +131,7 @@ def test_one_of_each_kind_is_told_for_what_it_is(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "diameter", "caution"),
+    ("place", "diameter", "note"),
     [
         ((120.0, 90.0), 55.0, ""),
         ((60.0, 45.0), 0.0, "nearer than λ/2B, 94.1 mas"),
@@ -140,18 +140,18 @@ def test_one_of_each_kind_is_told_for_what_it_is(kind: str) -> None:
     ],
 )
 def test_what_else_may_look_like_the_companion_is_stated(
-    place: tuple[float, float], diameter: float, caution: str
+    place: tuple[float, float], diameter: float, note: str
 ) -> None:
     model = BinaryModel(diameter_mas="free")
     data = simulated(niriss(), [*place, 0.1, diameter], None, model)
     result = search(Likelihood(data, model), (60.0, 300.0))
-    warned = caution_of(result)
-    assert caution in warned
-    assert bool(warned) == bool(caution)
+    warned = note_of(result)
+    assert note in warned
+    assert bool(warned) == bool(note)
     certain = Significance(100.0, np.arange(1000.0) / 100.0, 1e-3, (0.0, 4e-3), None, 0.01)
     stated = verdict(result, certain, replace(certain, probability=1.0), ())
     assert stated.statement == "companion"
-    assert stated.caution == warned
+    assert stated.note == warned
     assert stated.because.endswith(warned)
 
 

@@ -208,12 +208,12 @@ def _noted(
     also = f" and {len(group) - 1} more" if len(group) > 1 else ""
     notes = [
         f"{group[0].label}{also}: {'; '.join(said)}",
-        *(n for p in group for n in _cautions(p)),
+        *(n for p in group for n in _notes(p)),
     ]
     return replace(found, notes=(*notes, *kept))
 
 
-def _cautions(product: Product) -> list[str]:
+def _notes(product: Product) -> list[str]:
     """What a reader of the result has to know of a file."""
     found = []
     header = product.oifits.header

@@ -10,7 +10,7 @@ LARGEST_STAR_MAS = 60.0
 MNRAS 286, 957)."""
 
 
-def caution_of(result: SearchResult) -> str:
+def note_of(result: SearchResult) -> str:
     """Say why a point that fits may be no companion; empty where nothing speaks against one.
 
     A star is a uniform or darkened disc in the search. A spot on it is a point inside it; a ring
