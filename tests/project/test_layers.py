@@ -111,3 +111,10 @@ def test_folders_can_be_taken_in() -> None:
     counts = Counter(path.parent for path in PATHS.values())
     assert counts.pop(PACKAGE) <= MAX_LOOSE
     assert not {str(p.relative_to(PACKAGE)): n for p, n in counts.items() if n > MAX_IN_FOLDER}
+
+
+def test_files_of_tests_have_names_of_their_own() -> None:
+    """Two modules of one name in different folders cannot be collected together."""
+    names = Counter(path.name for path in (PACKAGE.parent / "tests").rglob("*.py"))
+    shared = {name for name, n in names.items() if n > 1}
+    assert shared <= {"__init__.py", "conftest.py"}
