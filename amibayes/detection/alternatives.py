@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
+from amibayes.likelihood.chi2 import chi2_of_part
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.extended import Extended
 from amibayes.models.limb_darkening import power_law_disc
@@ -84,8 +85,8 @@ def symmetric_chi2(likelihood: Likelihood) -> float:
     data = likelihood.observables
     nearest = likelihood.wrapped(2.0 * data.data) / 2.0
     closure = np.arange(data.n_vis2, len(data.data))
-    part = likelihood.noise.covariance.select(closure)
-    return float((part.whiten(nearest[closure]) ** 2).sum())
+    nearest[: data.n_vis2] = 0.0
+    return chi2_of_part(likelihood.noise.covariance, closure, nearest)[0]
 
 
 def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative | None:

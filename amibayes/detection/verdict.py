@@ -9,16 +9,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.covariance import Covariance
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import note_of
 from amibayes.detection.statistic import BankStatistic
-from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
 from amibayes.likelihood.residuals import files_of
-from amibayes.units import FloatArray, IntArray
 
 Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
 
@@ -144,23 +142,10 @@ def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
     for at in (np.flatnonzero(mask) for mask in masks):
         if not len(at):
             continue
-        chi2, rank = _chi2_of(covariance, at, difference)
+        chi2, rank = chi2_of_part(covariance, at, difference)
         each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
         found.append(float(weights @ each))
     return min(1.0, len(found) * min(found))
-
-
-def _chi2_of(covariance: Covariance, at: IntArray, difference: FloatArray) -> tuple[float, int]:
-    """χ² of the data ``at`` some places, and the number of independent ones among them."""
-    outside = np.ones(covariance.size)
-    outside[at] = 0.0
-    size = abs(covariance.whitening)
-    inside, beyond = size @ (1.0 - outside) > 0.0, size @ outside > 0.0
-    if not (inside & beyond).any():
-        # No error is shared with other data: their part of the whitened data is all of it.
-        return float((covariance.whiten(difference)[inside] ** 2).sum()), int(inside.sum())
-    part = covariance.select(at)
-    return float((part.whiten(difference[at]) ** 2).sum()), part.rank
 
 
 def within_calibration(test: BankStatistic) -> bool:
