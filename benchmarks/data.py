@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +41,7 @@ def niriss() -> Observables:
     )
     model = Likelihood(sheet).predict([TRUTH])[:, 0]
     model += sheet.covariance.draw(np.random.default_rng(1), 1)[:, 0]
-    vis2, closure = np.split(model, [len(sheet.vis2)])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
+    return sheet.with_data(model)
 
 
 def write_all(folder: Path) -> dict[str, Path]:

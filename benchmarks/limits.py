@@ -20,7 +20,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -145,12 +145,7 @@ def with_companion(
     """Data of a companion, with noise."""
     blank = likelihood.observables
     data = likelihood.predict(theta)[:, 0] + blank.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [blank.n_vis2])
-    return replace(
-        blank,
-        vis2=replace(blank.vis2, value=vis2),
-        closure_phase=replace(blank.closure_phase, value=closure),
-    )
+    return blank.with_data(data)
 
 
 def main() -> None:

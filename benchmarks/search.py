@@ -16,7 +16,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,12 +55,7 @@ def simulated(n_exposures: int = 50) -> Observables:
     data = join(parts)
     model = Likelihood(data, BinaryModel(diameter_mas=0.8)).predict([[6.2, -28.5, 0.009]])[:, 0]
     model += data.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(model, [len(data.vis2)])
-    return replace(
-        data,
-        vis2=replace(data.vis2, value=vis2),
-        closure_phase=replace(data.closure_phase, value=closure),
-    )
+    return data.with_data(model)
 
 
 def cpu(function, *arguments, repeat: int = 3):

@@ -26,7 +26,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -84,12 +84,7 @@ def simulated(n: int, n_companions: int, rng: np.random.Generator) -> list[Star]
             theta = [rho * np.sin(angle), rho * np.cos(angle), 10.0 ** (-0.4 * mag)]
             place = (rho, mag)
         data = likelihood.predict([theta])[:, 0] + empty.covariance.draw(rng, 1)[:, 0]
-        vis2, closure = np.split(data, [len(empty.vis2)])
-        one = replace(
-            empty,
-            vis2=replace(empty.vis2, value=vis2),
-            closure_phase=replace(empty.closure_phase, value=closure),
-        )
+        one = empty.with_data(data)
         stars.append(Star(f"star{k:05d}", one, *place))
     return stars
 

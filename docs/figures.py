@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import runpy
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,12 +115,7 @@ def aliases(path: Path) -> None:
     east, north = offset(150.0, 40.0)
     model = ab.Likelihood(data).predict([[east, north, 0.005]])[:, 0]
     model += data.covariance.draw(np.random.default_rng(3), 1)[:, 0]
-    vis2, closure = np.split(model, [len(data.vis2)])
-    seen = replace(
-        data,
-        vis2=replace(data.vis2, value=vis2),
-        closure_phase=replace(data.closure_phase, value=closure),
-    )
+    seen = data.with_data(model)
     save(detection_map(search(ab.Likelihood(seen), (50.0, 1100.0))), path)
 
 

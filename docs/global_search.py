@@ -9,7 +9,6 @@ RESULTS.jsonl, and writes the table when all are there. A run that was ended goe
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from brute_force import COVERAGES, Compared, case, compared  # noqa: E402
 from pages import put_table  # noqa: E402
+from trials import keep_answer, known_answers  # noqa: E402
 
 PAGE, MARK = "statistics.md", "table: docs/global_search.py"
 
@@ -66,8 +66,7 @@ def table(found: dict[tuple[str, int], Compared]) -> Iterator[str]:
 def main(results: Path, n: int) -> None:
     """Compare what is not in the file yet, and write the table."""
     found: dict[tuple[str, int], Compared] = {}
-    for line in results.read_text(encoding="utf-8").splitlines() if results.exists() else ():
-        row = json.loads(line)
+    for row in known_answers(results):
         found[row["name"], row["k"]] = Compared(**row["compared"])
     for k, name in product(range(n), COVERAGES):
         if (name, k) in found:
@@ -75,8 +74,7 @@ def main(results: Path, n: int) -> None:
         begin = time.process_time()
         found[name, k] = one(name, k)
         row = {"name": name, "k": k, "compared": vars(found[name, k])}
-        with results.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row | {"cpu_s": time.process_time() - begin}) + "\n")
+        keep_answer(results, row | {"cpu_s": time.process_time() - begin})
     put_table(PAGE, list(table(found)), MARK)
 
 

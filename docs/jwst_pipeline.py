@@ -16,15 +16,16 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import json
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pages import put_table
+from trials import keep_answer, known_answers
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "oifits")]
@@ -71,13 +72,11 @@ def visit(kind: str, seed: int) -> Visit:
 
 def trials(kind: str) -> list[dict[str, Any]]:
     """Visits of a kind that are there."""
-    lines = FILE.read_text().splitlines() if FILE.exists() else []
-    return [t for t in map(json.loads, lines) if t["kind"] == kind]
+    return [t for t in known_answers(FILE) if t["kind"] == kind]
 
 
 def run(environments: Path, minutes: float, kinds: list[str], most: int) -> None:
     """Add visits, the kinds in turn, while there is time."""
-    FILE.parent.mkdir(exist_ok=True)
     start, seed = time.monotonic(), 0
     while seed < most:
         for kind in kinds:
@@ -87,17 +86,20 @@ def run(environments: Path, minutes: float, kinds: list[str], most: int) -> None
                 continue
             with tempfile.TemporaryDirectory() as name:
                 done = trial(visit(kind, seed), Path(name), environments, KINDS[kind][2])
-            line = json.dumps({"kind": kind, "seed": seed, **done}, default=float)
-            with FILE.open("a", encoding="utf-8") as file:
-                file.write(line + "\n")
+            keep_answer(FILE, {"kind": kind, "seed": seed, **done})
             print(kind, seed, done["seconds"], flush=True)
         seed += 1
 
 
-def columns(kind: str, way: str) -> dict[str, np.ndarray]:
-    """Numbers of the visits of a kind by a route."""
-    got = [t["ways"][way] for t in trials(kind) if way in t["ways"]]
-    return {key: np.array([g[key] for g in got]) for key in (got[0] if got else ())}
+def measured(
+    kind: str, ways: Iterable[str] = ROUTES
+) -> Iterator[tuple[str, str, dict[str, np.ndarray]]]:
+    """Label, name and numbers of every route that visits of a kind have gone."""
+    there = trials(kind)
+    for way in ways:
+        got = [t["ways"][way] for t in there if way in t["ways"]]
+        if got:
+            yield LABELS[way], way, {key: np.array([g[key] for g in got]) for key in got[0]}
 
 
 def star_table() -> list[str]:
@@ -107,10 +109,7 @@ def star_table() -> list[str]:
         "| stated (deg) | bias (deg) |",
         f"|{'---|' * 8}",
     ]
-    for way, label in LABELS.items():
-        got = columns("stars", way)
-        if not got:
-            continue
+    for label, _, got in measured("stars", LABELS):
         cells = [
             f"{figure:.2g}"
             for name, truth in (("vis2", 1.0), ("closure", 0.0))
@@ -135,14 +134,11 @@ def limit_table() -> list[str]:
     rows = [f"| route | {marks} | CPU seconds for an integration |", f"|{'---|' * 5}"]
     seconds = [t["seconds"] for t in trials("stars")]
     n = 2 * KINDS["stars"][0]
-    for way in ROUTES:
-        got = columns("stars", way)
-        if not got:
-            continue
+    for label, way, got in measured("stars"):
         name = "amibayes" if way == "calints" else "analyze"
         each = np.median([s[name] for s in seconds]) / n
         cells = [f"{mag:.2f}" for mag in np.median(got["limit_mag"], axis=0)]
-        rows.append(f"| {LABELS[way]} | {' | '.join(cells)} | {each:.2g} |")
+        rows.append(f"| {label} | {' | '.join(cells)} | {each:.2g} |")
     return rows
 
 
@@ -154,10 +150,7 @@ def binary_table() -> list[str]:
         f"|{'---|' * 6}",
         f"| truth | | {SEPARATION_MAS:g} | {ANGLE_DEG:g} | {100 * CONTRAST:g} | |",
     ]
-    for way in ROUTES:
-        got = columns("binaries", way)
-        if not got:
-            continue
+    for label, _, got in measured("binaries"):
         names = (("separation_mas", 1.0), ("position_angle_deg", 1.0), ("contrast_stated", 100.0))
         cells = [mean_and_error(scale * got[name]) for name, scale in names]
         stated = [
@@ -169,7 +162,7 @@ def binary_table() -> list[str]:
             )
         ]
         n = len(got["near"])
-        rows.append(f"| {LABELS[way]} | {n} | {' | '.join(cells)} | {', '.join(stated)} |")
+        rows.append(f"| {label} | {n} | {' | '.join(cells)} | {', '.join(stated)} |")
     return rows
 
 
@@ -180,15 +173,12 @@ def pull_table() -> list[str]:
         "within 1σ (all three) | within 2σ |",
         f"|{'---|' * 8}",
     ]
-    for way in ROUTES:
-        got = columns("routes", way)
-        if not got:
-            continue
+    for label, _, got in measured("routes"):
         near = got["near"].astype(bool)
         pulls = np.stack([got[name][near] for name in ("east", "north", "contrast")])
         each = " | ".join(f"{rms(p):.2f}" for p in pulls)
         rows.append(
-            f"| {LABELS[way]} | {near.sum()} of {len(near)} | {each} | {pulls[2].mean():+.2f} | "
+            f"| {label} | {near.sum()} of {len(near)} | {each} | {pulls[2].mean():+.2f} | "
             f"{(abs(pulls) < 1).mean():.2f} | {(abs(pulls) < 2).mean():.2f} |"
         )
     return rows

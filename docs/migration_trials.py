@@ -16,7 +16,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
 import itertools
-import json
 import sys
 import tempfile
 import time
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from pages import put_table
+from trials import keep_answer, known_answers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -95,14 +95,9 @@ def single(data: Observables, seed: int) -> dict[str, float]:
     }
 
 
-def trials() -> list[dict[str, Any]]:
-    """What there is already."""
-    return [json.loads(line) for line in FILE.read_text().splitlines()] if FILE.exists() else []
-
-
 def missing(kinds: list[str], photons: list[float]) -> Iterator[tuple[str, float, float, int]]:
     """Trials that are not there, seed by seed: all cells keep nearly the same number."""
-    there = {(t["kind"], t["photons"], t["ratio"], t["seed"]) for t in trials()}
+    there = {(t["kind"], t["photons"], t["ratio"], t["seed"]) for t in known_answers(FILE)}
     for seed in itertools.count():
         for key in itertools.product(kinds, photons, RATIOS, (seed,)):
             if key not in there:
@@ -111,14 +106,11 @@ def missing(kinds: list[str], photons: list[float]) -> Iterator[tuple[str, float
 
 def run(minutes: float, kinds: list[str], photons: list[float]) -> None:
     """Add trials while there is time."""
-    FILE.parent.mkdir(exist_ok=True)
     for key in missing(kinds, photons):
         if time.process_time() > 60.0 * minutes:
             return
         before = time.process_time()
-        line = json.dumps(trial(*key), default=float)
-        with FILE.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
+        keep_answer(FILE, trial(*key))
         print(*key, f"{time.process_time() - before:.1f} s", flush=True)
 
 
@@ -224,7 +216,7 @@ def main() -> int:
     if arguments.no_tables:
         return 0
     for name, table in TABLES.items():
-        lines = table(trials())
+        lines = table(known_answers(FILE))
         if len(lines) > len(("head", "rule")):
             put_table(PAGE, lines, f"{name}: docs/migration_trials.py")
     return 0

@@ -1,6 +1,6 @@
 """Limits that `plan` predicts against those that simulated, calibrated searches reach.
 
-    python docs/plan_floor.py [FOLDER] [PHOTONS...]
+    python docs/plan_floor.py
 
 For each number of photons a star and three calibrators of half its brightness are simulated in
 images, extracted, calibrated and searched, and the limits of the search (95 % recovered at a
@@ -9,16 +9,15 @@ its floor. Integrations are put together, 25 to an exposure, with the charge, th
 the migration between pixels of as many as they stand for: their statistics are the same and the
 10⁴ images of 10¹⁰ photons need not be drawn. Of charge migration the images have what the error of
 the instrument's value leaves, and extraction attaches that error, as it does.
-Writes plan_floor.md, in some 10 minutes of one core.
+Writes the table of command_line.md, in some 10 minutes of one core.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+from pages import put_table
 
 from amibayes import Observables, calibrate, detection_limit, load_instrument
 from amibayes.cube import Cube
@@ -146,8 +145,8 @@ def compared(photons: float, seed: int = 1) -> Row:
     )
 
 
-def table(rows: list[Row]) -> str:
-    """The comparison in Markdown."""
+def table(rows: list[Row]) -> list[str]:
+    """The lines of the comparison."""
     lines = [
         "| photons | 3σ, photon noise alone | plan with floor | simulated searches | plan − search "
         "(each of them) |",
@@ -160,17 +159,16 @@ def table(rows: list[Row]) -> str:
             f"| 10^{np.log10(row.photons):.0f} | {means[0]:.2f} | {means[1]:.2f} | {means[2]:.2f} "
             f"| {np.nanmean(off):+.2f} ({', '.join(f'{x:+.2f}' for x in off)}) |"
         )
-    return "\n".join(lines) + "\n"
+    return lines
 
 
-def main(folder: Path, photons: tuple[float, ...]) -> None:
+def main() -> None:
     rows = []
-    for n in photons:
+    for n in PHOTONS:
         rows.append(compared(n))
-        print(table(rows[-1:]).splitlines()[-1], flush=True)
-    (folder / "plan_floor.md").write_text(table(rows), encoding="utf-8")
+        print(table(rows[-1:])[-1], flush=True)
+    put_table("command_line.md", table(rows), "table: docs/plan_floor.py")
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(Path(given[0] if given else "."), tuple(float(n) for n in given[1:]) or PHOTONS)
+    main()

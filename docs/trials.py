@@ -16,6 +16,13 @@ def known_answers(path: Path) -> list[Answer]:
     return [json.loads(line) for line in lines]
 
 
+def keep_answer(path: Path, answer: Answer) -> None:
+    """Put one more answer into a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(answer, default=float) + "\n")
+
+
 def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
     """Give the answers of trials 0 to n − 1: those of the file, then new ones, put there at once.
 
@@ -32,6 +39,5 @@ def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
     path.write_text(whole, encoding="utf-8")
     for k in range(len(known), n):
         known.append(trial(k))
-        with path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(known[-1]) + "\n")
+        keep_answer(path, known[-1])
     return known[:n]

@@ -6,7 +6,7 @@ their optimiser is that of Levenberg and Marquardt, written here for many starts
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from helpers import niriss
@@ -105,12 +105,7 @@ def case(name: str, seed: int, *, smeared: bool = False, disc: bool = False) -> 
     both = names.index("diameter_mas"), names.index("companion_diameter_mas")
     truth[list(both)] = np.array(sizes) * resolution_mas(free)
     data = free.predict([truth])[:, 0] + sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [sheet.n_vis2])
-    noisy = replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
+    noisy = sheet.with_data(data)
     model = BinaryModel(
         diameter_mas=0.0 if point else "free", companion_diameter_mas="free" if disc else 0.0
     )

@@ -45,9 +45,4 @@ def noisy(sheet: Observables, truth, rng) -> Observables:
     data = Likelihood(sheet).predict([truth])[:, 0]
     if rng is not None:
         data = data + sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [len(sheet.vis2)])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
+    return sheet.with_data(data)

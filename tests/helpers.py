@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -60,12 +59,8 @@ def simulated(
     data = likelihood.predict([theta])[:, 0]
     if rng is not None:
         data = data + sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [len(sheet.vis2)])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure + shift_closure),
-    )
+    data[len(sheet.vis2) :] += shift_closure
+    return sheet.with_data(data)
 
 
 def error_of(capsys: pytest.CaptureFixture[str]) -> str:

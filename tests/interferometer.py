@@ -74,3 +74,16 @@ def visibilities(
     wavelength = closure.wavelength_m[:, None]
     sides = [np.column_stack([x, -x.sum(axis=1)]) / wavelength for x in (closure.u_m, closure.v_m)]
     return source(u, v, vis2.wavelength_m), source(*sides, wavelength)
+
+
+def observed(
+    sheet: Observables,
+    source: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    rng: np.random.Generator | None = None,
+) -> Observables:
+    """Data of a source as for `visibilities`, with noise of the sheet's (none without rng)."""
+    both, sides = visibilities(sheet, source)
+    data = np.concatenate([np.abs(both) ** 2, np.angle(sides.prod(axis=1))])
+    if rng is not None:
+        data = data + sheet.covariance.draw(rng, 1)[:, 0]
+    return sheet.with_data(data)

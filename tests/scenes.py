@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import interferometer
 import numpy as np
 
 from amibayes.data.observables import Observables
@@ -39,28 +38,16 @@ def spiral(n: int = 1500) -> Points:
 SCENES = {"disc": disc, "ring with companion": ring_with_companion, "spiral": spiral}
 
 
-def visibility(points: Points, u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
-    """Of a star of flux 1 with the points, at one wavelength each."""
+def visibility(points: Points, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Of a star of flux 1 with the points, at spatial frequencies in 1/rad."""
     east, north, light = points
-    turns = np.outer(u / wavelength, east * MAS) + np.outer(v / wavelength, north * MAS)
+    turns = np.multiply.outer(u, east * MAS) + np.multiply.outer(v, north * MAS)
     return (1.0 + np.exp(-2j * np.pi * turns) @ light) / (1.0 + light.sum())
 
 
 def observed(sheet: Observables, points: Points, rng: np.random.Generator | None) -> Observables:
     """Values that a scene gives, with noise of the sheet's covariance (none without rng)."""
-    v2, cp = sheet.vis2, sheet.closure_phase
-    one = visibility(points, v2.u_m[:, 0], v2.v_m[:, 0], v2.wavelength_m)
-    legs = [
-        visibility(points, u, v, cp.wavelength_m)
-        for u, v in zip(
-            (*cp.u_m.T, cp.u_m.sum(axis=1)), (*cp.v_m.T, cp.v_m.sum(axis=1)), strict=True
-        )
-    ]
-    data = np.concatenate([np.abs(one) ** 2, np.angle(legs[0] * legs[1] * legs[2].conj())])
-    if rng is not None:
-        data = data + sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(data, [len(v2)])
-    return replace(sheet, vis2=replace(v2, value=vis2), closure_phase=replace(cp, value=closure))
+    return interferometer.observed(sheet, lambda u, v, _: visibility(points, u, v), rng)
 
 
 def binned(points: Points, n: int, pixel_mas: float) -> np.ndarray:

@@ -231,6 +231,15 @@ class Observables:
             shared=None if self.shared is None else self.shared.select(used),
         )
 
+    def with_data(self, data: FloatArray) -> Observables:
+        """The same with other values (n_data,): V², then closure phases in radians."""
+        vis2, closure = np.split(np.asarray(data), [self.n_vis2])
+        return replace(
+            self,
+            vis2=replace(self.vis2, value=vis2),
+            closure_phase=replace(self.closure_phase, value=closure),
+        )
+
     def with_shared_errors(self, shared: SharedErrors | None, sign: float = 1.0) -> Observables:
         """Data with errors in common with others put into the covariance, or taken out of it."""
         if shared is None:

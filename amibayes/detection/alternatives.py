@@ -105,17 +105,19 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
     n_vis2 = likelihood.observables.n_vis2
     size = np.sqrt(likelihood.noise.covariance.variance[:n_vis2])
 
-    def difference(diameters: FloatArray) -> FloatArray:
+    def seen(diameters: FloatArray) -> FloatArray:
         at = np.array([np.interp(wavelengths, nodes, one) for one in diameters.T]).T
         wave = power_law_disc(points.frequency[:, None], at, np.array(exponent))
-        model = coloured.observe((wave / (1.0 + background)).astype(complex))
-        return coloured.wrapped(likelihood.observables.data[:, None] - model)
+        return coloured.observe((wave / (1.0 + background)).astype(complex))
+
+    def difference(diameters: FloatArray) -> FloatArray:
+        return coloured.wrapped(likelihood.observables.data - seen(diameters[:, None])[:, 0])
 
     def by_vis2(diameters: FloatArray) -> FloatArray:
-        return np.asarray(difference(diameters[:, None])[:n_vis2, 0] / size)
+        return np.asarray(difference(diameters)[:n_vis2] / size)
 
     def white(diameters: FloatArray) -> FloatArray:
-        return np.asarray(likelihood.noise.whiten(difference(diameters[:, None]))[:, 0])
+        return np.asarray(likelihood.noise.whiten(difference(diameters)))
 
     # V² have no walls at nulls, and lead near to the right side of each.
     bounds = (0.3 * grey, 3.0 * grey)
@@ -123,8 +125,7 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
     for k in np.tile(np.arange(len(nodes)), 2):
         tried = np.repeat(best[:, None], len(LADDER), axis=1)
         tried[k] *= LADDER
-        chi2 = (likelihood.noise.whiten(difference(tried)) ** 2).sum(axis=0)
-        best = tried[:, np.argmin(chi2)]
+        best = tried[:, np.argmin(coloured.chi2_of_model(seen(tried)))]
     best = np.clip(best, *bounds)
     fit = least_squares(white, best, bounds=bounds, max_nfev=STEPS)
     more = len(nodes) - len(result.theta)

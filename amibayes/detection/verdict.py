@@ -63,7 +63,6 @@ def verdict(
     *,
     structured: bool = True,
     shape: float = 0.0,
-    other: Alternative | None = None,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -82,9 +81,6 @@ def verdict(
         `within_calibration`. Structure that is not does not speak against the model.
     shape : float
         Of `fit_probability`: `SHAPE` where noise was fitted.
-    other : Alternative, optional
-        A source without a companion that fits as well: the companion is not detected then. A star
-        that changes with wavelength is one star; light around it is outside of the model.
 
     Notes
     -----
@@ -105,16 +101,23 @@ def verdict(
         return Verdict("inconsistent data", _apart(split), p_model)
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
-    if tested.detected and other is not None:
-        against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
-        if other.kind == "chromatic star":
-            return Verdict("no companion", f"{other.words}, {against}", p_model)
-        return Verdict("model rejected", f"{other.words} {against}: compare by --models", p_model)
     if tested.detected:
         note = note_of(result)
         left += f"; but {note}" if note else ""
         return Verdict("companion", _found(tested) + left, p_model, note)
     return Verdict("no companion", _nothing(tested) + left, p_model)
+
+
+def without_companion(found: Verdict, other: Alternative, result: SearchResult) -> Verdict:
+    """The verdict where a source without a companion fits as well as the one that was found.
+
+    A star that changes with wavelength is one star; light around it is outside of the model.
+    """
+    against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
+    if other.kind == "chromatic star":
+        return Verdict("no companion", f"{other.words}, {against}", found.p_model)
+    because = f"{other.words} {against}: compare by --models"
+    return Verdict("model rejected", because, found.p_model)
 
 
 SHAPE = 0.1

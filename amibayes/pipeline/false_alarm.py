@@ -15,7 +15,13 @@ from amibayes.detection.consistency import Consistency, consistency
 from amibayes.detection.false_alarm import Significance, draws_needed, significance
 from amibayes.detection.randomised import Randomised, randomised
 from amibayes.detection.statistic import BankStatistic, statistic_of
-from amibayes.detection.verdict import SHAPE, Verdict, verdict, within_calibration
+from amibayes.detection.verdict import (
+    SHAPE,
+    Verdict,
+    verdict,
+    within_calibration,
+    without_companion,
+)
 from amibayes.detection.whiteness import correlated
 from amibayes.parallel import Executor, Journal, Progress, spawn
 from amibayes.pipeline.field import noise_prior
@@ -157,6 +163,7 @@ def verdict_of(
     rest = structure(test, options, rng, executor)
     structured = rest.probability > options.alpha or not within_calibration(test)
     shape = SHAPE if options.extra_noise else 0.0
-    other = alternative(result) if tested.detected else None
-    found = verdict(result, tested, rest, splits, structured=structured, shape=shape, other=other)
+    found = verdict(result, tested, rest, splits, structured=structured, shape=shape)
+    if found.statement == "companion" and (other := alternative(result)) is not None:
+        found = without_companion(found, other, result)
     return found, splits

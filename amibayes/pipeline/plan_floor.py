@@ -338,22 +338,13 @@ def calibrated_covariance(
     drawn = rng.multivariate_normal(clean, own, (REALISATIONS, calibrators), method="svd")
     total = np.zeros_like(noise)
     for stars in drawn:
-        seen = [transfer_of(_with(photons, star), keys, (0.0, 0.0)) for star in stars]
+        seen = [transfer_of(photons.with_data(star), keys, (0.0, 0.0)) for star in stars]
         population = population_of(seen, keys, seen[0].seen)
         grid, weight = tau_posterior(population)
         some = grid[rng.choice(len(grid), 64, p=weight)]
         response = predictive(population, some, len(keys))[1].toarray()
         total += response[np.ix_(keys.key, keys.key)] * np.outer(keys.sign, keys.sign)
     return np.asarray(noise + total / REALISATIONS)
-
-
-def _with(observables: Observables, data: FloatArray) -> Observables:
-    n = observables.n_vis2
-    return replace(
-        observables,
-        vis2=replace(observables.vis2, value=data[:n]),
-        closure_phase=replace(observables.closure_phase, value=data[n:]),
-    )
 
 
 def search_limit(
@@ -370,7 +361,7 @@ def search_limit(
         some = observables.only((kind,)).covariance
         chi2 = float((some.whiten(noise[part]) ** 2).sum())
         noise[part] *= np.sqrt(some.rank / chi2)
-    found = search(Likelihood(_with(observables, observables.data + noise), BinaryModel()))
+    found = search(Likelihood(observables.with_data(observables.data + noise), BinaryModel()))
     tested = significance(statistic_of(found), NULL_DRAWS, rng)
     limit = detection_limit(
         found, tested, rng, separation_mas=separation_mas.tolist(), trials=TRIALS

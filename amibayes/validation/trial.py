@@ -110,9 +110,7 @@ def answer_of(report: SearchReport, truth: FloatArray | None) -> dict[str, Any]:
     near = bool(at_its_place(place, truth[:2], resolution_mas(report.result.likelihood)))
     return answer | {
         "truth": truth,
-        "rank": [
-            float(np.mean(posterior.column(q) < x)) for q, x in zip(RANKED, truth, strict=True)
-        ],
+        "rank": _ranks(posterior, truth),
         "covered": _covered(posterior, truth),
         "found": bool(tested.detected) and (near or limits.counts_anywhere(rho)),
         "expected": limits.probability(rho, truth[2]),

@@ -5,12 +5,11 @@ The data come from formulas of their own (Hestroffer 1997 for discs; no smearing
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import interferometer
 import numpy as np
 import pytest
 from brute_force import coverage
-from interferometer import darkened_disc, visibilities
+from interferometer import darkened_disc
 
 from amibayes.companion_search.optimise import refine
 from amibayes.data.observables import Observables
@@ -38,12 +37,7 @@ def observed(sheet: Observables) -> Observables:
         other = darkened_disc(TRUTH["companion_diameter_mas"], 0.0, u, v)
         return (star + ratio * other * np.exp(-2j * np.pi * (u * east + v * north))) / (1 + ratio)
 
-    both, legs = visibilities(sheet, visibility)
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=np.abs(both) ** 2),
-        closure_phase=replace(sheet.closure_phase, value=np.angle(legs.prod(axis=1))),
-    )
+    return interferometer.observed(sheet, visibility)
 
 
 @pytest.mark.parametrize("n", [60, pytest.param(600, marks=pytest.mark.slow)])
@@ -66,14 +60,8 @@ def test_pulls_of_discs_colour_and_limb_darkening(n: int) -> None:
     noise = sheet.covariance.draw(np.random.default_rng(8), n)
     pulls = np.empty((n, len(names)))
     for k in range(n):
-        vis2, closure = np.split(
-            np.concatenate([sheet.vis2.value, sheet.closure_phase.value]) + noise[:, k],
-            [sheet.n_vis2],
-        )
-        data = replace(
-            sheet,
-            vis2=replace(sheet.vis2, value=vis2),
-            closure_phase=replace(sheet.closure_phase, value=closure),
+        data = sheet.with_data(
+            np.concatenate([sheet.vis2.value, sheet.closure_phase.value]) + noise[:, k]
         )
         likelihood = Likelihood(data, model)
         fit = np.array(refine(likelihood, truth, Box(0.5, 20.0, 1.0), 0.0).theta)

@@ -89,12 +89,7 @@ def test_noise_that_a_floor_explains_is_not_added_again(rng) -> None:
     data = exposures(1, channels=6)
     floor = Systematics(data.setups[0].source, 0.03, 0.02)
     draw = noise_with_channels(data, (), [floor]).draw(1, rng)[:, 0]
-    vis2, closure = np.split(data.data + draw, [data.n_vis2])
-    noisy = replace(
-        data,
-        vis2=replace(data.vis2, value=vis2),
-        closure_phase=replace(data.closure_phase, value=closure),
-    )
+    noisy = data.with_data(data.data + draw)
     theta = np.array([100.0, 50.0, 0.0])
     with_floor = fit_noise(Likelihood(noisy), theta, prior=NoisePrior(floors=(floor,)))
     assert not with_floor.any

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
+import interferometer
 import numpy as np
 import pytest
 from brute_force import coverage
-from interferometer import darkened_disc, visibilities
+from interferometer import darkened_disc
 
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
@@ -24,15 +24,7 @@ MODEL = BinaryModel(diameter_mas="free", smearing=False)
 def observed(source: Visibility, seed: int, name: str = "pionier") -> Observables:
     """Data of a source with errors of 0.01 in V² and 0.5° in closure phase."""
     sheet = coverage(name, 0.01, np.radians(0.5))
-    both, legs = visibilities(sheet, source)
-    exact = np.concatenate([np.abs(both) ** 2, np.angle(legs.prod(axis=1))])
-    data = exact + sheet.covariance.draw(np.random.default_rng(seed), 1)[:, 0]
-    vis2, closure = np.split(data, [sheet.n_vis2])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
+    return interferometer.observed(sheet, source, np.random.default_rng(seed))
 
 
 def chromatic(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:

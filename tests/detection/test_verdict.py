@@ -6,10 +6,10 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 
+import interferometer
 import numpy as np
 import pytest
 from helpers import niriss, simulated
-from interferometer import visibilities
 from scipy.special import j0, j1
 from scipy.stats import chi2
 
@@ -73,14 +73,7 @@ def disc(diameter: float, spot: float = 0.0) -> Visibility:
 
 def observed(sheet: Observables, source: Visibility, rng: np.random.Generator) -> Observables:
     """The sheet's observables of a source, with noise."""
-    both, sides = visibilities(sheet, lambda u, v, _: source(MAS * u, MAS * v))
-    data = np.concatenate([np.abs(both) ** 2, np.angle(sides.prod(axis=1))])
-    vis2, closure = np.split(data + sheet.covariance.draw(rng, 1)[:, 0], [sheet.n_vis2])
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=vis2),
-        closure_phase=replace(sheet.closure_phase, value=closure),
-    )
+    return interferometer.observed(sheet, lambda u, v, _: source(MAS * u, MAS * v), rng)
 
 
 def searched(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -30,12 +28,7 @@ def test_common_errors_of_channels_are_measured(share, rng) -> None:
         common = rng.standard_normal(table.row.max() + 1)[table.row] * error
         parts.append(np.sqrt(1.0 - share) * own + np.sqrt(share) * common)
     values = clean + np.concatenate(parts)
-    vis2, closure = np.split(values, [len(data.vis2)])
-    data = replace(
-        data,
-        vis2=replace(data.vis2, value=vis2),
-        closure_phase=replace(data.closure_phase, value=closure),
-    )
+    data = data.with_data(values)
     result = search(Likelihood(data), (50.0, 400.0))
     correlation, n_pairs = channel_correlation(result)
     assert n_pairs == 5 * 56

@@ -56,12 +56,7 @@ def noisy(data: Observables, shares: ChannelShare, rng) -> Observables:
 
 
 def with_draw(data: Observables, draw: np.ndarray) -> Observables:
-    vis2, closure = np.split(data.data + draw, [data.n_vis2])
-    return replace(
-        data,
-        vis2=replace(data.vis2, value=vis2),
-        closure_phase=replace(data.closure_phase, value=closure),
-    )
+    return data.with_data(data.data + draw)
 
 
 @pytest.mark.parametrize("n", [2, 3, 7, 64])

@@ -46,12 +46,7 @@ def test_spread_is_that_of_new_data(factor) -> None:
     wide = replace(sheet, covariance=sheet.covariance)
     noise = simulated(wide, TRUTH, None)
     draw = factor * sheet.covariance.draw(rng, 1)[:, 0]
-    vis2, closure = np.split(noise.data + draw, [sheet.n_vis2])
-    data = replace(
-        noise,
-        vis2=replace(noise.vis2, value=vis2),
-        closure_phase=replace(noise.closure_phase, value=closure),
-    )
+    data = noise.with_data(noise.data + draw)
     result = search(Likelihood(data), (80.0, 200.0))
     found = bootstrap(result, ExtraNoise(), 60, rng)
     expected = factor * np.sqrt(np.diag(result.theta_covariance))
