@@ -5,12 +5,18 @@
 A function counts from its ``def`` to its last line, comments and blank lines included; with and
 without its docstring, since the public ones state shapes, units and errors at length. A module
 counts every line.
+
+``python docs/sizes_table.py`` compares `measured` with the package before it was restructured.
 """
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +28,7 @@ def functions(folder: Path = PACKAGE, *, docstrings: bool = False) -> dict[str, 
     """Lines of every function and method, by ``path:line name``."""
     out = {}
     for path in sorted(folder.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in _nodes(path.read_text(encoding="utf-8")):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 name = f"{path.relative_to(folder)}:{node.lineno} {node.name}"
                 whole = int(node.end_lineno or node.lineno) - node.lineno + 1
@@ -43,6 +49,79 @@ def modules(folder: Path = PACKAGE) -> dict[str, int]:
     return {
         str(path.relative_to(folder)): len(path.read_text(encoding="utf-8").splitlines())
         for path in sorted(folder.rglob("*.py"))
+    }
+
+
+@cache
+def _nodes(source: str) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(source)))
+
+
+@cache
+def code(source: str) -> list[tuple[int, str]]:
+    """Lines of code with their numbers: no comments, docstrings, imports or blank lines."""
+    passed: set[int] = set()
+    for node in _nodes(source):
+        text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if text or isinstance(node, ast.Import | ast.ImportFrom):
+            passed |= set(range(node.lineno, int(node.end_lineno or node.lineno) + 1))
+    lines = enumerate(map(str.strip, source.splitlines()), start=1)
+    return [(k, text) for k, text in lines if text and text[0] != "#" and k not in passed]
+
+
+RUN = 6
+"""Lines that stand twice are worth a look from here on; shorter runs are how code looks."""
+
+
+def repeated_runs(folder: Path = PACKAGE) -> int:
+    """Runs of `RUN` or more lines of code that stand in the package before, to the letter."""
+    every = [list(_windows(path)) for path in sorted(folder.rglob("*.py"))]
+    number = Counter(window for windows in every for window in windows)
+    first: set[tuple[str, ...]] = set()
+    runs = 0
+    for windows in every:
+        inside = False
+        for window in windows:
+            again = number[window] > 1 and window in first
+            runs += again and not inside
+            inside = again
+            first.add(window)
+    return runs
+
+
+def _windows(path: Path) -> Iterator[tuple[str, ...]]:
+    # Lines without a word, as lone brackets, are no content.
+    lines = [text for _, text in code(path.read_text(encoding="utf-8")) if re.search(r"\w", text)]
+    for k in range(len(lines) - RUN + 1):
+        yield tuple(lines[k : k + RUN])
+
+
+def public_names(folder: Path = PACKAGE) -> int:
+    """Names that the package gives, as type checkers read them."""
+    stub = folder / "__init__.pyi"
+    source = (stub if stub.is_file() else folder / "__init__.py").read_text(encoding="utf-8")
+    nodes = [n for n in _nodes(source) if isinstance(n, ast.ImportFrom)]
+    own = [n for n in nodes if n.level or str(n.module).startswith("amibayes")]
+    return sum(len(node.names) for node in own)
+
+
+def measured(folder: Path = PACKAGE) -> dict[str, float]:
+    """What tells how easily the package can be taken in."""
+    paths = sorted(folder.rglob("*.py"))
+    folders = Counter(path.parent for path in paths)
+    texts = [path.read_text(encoding="utf-8") for path in paths]
+    lengths = list(functions(folder).values())
+    return {
+        "modules": len(paths),
+        "modules beside the packages": folders[folder],
+        "modules of the fullest folder": max(n for at, n in folders.items() if at != folder),
+        "lines": sum(len(text.splitlines()) for text in texts),
+        "lines of code": sum(len(code(text)) for text in texts),
+        f"runs of {RUN} lines or more that stand twice": repeated_runs(folder),
+        "functions": len(lengths),
+        "lines of the median function": float(np.median(lengths)),
+        "lines of the longest function": max(lengths),
+        "public names": public_names(folder),
     }
 
 
