@@ -10,7 +10,7 @@ not of the noisy pixel itself.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -60,6 +60,10 @@ class RampFile:
         SCI (n_int, n_groups, ny, nx) and, where the file has them, GROUPDQ and PIXELDQ.
     mjd : (n_int,) array, optional
     timing : GroupTiming
+    bias_dn : (ny, nx) array, optional
+        Counts that were taken off (the superbias), where that file is at hand.
+    excess_dn : (65536,) array, optional
+        Counts too many for every number of counts, bias included: taken off what is read.
     """
 
     template: Cube
@@ -67,6 +71,8 @@ class RampFile:
     hdus: dict[str, Any]
     mjd: FloatArray | None
     timing: GroupTiming
+    bias_dn: FloatArray | None = None
+    excess_dn: FloatArray | None = field(default=None, repr=False)
 
     def read(self, start: int = 0, stop: int | None = None) -> Cube:
         """Fit the slopes of the integrations from ``start`` up to ``stop``."""
@@ -106,6 +112,7 @@ class RampFile:
             flags = self.hdus.get("GROUPDQ")
             dq = None if flags is None else np.asarray(flags.section[part])
         good = np.isfinite(groups)
+        groups = self._true(groups)
         steps = groups[:, 1:] - groups[:, :-1]
         used = good[:, 1:] & good[:, :-1]
         if dq is not None and dq.any():
@@ -114,6 +121,15 @@ class RampFile:
         if not used.all():
             steps[~used] = 0.0
         return Differences(steps, used)
+
+    def _true(self, groups: SingleArray) -> SingleArray:
+        """Take off what the converter gave too much of, where that is known."""
+        if self.excess_dn is None or self.bias_dn is None:
+            return groups
+        unit = np.float32(GAIN_E_DN / self.gain_e)
+        counts = np.nan_to_num(groups) / unit + self.bias_dn
+        number = np.clip(np.rint(counts), 0, len(self.excess_dn) - 1).astype(np.intp)
+        return np.asarray(groups - unit * self.excess_dn.astype(np.float32)[number])
 
     @cached_property
     def pixel_flags(self) -> Any:

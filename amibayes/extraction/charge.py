@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,27 @@ import numpy as np
 from amibayes.cube import Cube
 from amibayes.cube.ramps import RampFile
 from amibayes.cube.source import Source, opened
+from amibayes.cube.superbias import KEYWORD
 from amibayes.cube.write import SHIFT_KEYWORDS
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import ChargeMigration, load_instrument
+from amibayes.ramps.converter import WAVES, WaveColumns, table
 from amibayes.ramps.correction import MigrationFree, electrons_of, slope_time_s
 from amibayes.ramps.curvature import Curvature, curvature_of
 from amibayes.ramps.fit import MigrationFit, fit_migration
 from amibayes.ramps.migration import Migration
-from amibayes.ramps.transfer import gains
+from amibayes.ramps.transfer import KINDS, gain
 from amibayes.units import ComplexArray, FloatArray
 
 TOO_FEW_GROUPS = "ramps of fewer than 4 groups cannot tell charge migration from flux"
+
+BIAS_UNKNOWN = (
+    "errors of the analogue-to-digital converter left in: the superbias that the ramps name "
+    "(R_SUPERB) is neither beside them nor below CRDS_PATH, or has other pixels"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +47,14 @@ class CubeMigration:
         Of the ramps of the visit.
     notes : tuple of str
         What a reader of the result has to know.
+    waves : WaveColumns, optional
+        What errors of the converter do to the ramps of this cube.
     """
 
     migration: Migration | None = None
     fit: MigrationFit | None = None
     notes: tuple[str, ...] = ()
+    waves: WaveColumns | None = None
 
     def applied(self, file: Source) -> Source:
         """The file without it."""
@@ -53,8 +63,13 @@ class CubeMigration:
         template = file.template
         electrons = electrons_of(template)
         assert electrons is not None
-        time = None if isinstance(file, RampFile) else slope_time_s(template.header)
-        return MigrationFree(file, self.migration, electrons, time)
+        if not isinstance(file, RampFile):
+            return MigrationFree(file, self.migration, electrons, slope_time_s(template.header))
+        converter = self.migration.of_converter
+        if converter is None or self.waves is None:
+            return MigrationFree(file, self.migration, electrons)
+        file = replace(file, excess_dn=table(converter.value))
+        return MigrationFree(file, self.migration, electrons, waves=self.waves.current)
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers: value, error, source, and the tests of a fit."""
@@ -127,13 +142,17 @@ def _decided(known: _Known, fit: MigrationFit | None, options: ExtractOptions) -
     migration, notes = _chosen(known, fit, options)
     if migration is None:
         return CubeMigration(None, fit, notes)
+    waves = None if known.curvature is None else known.curvature.waves
+    if waves is None and known.curvature is not None and known.template.header.get(KEYWORD):
+        notes = (*notes, BIAS_UNKNOWN)
     if not known.is_ramp:
         missing = _missing(known.template)
         if missing:
             return CubeMigration(
                 None, fit, (*notes, f"charge migration not taken out: the header lacks {missing}")
             )
-    return CubeMigration(migration, fit, (*notes, stated(migration)))
+    text = stated(migration.of_pixels if waves is None else migration)
+    return CubeMigration(migration, fit, (*notes, text), waves)
 
 
 def _chosen(
@@ -151,7 +170,9 @@ def _chosen(
         return fit.migration, notes
     if before is None:
         return None, notes
-    return Migration.isotropic(before.per_e, before.error, "instrument"), notes
+    of_file = Migration.isotropic(before.per_e, before.error, "instrument")
+    converter = None if fit is None else fit.migration.of_converter
+    return (of_file if converter is None else of_file.beside(converter)), notes
 
 
 def _missing(template: Cube) -> str:
@@ -168,9 +189,19 @@ def stated(migration: Migration) -> str:
     """Say in a line what is taken out."""
     value, error = migration.mean
     origin = {"fit": "fitted to ramps", "instrument": "of the instrument's file"}
-    return (
+    text = (
         f"charge migration taken out: {1e7 * value:.2f} ± {1e7 * error:.2f} e-7 pixels per "
         f"electron, {origin.get(migration.source, migration.source)}"
+    )
+    converter = migration.of_converter
+    if converter is None:
+        return text
+    sine, cosine = (
+        f"{1e6 * converter.value[k]:.1f} ± {1e6 * converter.error[k]:.1f}" for k in (0, 1)
+    )
+    return (
+        f"{text}; errors of the converter too, per million counts and with a period of 1024: "
+        f"sine {sine}, cosine {cosine}, fitted to ramps"
     )
 
 
@@ -195,7 +226,8 @@ def observable_changes(
     """
     migration, sampling = file.migration, operator.sampling
     current = operator.reference.image * file.electrons
-    moved = gains(migration.kinds, file.mean_time_s * current, current)
+    charge = file.mean_time_s * current
+    moved = np.stack([_change(kind, charge, current, file.waves) for kind in migration.kinds])
     images = -np.tensordot(migration.directions.T, moved, axes=1) / file.electrons
     view = operator.view
     pixels = images[:, view.rows, view.columns].reshape(len(images), operator.scatter.size)
@@ -208,6 +240,15 @@ def observable_changes(
     (high, high3), (low, low3) = sides
     closure = np.angle(high3 * low3.conj())
     return np.asarray(0.5 * np.concatenate([high - low, closure], axis=1).T)
+
+
+def _change(
+    kind: str, charge: FloatArray, current: FloatArray, waves: FloatArray | None
+) -> FloatArray:
+    """Current (ny, nx) that a coefficient of 1 makes."""
+    if kind in KINDS:
+        return gain(kind, charge, current)
+    return np.zeros_like(current) if waves is None else waves[WAVES.index(kind)]
 
 
 def shared_errors(parts: Sequence[tuple[Migration, FloatArray]]) -> SharedErrors | None:

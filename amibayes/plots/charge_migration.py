@@ -33,8 +33,10 @@ def migration_plot(fit: MigrationFit) -> Figure:
     """Draw the change of the current in every pixel, measured and predicted, and along the ramp."""
     best = max(fit.exposures, key=lambda e: float((fit.predicted(e)[e.used] ** 2).sum()))
     predicted = fit.predicted(best)
-    figure = new_figure(6.4)
-    (first, second), (third, fourth) = figure.subplots(2, 2)
+    of_converter = fit.migration.of_converter is not None
+    figure = new_figure(8.6 if of_converter else 6.4)
+    grid = figure.add_gridspec(2 + of_converter, 2)
+    first, second, third, fourth = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
     limit = float(np.abs(predicted).max()) or 1.0
     for ax, image, title in (
         (first, np.where(best.used, best.change, np.nan), "measured"),
@@ -45,6 +47,8 @@ def migration_plot(fit: MigrationFit) -> Figure:
     bar.set_label("Change of the current (e⁻ s⁻²)")
     _per_pixel(third, fit)
     _along_ramp(fourth, fit)
+    if of_converter:
+        _of_converter(figure.add_subplot(grid[2, :]), fit)
     value, error = fit.migration.mean
     figure.suptitle(
         f"Charge migration {1e7 * value:.2f} ± {1e7 * error:.2f} · 10⁻⁷ pixels per electron, "
@@ -68,9 +72,38 @@ def _image(ax: Axes, image: FloatArray, exposure: Curvature, limit: float, title
 
 def _per_pixel(ax: Axes, fit: MigrationFit) -> None:
     """Draw measured against predicted change, in groups of pixels of all exposures."""
-    p, m, w = (
-        np.concatenate(a) for a in zip(*(_pixels(fit, e) for e in fit.exposures), strict=True)
-    )
+    parts = zip(*(_pixels(fit, e) for e in fit.exposures), strict=True)
+    _binned(ax, *(np.concatenate(a) for a in parts))
+    ax.set_xlabel("Predicted (e⁻ s⁻²)")
+    ax.set_ylabel("Measured (e⁻ s⁻²)")
+
+
+def _of_converter(ax: Axes, fit: MigrationFit) -> None:
+    """Draw what the converter makes of single differences, beside all that changes linearly."""
+    parts = zip(*(_differences(fit, e) for e in fit.exposures if e.waves), strict=True)
+    _binned(ax, *(np.concatenate(a) for a in parts))
+    ax.set_xlabel("Current of one difference, by the converter's errors: predicted (e⁻ s⁻¹)")
+    ax.set_ylabel("Measured (e⁻ s⁻¹)")
+
+
+def _differences(
+    fit: MigrationFit, exposure: Curvature
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Prediction, measurement and weight of the differences of the pixels of an exposure."""
+    converter, used = fit.migration.of_converter, exposure.used
+    assert converter is not None
+    assert exposure.waves is not None
+    lag = exposure.lag_s[:, None, None]
+    of_waves = np.tensordot(converter.value, exposure.waves.departure, axes=1)
+    linear = np.tensordot(converter.value, exposure.waves.change, axes=1)
+    found = exposure.departure - lag * (fit.predicted(exposure) - linear)
+    # A slope over these times is known to sigma: one of them to that times √Σ lag².
+    weight = np.broadcast_to(exposure.sigma**-2 / (exposure.lag_s**2).sum(), found.shape)
+    return of_waves[:, used].ravel(), found[:, used].ravel(), weight[:, used].ravel()
+
+
+def _binned(ax: Axes, p: FloatArray, m: FloatArray, w: FloatArray) -> None:
+    """Draw measured against predicted numbers, in groups of like prediction."""
     order = np.argsort(p)
     share = np.cumsum((w * p**2)[order])
     group = np.minimum((BINS * share / max(share[-1], 1e-300)).astype(int), BINS - 1)
@@ -80,8 +113,6 @@ def _per_pixel(ax: Axes, fit: MigrationFit) -> None:
     ends = np.array([x.min(), x.max()])
     ax.plot(ends, ends, color=GREY, label="prediction")
     ax.errorbar(x, y, 1.0 / np.sqrt(total[seen]), fmt="o", color=BLUE, label="groups of pixels")
-    ax.set_xlabel("Predicted (e⁻ s⁻²)")
-    ax.set_ylabel("Measured (e⁻ s⁻²)")
     ax.legend(loc="lower right")
 
 

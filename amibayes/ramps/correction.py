@@ -34,12 +34,16 @@ class MigrationFree:
         Electrons per second of the images' unit.
     time_s : float, optional
         Mean time from the reset that slopes are of; ramps know it of every pixel.
+    waves : (len(WAVES), ny, nx) array, optional
+        Currents (e⁻/s) that amplitudes of 1 of the converter's errors make, where these have
+        been taken off the ramps.
     """
 
     source: Source
     migration: Migration
     electrons: float
     time_s: float | None = None
+    waves: FloatArray | None = None
 
     @property
     def template(self) -> Cube:
@@ -70,7 +74,7 @@ class MigrationFree:
             return cube
         # What is taken off is a percent of the current: single precision is enough for it.
         current = np.asarray(cube.images * self.electrons, dtype=np.float32)
-        lost = charge_lost(self.migration, current, time, cube.bad)
+        lost = charge_lost(self.migration.of_pixels, current, time, cube.bad)
         images = cube.images - (lost / self.electrons).astype(cube.images.dtype)
         return replace(cube, images=images)
 

@@ -7,7 +7,7 @@ change, B in the current F + B·t, is all that a fit of migration needs of an ex
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from amibayes.cube.container import NEVER_USED, flag_bits
-from amibayes.cube.ramps import RampFile
+from amibayes.cube.ramps import GAIN_E_DN, RampFile
 from amibayes.cube.timing import GroupTiming
+from amibayes.ramps.converter import WAVES, Predictor, WaveColumns, spread_of
 from amibayes.ramps.transfer import KINDS, gains
 from amibayes.units import BoolArray, FloatArray, IntArray, read_only
 
@@ -65,6 +66,8 @@ class Curvature:
     bend_chi2 : float
         χ² of what is left of the mean ramps beside a linear change.
     bend_dof : int
+    waves : WaveColumns, optional
+        What errors of the converter make of the ramps, where the bias is known.
     """
 
     source: str
@@ -80,6 +83,7 @@ class Curvature:
     lag_s: FloatArray
     bend_chi2: float
     bend_dof: int
+    waves: WaveColumns | None = None
 
     def __post_init__(self) -> None:
         read_only(self, "current", "change", "sigma", "batches", "gains", "departure")
@@ -148,6 +152,7 @@ class _Sums:
         self.current = np.zeros(shape)
         self.ramp = np.zeros((kept, *shape))
         self.gains = np.zeros((len(KINDS), *shape))
+        self.waves = np.zeros((len(WAVES), kept, *shape))
         self.n = 0
 
     def add(
@@ -179,6 +184,7 @@ def curvature_of(file: RampFile) -> Curvature | None:
     usual = filled(photons / file.timing.group_s, ~bad)
     stride = -(-file.n_integrations // SAMPLED)
     sums = _Sums(shape, len(kept), min(BATCHES, file.n_integrations))
+    predictor = _predictor(file, weights, photons, read)
     for start in range(0, file.n_integrations, CHUNK):
         part = slice(start, min(start + CHUNK, file.n_integrations))
         found = file.differences(part)
@@ -191,6 +197,8 @@ def curvature_of(file: RampFile) -> Curvature | None:
         sums.ramp += steps.sum(axis=0, dtype=float)
         light = np.where(whole, current, usual)[-part.start % stride :: stride]
         sums.gains += gains(KINDS, light, light).sum(axis=1)
+        if predictor is not None:
+            sums.waves += predictor(light)
         sums.n += len(light)
     return _averaged(sums, weights, file, bad)
 
@@ -243,7 +251,7 @@ def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) ->
     flat = left.reshape(len(left), -1)
     chi2 = divisor.ravel() * np.einsum("kp,pkl,lp->p", flat, weights.inverse, flat)
     used = np.isfinite(sigma).ravel()
-    return Curvature(
+    found = Curvature(
         file.template.source,
         n,
         len(weights.kept),
@@ -258,6 +266,47 @@ def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) ->
         float(chi2[used].sum()),
         int(used.sum()) * (len(weights.kept) - 2),
     )
+    if file.bias_dn is None:
+        return found
+    return replace(found, waves=_wave_columns(sums.waves / sums.n, weights, left, sigma, divisor))
+
+
+def _predictor(
+    file: RampFile, weights: _Weights, photons: FloatArray, read: float
+) -> Predictor | None:
+    """Waves of the converter in differences; None where the pixels' bias is not known."""
+    if file.bias_dn is None:
+        return None
+    light = photons.ravel() / file.timing.group_s
+    spread = spread_of(file.timing, weights.kept, weights.matrix[0], light, read) / GAIN_E_DN**2
+    shape = (-1, *photons.shape)
+    return Predictor(file.bias_dn, GAIN_E_DN, file.timing, weights.kept, spread.reshape(shape))
+
+
+def _wave_columns(
+    steps: FloatArray, weights: _Weights, left: FloatArray, sigma: FloatArray, count: FloatArray
+) -> WaveColumns:
+    """Columns of waves whose mean differences are (len(WAVES), k, ny, nx).
+
+    Parameters
+    ----------
+    steps : array
+        Currents.
+    weights : _Weights
+    left : (k, ny, nx) array
+        What the mean ramps have beside a linear change.
+    sigma, count : (ny, nx) arrays
+        Infinite where a pixel does not count; ramps that were averaged.
+    """
+    current, change = weights.applied(steps)
+    departure = steps - current[:, None]
+    bend = departure - change[:, None] * weights.lag_s[:, None, None]
+    shape = (*bend.shape[:2], -1)
+    inverse = weights.inverse * np.where(np.isfinite(sigma), count, 0.0).reshape(-1, 1, 1)
+    whitened = np.einsum("wkp,pkl->wlp", bend.reshape(shape), inverse)
+    normal = np.einsum("wlp,vlp->wv", whitened, bend.reshape(shape))
+    right = np.einsum("wlp,lp->w", whitened, left.reshape(shape[1:]))
+    return WaveColumns(current, change, departure, normal, right)
 
 
 def _usable(file: RampFile) -> IntArray:

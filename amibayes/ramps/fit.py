@@ -2,8 +2,9 @@
 
 The mean change of every pixel's current is a sum of what migration, and imperfect linearity,
 make of the exposure's own image, and of what is the exposure's alone: a flux and a pointing
-that drift along the ramp, and a change that all pixels share. Weighted least squares; the
-covariance is scaled by the scatter of parts of the exposures where that is larger.
+that drift along the ramp, and a change that all pixels share. Errors of the converter, where the
+pixels' bias is known, also make ramps bend otherwise. Weighted least squares; the covariance is
+scaled by the scatter of parts of the exposures where that is larger.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
+from amibayes.ramps.converter import WAVE_PRIOR, WAVES
 from amibayes.ramps.curvature import Curvature
 from amibayes.ramps.migration import Migration
 from amibayes.ramps.transfer import FURTHER, KINDS, LINEARITY, SIDES, gains
@@ -27,6 +29,9 @@ LINEARITY_PRIOR = 5e-8
 """Standard deviation of what a linearised ramp's current is off by per electron: 0.2 % of the
 signal at full well. Without it a flux that drifts within the ramp could make up for any of it, and
 further neighbours that are not fitted would be taken for both (seen with GalSim's sensor)."""
+
+PRIORS = {LINEARITY: LINEARITY_PRIOR, **dict(zip(WAVES, WAVE_PRIOR, strict=True))}
+"""Standard deviations about zero of what ramps do not always tell."""
 
 ROUNDS = 3
 """Fits, each with the image that the one before left: the coefficients are good to 1e-4 then."""
@@ -55,8 +60,10 @@ class MigrationFit:
         Without migration; linearity and drifts are fitted all the same.
     p_value : float
         Probability of a larger χ².
+    bend_chi2 : float
+        Of what ramps bend beside a linear change.
     bend_p_value : float
-        Probability of ramps that bend more beside the linear change.
+        Probability of ramps that bend more.
     error_scale : float
         What the scatter of parts made of the errors; 1 where it agrees with the noise.
     exposures : tuple of Curvature
@@ -67,6 +74,7 @@ class MigrationFit:
     dof: int
     chi2_without: float
     p_value: float
+    bend_chi2: float
     bend_p_value: float
     error_scale: float
     exposures: tuple[Curvature, ...]
@@ -78,8 +86,7 @@ class MigrationFit:
 
     def predicted(self, exposure: Curvature) -> FloatArray:
         """(ny, nx) change of the current that migration makes, electrons per second squared."""
-        chosen = _chosen(_refined(exposure, self.migration), self.migration.kinds)
-        return np.tensordot(self.migration.value, chosen, axes=1)
+        return np.tensordot(self.migration.value, _columns(exposure, self.migration), axes=1)
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers."""
@@ -108,18 +115,31 @@ def fit_migration(exposures: Sequence[Curvature]) -> MigrationFit:
     -------
     MigrationFit
     """
-    kinds: tuple[str, ...] = ALWAYS
-    found = _solved(exposures, kinds)
+    found = _solved(exposures, ALWAYS)
+    of_converter: tuple[str, ...] = ()
+    if any(e.waves is not None for e in exposures):
+        more = _solved(exposures, (*ALWAYS, *WAVES))
+        if _asked_for(found, more):
+            of_converter, found = WAVES, more
     for _ in FURTHER:
+        kinds = found.migration.kinds
         tried = [_solved(exposures, (*kinds, k)) for k in FURTHER if k not in kinds]
-        more = min(tried, key=lambda fit: fit.chi2)
-        if chi2_distribution.sf(found.chi2 - more.chi2, 1) > ASKED_FOR:
+        more = min(tried, key=_misfit)
+        if not _asked_for(found, more):
             break
-        kinds, found = more.migration.kinds, more
-    none = _solved(exposures, (LINEARITY,))
-    bend = sum(e.bend_chi2 for e in exposures), sum(e.bend_dof for e in exposures)
-    p_bend = float(chi2_distribution.sf(*bend)) if bend[1] else 1.0
-    return replace(found, chi2_without=none.chi2, bend_p_value=p_bend)
+        found = more
+    none = _solved(exposures, (LINEARITY, *of_converter))
+    return replace(found, chi2_without=none.chi2)
+
+
+def _misfit(fit: MigrationFit) -> float:
+    return fit.chi2 + fit.bend_chi2
+
+
+def _asked_for(less: MigrationFit, more: MigrationFit) -> bool:
+    """Whether χ² falls by more than chance makes it, with the kinds that are more."""
+    count = len(more.migration.kinds) - len(less.migration.kinds)
+    return bool(chi2_distribution.sf(_misfit(less) - _misfit(more), count) <= ASKED_FOR)
 
 
 def _solved(exposures: Sequence[Curvature], kinds: tuple[str, ...]) -> MigrationFit:
@@ -128,17 +148,20 @@ def _solved(exposures: Sequence[Curvature], kinds: tuple[str, ...]) -> Migration
     migration = Migration(kinds, *start, "fit")
     systems: list[_System] = []
     for _ in range(ROUNDS):
-        systems = [_system(e, _chosen(_refined(e, migration), kinds)) for e in exposures]
-        normal, right = sum(s.normal for s in systems), sum(s.right for s in systems)
-        normal = normal + np.diag([(k == LINEARITY) / LINEARITY_PRIOR**2 for k in kinds])
-        covariance = np.linalg.inv(normal)
-        migration = Migration(kinds, np.asarray(covariance @ right), np.asarray(covariance), "fit")
-    scale = _excess(systems, migration.covariance)
-    total = float(sum(s.chi2 for s in systems) - right @ covariance @ right)
-    dof = sum(s.n_data for s in systems) - len(kinds)
+        systems = [_system(e, _columns(e, migration)) for e in exposures]
+        bends = [_bend_system(e, kinds) for e in exposures]
+        normal = sum(s.normal for s in (*systems, *bends))
+        normal = normal + np.diag([PRIORS[k] ** -2 if k in PRIORS else 0.0 for k in kinds])
+        covariance = np.asarray(np.linalg.inv(normal))
+        value = np.asarray(covariance @ sum(s.right for s in (*systems, *bends)))
+        migration = Migration(kinds, value, covariance, "fit")
+    scale = _excess(systems, kinds)
+    chi2, bend = (sum(s.left(value) for s in parts) for parts in (systems, bends))
+    dof, bend_dof = sum(s.n_data for s in systems) - len(kinds), sum(e.bend_dof for e in exposures)
     migration = replace(migration, covariance=migration.covariance * scale**2)
-    p = float(chi2_distribution.sf(total, dof))
-    return MigrationFit(migration, total, dof, total, p, 1.0, scale, tuple(exposures))
+    p = float(chi2_distribution.sf(chi2, dof))
+    p_bend = float(chi2_distribution.sf(bend, bend_dof)) if bend_dof else 1.0
+    return MigrationFit(migration, chi2, dof, chi2, p, bend, p_bend, scale, tuple(exposures))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +186,20 @@ class _System:
     n_data: int
     scores: FloatArray
 
+    def left(self, value: FloatArray) -> float:
+        """χ² with coefficients (k,)."""
+        return float(self.chi2 - 2.0 * value @ self.right + value @ self.normal @ value)
+
+
+def _bend_system(exposure: Curvature, kinds: tuple[str, ...]) -> _System:
+    """Of what ramps bend beside a linear change: of all kinds only the converter's show there."""
+    k, n = len(kinds), exposure.bend_dof
+    normal, right = np.zeros((k, k)), np.zeros(k)
+    if exposure.waves is not None and WAVES[0] in kinds:
+        own = [kinds.index(wave) for wave in WAVES]
+        normal[np.ix_(own, own)], right[own] = exposure.waves.normal, exposure.waves.right
+    return _System(normal, right, exposure.bend_chi2, n, np.empty((0, k)))
+
 
 def _system(exposure: Curvature, columns: FloatArray) -> _System:
     used = exposure.used
@@ -179,19 +216,20 @@ def _system(exposure: Curvature, columns: FloatArray) -> _System:
     return _System(rows @ rows.T, rows @ data, float(data @ data), n_data, scores)
 
 
-def _excess(systems: Sequence[_System], covariance: FloatArray) -> float:
+def _excess(systems: Sequence[_System], kinds: tuple[str, ...]) -> float:
     """Factor of the errors by the scatter of the parts, where that is larger by more than chance.
 
     It holds whatever correlates pixels: stripes, pointing within a ramp.
     """
     trace, dof = 0.0, 0
+    own = [k for k, kind in enumerate(kinds) if kind in KINDS]
     for system in systems:
-        b, k = system.scores.shape
+        b, k = len(system.scores), len(own)
         if b < 2:
             continue
-        off = system.scores - system.scores.mean(axis=0)
-        own = np.linalg.inv(system.normal)
-        trace += float(np.einsum("bk,kl,bl->", off, own, off)) / b
+        off = (system.scores - system.scores.mean(axis=0))[:, own]
+        inverse = np.linalg.inv(system.normal[np.ix_(own, own)])
+        trace += float(np.einsum("bk,kl,bl->", off, inverse, off)) / b
         dof += (b - 1) * k
     if not dof or chi2_distribution.sf(trace, dof) > EXCESS:
         return 1.0
@@ -200,6 +238,19 @@ def _excess(systems: Sequence[_System], covariance: FloatArray) -> float:
 
 def _chosen(every: FloatArray, kinds: Sequence[str]) -> FloatArray:
     return every[[KINDS.index(kind) for kind in kinds]]
+
+
+def _columns(exposure: Curvature, migration: Migration) -> FloatArray:
+    """Changes (k, ny, nx) that coefficients of 1 make, of all kinds of a migration."""
+    of_pixels = _chosen(_refined(exposure, migration.of_pixels), migration.of_pixels.kinds)
+    if exposure.waves is None:
+        of_converter = np.zeros((len(WAVES), *exposure.current.shape))
+    else:
+        of_converter = exposure.waves.change
+    columns = dict(
+        zip((*migration.of_pixels.kinds, *WAVES), (*of_pixels, *of_converter), strict=True)
+    )
+    return np.stack([columns[kind] for kind in migration.kinds])
 
 
 def _refined(exposure: Curvature, migration: Migration) -> FloatArray:

@@ -1,12 +1,14 @@
-"""Coefficients of charge migration, with what is known of them."""
+"""Coefficients of charge migration and of the converter, with what is known of them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from amibayes.ramps.converter import WAVES
 from amibayes.ramps.transfer import KINDS, SIDES
 from amibayes.units import FloatArray, read_only
 
@@ -20,9 +22,9 @@ class Migration:
     Parameters
     ----------
     kinds : tuple of str
-        Of `amibayes.ramps.transfer.KINDS`.
+        Of `amibayes.ramps.transfer.KINDS`; then those of `amibayes.ramps.converter.WAVES`.
     value : (k,) array
-        Coefficients per electron.
+        Coefficients per electron; amplitudes of waves, counts per count.
     covariance : (k, k) array
     source : {"fit", "instrument", "given"}
         Ramps of these data, the instrument's file, or the user.
@@ -35,7 +37,7 @@ class Migration:
 
     def __post_init__(self) -> None:
         read_only(self, "value", "covariance")
-        unknown = set(self.kinds) - set(KINDS)
+        unknown = set(self.kinds) - {*KINDS, *WAVES}
         if unknown or self.covariance.shape != 2 * (len(self.kinds),):
             raise ValueError(f"kinds {self.kinds} and covariance {self.covariance.shape}")
 
@@ -58,11 +60,36 @@ class Migration:
         return float(weight @ self.value), float(np.sqrt(weight @ self.covariance @ weight))
 
     @property
+    def of_pixels(self) -> Migration:
+        """What charge does, without the converter."""
+        return self._of(KINDS)
+
+    @property
+    def of_converter(self) -> Migration | None:
+        """Amplitudes of the converter's waves; None where they were not fitted."""
+        return self._of(WAVES) if set(WAVES) <= set(self.kinds) else None
+
+    def _of(self, wanted: tuple[str, ...]) -> Migration:
+        own = [k for k, kind in enumerate(self.kinds) if kind in wanted]
+        kinds = tuple(self.kinds[k] for k in own)
+        return replace(
+            self, kinds=kinds, value=self.value[own], covariance=self.covariance[np.ix_(own, own)]
+        )
+
+    def beside(self, other: Migration) -> Migration:
+        """Both together, their errors independent."""
+        value = np.concatenate([self.value, other.value])
+        covariance = block_diag(self.covariance, other.covariance)
+        return replace(self, kinds=self.kinds + other.kinds, value=value, covariance=covariance)
+
+    @property
     def directions(self) -> FloatArray:
         """(k, r) independent errors of one standard deviation: the covariance is D·Dᵀ."""
-        eigenvalue, vector = np.linalg.eigh(self.covariance)
+        # Numbers of different units: in units of their errors they are of one size.
+        unit = np.where(self.error > 0.0, self.error, 1.0)
+        eigenvalue, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
         kept = eigenvalue > 1e-9 * max(float(eigenvalue.max(initial=0.0)), 1e-300)
-        return np.asarray(vector[:, kept] * np.sqrt(eigenvalue[kept]))
+        return np.asarray(unit[:, None] * vector[:, kept] * np.sqrt(eigenvalue[kept]))
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers."""
@@ -71,5 +98,10 @@ class Migration:
         found["coefficients"] = {
             kind: {"value_per_e": float(v), "error_per_e": float(e)}
             for kind, v, e in zip(self.kinds, self.value, self.error, strict=True)
+            if kind in KINDS
         }
+        converter = self.of_converter
+        if converter is not None:
+            rows = zip(converter.kinds, converter.value, converter.error, strict=True)
+            found["converter"] = {k: {"value": float(v), "error": float(e)} for k, v, e in rows}
         return found

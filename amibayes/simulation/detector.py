@@ -12,6 +12,9 @@ import numpy as np
 from amibayes.errors import UsageError
 from amibayes.units import BoolArray, FloatArray
 
+BIAS_DN = 12000.0
+"""Counts of a pixel after the reset: those of NIRISS."""
+
 
 @dataclass(frozen=True)
 class Detector:
@@ -67,6 +70,8 @@ class Detector:
     adc_nonlinearity : float
         Errors of the analogue-to-digital converter, in units of those of NIRISS
         (`amibayes.simulation.ramps.converted`).
+    bias_spread_dn : float
+        Standard deviation of the pixels' bias, which the converter's errors depend on.
 
     Raises
     ------
@@ -96,6 +101,7 @@ class Detector:
     boundary_shift_y: float = 0.0
     stripe_noise_e: float = 0.0
     adc_nonlinearity: float = 0.0
+    bias_spread_dn: float = 300.0
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -139,6 +145,7 @@ LARGEST = {
     "boundary_shift_y": 1e-5,
     "stripe_noise_e": 1e3,
     "adc_nonlinearity": 100.0,
+    "bias_spread_dn": 2000.0,
 }
 """Beyond these an effect is no longer the small correction that it is modelled as."""
 
@@ -196,12 +203,15 @@ class DetectorMaps:
         Of pixels, their mean 1.
     dead, hot : (ny, nx) bool arrays
         Pixels without signal, and with too much of it.
+    bias_dn : (ny, nx) array
+        Counts after the reset.
     """
 
     flat: FloatArray
     sensitivity: FloatArray
     dead: BoolArray
     hot: BoolArray
+    bias_dn: FloatArray
 
     @property
     def bad(self) -> BoolArray:
@@ -214,9 +224,11 @@ def draw_maps(detector: Detector, shape: tuple[int, int], rng: np.random.Generat
 
     Each effect has its own stream, so that switching one does not change the others.
     """
-    of_flat, of_bad, of_sensitivity = rng.spawn(3)
+    of_flat, of_bad, of_sensitivity, of_bias = rng.spawn(4)
     flat = 1.0 + detector.flat_error * of_flat.standard_normal(shape)
     sensitivity = 1.0 + detector.flat_field * of_sensitivity.standard_normal(shape)
     lot = of_bad.random(shape)
     half = detector.bad_pixel_fraction / 2.0
-    return DetectorMaps(flat, sensitivity, lot < half, (lot >= half) & (lot < 2.0 * half))
+    bias = BIAS_DN + detector.bias_spread_dn * of_bias.standard_normal(shape)
+    hot = (lot >= half) & (lot < 2.0 * half)
+    return DetectorMaps(flat, sensitivity, lot < half, hot, bias)

@@ -188,7 +188,8 @@ class Recorder:
             shape = (self.exposure.n_groups, *jitter.shape)
             moved = rng.spawn(1)[0].standard_normal(shape).clip(-MAX_SIGMA, MAX_SIGMA)
             jitter = jitter + self.frame_px * moved
-        ramps = read_ramps(self.light(jitter), self.detector, self.exposure.n_groups, rng)
+        light, n_groups = self.light(jitter), self.exposure.n_groups
+        ramps = read_ramps(light, self.detector, n_groups, rng, self.maps.bias_dn)
         slopes = self.fit(ramps)
         result = {
             "images": slopes.images.astype(np.float32),

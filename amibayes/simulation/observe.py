@@ -12,6 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, headers_of
+from amibayes.cube.superbias import KEYWORD
 from amibayes.errors import DataError
 from amibayes.instrument import Instrument, instrument_names, load_instrument
 from amibayes.optics import Wavefront, scene_image
@@ -316,13 +317,29 @@ def _files(
         )
         ramps = None
         if observation.exposure.keep_ramps:
-            ramps = stack.enter_context(FitsStream.create(ramp_path(path), _ramp_hdus(shutter)))
+            hdus = _ramp_hdus(shutter)
+            if observation.detector.adc_nonlinearity > 0.0:
+                _write_superbias(superbias_path(path), shutter.recorder.maps.bias_dn)
+                hdus[0].header[KEYWORD] = superbias_path(path).name
+            ramps = stack.enter_context(FitsStream.create(ramp_path(path), hdus))
         yield cube, ramps
 
 
 def ramp_path(path: Path) -> Path:
     """Name of the reads' file beside a ``calints`` file."""
     return path.with_name(path.name.replace("_calints", "_ramp"))
+
+
+def superbias_path(path: Path) -> Path:
+    """Name of the file of the pixels' bias beside a ``calints`` file."""
+    return path.with_name(path.name.replace("_calints", "_superbias"))
+
+
+def _write_superbias(path: Path, bias_dn: FloatArray) -> None:
+    """Write counts as the reference file of JWST that was taken off the reads has them."""
+    image = fits.ImageHDU(bias_dn.astype(np.float32), name="SCI")
+    with FitsStream.create(path, [fits.PrimaryHDU(), image]):
+        pass
 
 
 def _ramp_hdus(shutter: PreparedExposure) -> list[Any]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from amibayes.cube.ramps import GAIN_E_DN
 from amibayes.ramps.transfer import SIDES, gains
-from amibayes.simulation.detector import Detector
+from amibayes.simulation.detector import BIAS_DN, Detector
 from amibayes.units import FloatArray
 
 TO_NEIGHBOURS = 0.05
@@ -22,9 +22,6 @@ ADC_WAVES = (
     (1024.0 / 3.0, -0.64e-6, 4.13e-6),
 )
 """Periods in counts, and amplitudes of sine and cosine, of the readout of JWST's detectors."""
-
-BIAS_DN = 12000.0
-"""Counts of a pixel after the reset: those of NIRISS, which pixels differ from by hundreds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +41,11 @@ class Ramps:
 
 
 def read_ramps(
-    rate_e_s: FloatArray, detector: Detector, n_groups: int, rng: np.random.Generator
+    rate_e_s: FloatArray,
+    detector: Detector,
+    n_groups: int,
+    rng: np.random.Generator,
+    bias_dn: FloatArray | float = BIAS_DN,
 ) -> Ramps:
     """Simulate the ramps of some integrations.
 
@@ -58,6 +59,8 @@ def read_ramps(
         Groups (frames) of a ramp.
     rng : numpy Generator
         Of these integrations.
+    bias_dn : (ny, nx) array, or float
+        Counts of pixels after the reset.
 
     Returns
     -------
@@ -80,10 +83,12 @@ def read_ramps(
             _add_hits(charge, detector, rng)
         reads[first + group] += measured_signal(charge, detector)
         n_good = _count_good(n_good, charge, detector.full_well_e, first + group)
-    return Ramps(linearised(converted(reads, detector), detector), n_good)
+    return Ramps(linearised(converted(reads, detector, bias_dn), detector), n_good)
 
 
-def converted(reads: FloatArray, detector: Detector) -> FloatArray:
+def converted(
+    reads: FloatArray, detector: Detector, bias_dn: FloatArray | float = BIAS_DN
+) -> FloatArray:
     """Reads as the analogue-to-digital converter gives them, bias taken off, in electrons.
 
     Counts x become x/(1 + Σ(s sin + c cos)(2πx/p)); what a bias frame shows of it is taken off.
@@ -91,7 +96,7 @@ def converted(reads: FloatArray, detector: Detector) -> FloatArray:
     if detector.adc_nonlinearity == 0.0:
         return reads
     off = detector.adc_nonlinearity * GAIN_E_DN
-    return np.asarray(reads + off * (_adc_error(reads / GAIN_E_DN + BIAS_DN) - _adc_error(BIAS_DN)))
+    return np.asarray(reads + off * (_adc_error(reads / GAIN_E_DN + bias_dn) - _adc_error(bias_dn)))
 
 
 def _adc_error(counts: FloatArray | float) -> FloatArray:
