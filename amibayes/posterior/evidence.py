@@ -23,8 +23,8 @@ from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.integrand import log_evidence_none
 from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
+from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, Range
 from amibayes.posterior.sampler import draw_posterior
 from amibayes.support.arguments import checks_arguments

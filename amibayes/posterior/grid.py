@@ -21,7 +21,8 @@ from amibayes.likelihood.combinations import combination_of, refusal
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.parameters import Parameters
-from amibayes.posterior.integrand import Cells, Integrand, Nuisance
+from amibayes.posterior.integrand import Cells, Integrand, Shares
+from amibayes.posterior.nuisance import Nuisance
 from amibayes.posterior.priors import Prior
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import html_table
@@ -206,16 +207,14 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
     """
     work = Integrand(likelihood, prior)
     cells = work.start()
-    log_mass, peak = work.masses(cells)
-    if not np.isfinite(log_mass).any():
+    shares = work.shares(cells)
+    if not np.isfinite(shares.log_mass).any():
         raise DataError("the likelihood is finite nowhere", source=likelihood.observables.source)
-    while (cut := _to_cut(work, cells, log_mass, work.delta_chi2(peak), step)).any():
+    while (cut := _to_cut(work, cells, shares, step)).any():
         children = cells[cut].halved()
-        mass, top = work.masses(children)
         cells = Cells.join(cells[~cut], children)
-        log_mass = np.concatenate([log_mass[~cut], mass])
-        peak = np.concatenate([peak[~cut], top])
-    return _finished(work, cells, log_mass)
+        shares = Shares.join([shares[~cut], work.shares(children)])
+    return _finished(work, cells, shares)
 
 
 def integrable(likelihood: Likelihood) -> bool:
@@ -224,21 +223,27 @@ def integrable(likelihood: Likelihood) -> bool:
     return not len(shapes) and refusal(combination_of(likelihood, method="grid posterior")) is None
 
 
-def affordable(likelihood: Likelihood, prior: Prior, most: float = 2e7) -> bool:
-    """Whether the grid posterior takes fewer model values than ``most`` (a few seconds).
+POINTS = 32
+"""Parameter sets per cell and node of the nuisance parameters, as measured."""
+
+
+MORE_CELLS = 2000
+"""Cells that the modes of a strong companion are cut into, as measured."""
+
+
+def affordable(likelihood: Likelihood, prior: Prior, most: float = 3e8) -> bool:
+    """Whether the grid posterior takes fewer model values than ``most`` (some ten seconds).
 
     Several contrasts and motion are dimensions that it does not have.
     """
     if not integrable(likelihood):
         return False
     work = Integrand(likelihood, prior)
-    n_sets = len(work.start()) * len(work.nuisance.value) * (work.n_boxes + 16)
+    n_sets = (len(work.start()) + MORE_CELLS) * len(work.nuisance.value) * POINTS
     return n_sets * len(likelihood.samples) < most
 
 
-def _to_cut(
-    work: Integrand, cells: Cells, log_mass: FloatArray, delta_chi2: FloatArray, step: float
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _to_cut(work: Integrand, cells: Cells, shares: Shares, step: float) -> BoolArray:
     """Say which cells are too large for what they hold.
 
     No phase of the model turns faster than 2π per λ/B_max, so that at a signal-to-noise S a
@@ -246,7 +251,7 @@ def _to_cut(
     with the separation, not below ρ/2S. What a centre may miss of its cell's peak is
     bounded in the same way, by the half diagonal.
     """
-    gain = np.maximum(delta_chi2, 1.0)
+    log_mass, gain = shares.log_mass, np.maximum(work.delta_chi2(shares.peak), 1.0)
     rate = np.maximum(2.0 * np.pi / work.fringe_mas, 2.0 / cells.centre[0])
     too_large = cells.size * rate * np.sqrt(gain) > step
     missed = work.likelihood.noise.log_loss(
@@ -257,28 +262,23 @@ def _to_cut(
     return np.asarray(too_large & (below > -FLOOR - missed))
 
 
-def _finished(work: Integrand, cells: Cells, log_mass: FloatArray) -> GridPosterior:
-    """Collect contrasts and nuisance of the cells that hold something."""
-    log_z = float(logsumexp(log_mass))
-    cells = cells[log_mass > log_z - 1.5 * FLOOR]
-    edges: list[FloatArray] = []
-    shares: list[FloatArray] = []
-    nodes = np.zeros(len(work.nuisance.value))
-    for batch in work.batches(cells):
-        edge, log_share, _ = work.shares(batch)
-        share = np.exp(log_share - log_z)
-        edges.append(edge)
-        shares.append(share.sum(axis=1))
-        nodes += share.sum(axis=(0, 2))
-    contrast = np.concatenate(shares) / sum(s.sum() for s in shares)
+def _finished(work: Integrand, cells: Cells, shares: Shares) -> GridPosterior:
+    """Keep the cells that hold something."""
+    log_z = float(logsumexp(shares.log_mass))
+    kept = shares.log_mass > log_z - 1.5 * FLOOR
+    shares = shares[kept]
+    unit = np.exp(shares.log_scale - log_z)
+    contrast = unit[:, None] * shares.by_contrast
+    contrast /= contrast.sum()
+    nodes = unit @ shares.by_nuisance
     return GridPosterior(
         work.prior,
         replace(work.likelihood.model, companions=0).parameters.names,
         log_z,
         work.log_z_none,
-        cells,
+        cells[kept],
         contrast.sum(axis=1),
-        np.concatenate(edges),
+        shares.edges,
         contrast,
         work.nuisance,
         nodes / nodes.sum(),

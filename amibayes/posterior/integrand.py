@@ -6,21 +6,23 @@ its exact prior probability; nuisance parameters over Gauss–Legendre nodes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter
-from scipy.special import logsumexp
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
+from amibayes.posterior.contrast_profile import profile
+from amibayes.posterior.nuisance import Nuisance, log_evidence_none, nuisance_nodes
 from amibayes.posterior.priors import Prior
-from amibayes.units import MAS, FloatArray
+from amibayes.units import MAS, FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +99,8 @@ FAINT_BOXES, FINE_BOXES, MORE_BOXES = 8, 40, 24
 """Boxes in contrast: below the fine range, in it, and more of them with nuisance parameters."""
 
 
-NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.3
-
-
-MIN_NODES, MAX_NODES = 6, 32
+CERTAIN = 30.0
+"""Gain of ln L by a companion beyond which what fits without one has no share."""
 
 
 BRIGHT = (0.1, 0.2, 0.4, 0.8)
@@ -112,86 +112,41 @@ BATCH = 1_500_000
 
 
 @dataclass(frozen=True, eq=False)
-class Nuisance:
-    """Quadrature of the nuisance parameters.
+class Shares:
+    """What cells hold of the evidence.
 
     Parameters
     ----------
-    value : (n_nodes, n_nuisance) float array
-    log_weight : (n_nodes,) float array
-        Logarithm of the prior probability that a node stands for.
-    low, high : (n_nodes, n_nuisance) float array
-        Range that it stands for.
+    edges : (n, n_boxes + 1) float array
+        Boxes of the contrast.
+    log_scale : (n,) float array
+        Logarithm of the unit of the following two.
+    by_contrast : (n, n_boxes) float array
+    by_nuisance : (n, n_nodes) float array
+    peak : (n,) float array
+        Best log-likelihood.
     """
 
-    value: FloatArray
-    log_weight: FloatArray
-    low: FloatArray
-    high: FloatArray
+    edges: FloatArray
+    log_scale: FloatArray
+    by_contrast: FloatArray
+    by_nuisance: FloatArray
+    peak: FloatArray
 
+    @property
+    def log_mass(self) -> FloatArray:
+        """Logarithm of each cell's share of the evidence, (n,)."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.log_scale + np.log(self.by_contrast.sum(axis=1)))
 
-def nuisance_nodes(prior: Prior, centres: FloatArray, errors: FloatArray) -> Nuisance:
-    """Gauss–Legendre nodes around fits, each parameter given the ones before it.
+    def __getitem__(self, index: Any) -> Shares:
+        return Shares(*(getattr(self, f.name)[index] for f in fields(self)))
 
-    Parameters
-    ----------
-    prior : Prior
-    centres : (n_fits, n_nuisance) float array
-        Best values; nodes reach 5σ beyond all of them, as far as the prior goes.
-    errors : (n_nuisance, n_nuisance) float array
-        Their covariance: correlated parameters are followed along their ridge.
-    """
-    value, low, high = (np.empty((1, 0)) for _ in range(3))
-    log_weight = np.zeros(1)
-    for k, one in enumerate(prior.ranges):
-        bounds = one.low, one.high
-        turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
-        sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
-        if not 0.0 < sigma < bounds[1] - bounds[0]:
-            sigma, turn = bounds[1] - bounds[0], 0.0 * turn
-        middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
-        x, w, a, b = _axis(middle, sigma, bounds)
-        n = x.shape[1]
-        value, low, high = (
-            np.hstack([np.repeat(old, n, axis=0), new.reshape(-1, 1)])
-            for old, new in ((value, x), (low, a), (high, b))
-        )
-        log_weight = np.repeat(log_weight, n) + (np.log(w) + one.log_density(x)).ravel()
-    return Nuisance(value, log_weight, low, high)
-
-
-def _axis(
-    middle: FloatArray, sigma: float, bounds: tuple[float, float]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Nodes, widths and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
-    centres = np.clip(middle, *bounds)
-    begin = np.maximum(centres.min(axis=1) - NUISANCE_REACH * sigma, bounds[0])[:, None]
-    length = np.minimum(centres.max(axis=1) + NUISANCE_REACH * sigma, bounds[1])[:, None] - begin
-    wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
-    x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, MIN_NODES, MAX_NODES)))
-    edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
-    weight = 0.5 * w * length
-    return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
-
-
-def log_evidence_none(
-    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
-) -> float:
-    """Logarithm of the evidence without a companion, nuisance parameters integrated.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        With any number of companions in its model.
-    prior : Prior
-    single : (n_nuisance,) float array, optional
-        The best fit without a companion, if it is known.
-    """
-    alone = single_likelihood(likelihood)
-    best = fit_single(likelihood)[0] if single is None else single
-    errors = alone.errors(best) if len(best) else np.empty((0, 0))
-    nodes = nuisance_nodes(prior, best[None], errors)
-    return float(logsumexp(alone.log_prob(nodes.value) + nodes.log_weight))
+    @staticmethod
+    def join(several: Sequence[Shares]) -> Shares:
+        """Cells of all."""
+        columns = ([getattr(s, f.name) for s in several] for f in fields(Shares))
+        return Shares(*(np.concatenate(c) for c in columns))
 
 
 class Integrand:
@@ -211,11 +166,11 @@ class Integrand:
         lattice = self.fringe_mas / CELLS_PER_FRINGE
         self.grid = make_grid(prior.inner_mas, prior.outer_mas, lattice)
         self._scan()
+        alone = single_likelihood(likelihood)
+        self.best_none = float(alone.log_prob(self.single[None])[0])
         self.nuisance = self._nuisance()
         self.n_boxes = FAINT_BOXES + FINE_BOXES + MORE_BOXES * bool(len(self.single))
         self.log_z_none = log_evidence_none(likelihood, prior, self.single)
-        alone = single_likelihood(likelihood)
-        self.best_none = float(alone.log_prob(self.single[None])[0])
         without, left = alone.chi2(self.single[None])[0], likelihood.chi2(self._best[None])[0]
         self.most = max(float((without - left) / likelihood.noise.inflation(left)), 0.0)
         self.n_evaluations = 0
@@ -247,13 +202,15 @@ class Integrand:
         return cells[around[north, east] > 0.4 * best - 60.0]
 
     def _nuisance(self) -> Nuisance:
-        """Nodes over what the fits with and without a companion allow."""
+        """Nodes over what the fits with a companion, and if it counts without, allow."""
         if not len(self.single):
             return nuisance_nodes(self.prior, np.empty((1, 0)), np.empty((0, 0)))
         best = self._best
         columns = self.likelihood.parameters.nuisance
         errors = self.likelihood.errors(best)[np.ix_(columns, columns)]
-        return nuisance_nodes(self.prior, np.array([self.single, best[columns]]), errors)
+        gain = float(self.likelihood.log_prob(best[None])[0]) - self.best_none
+        centres = [best[columns]] if gain > CERTAIN else [self.single, best[columns]]
+        return nuisance_nodes(self.prior, np.array(centres), errors)
 
     @cached_property
     def _best(self) -> FloatArray:
@@ -307,13 +264,20 @@ class Integrand:
 
     def boxes(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
         """Boxes of the contrast (n, n_boxes + 1), and log-likelihood (n, n_nodes, n_boxes)."""
-        n, nodes = len(cells), self.nuisance.value
-        place = np.repeat(np.column_stack(cells.position), len(nodes), axis=0)
-        sites = np.hstack([place, np.tile(nodes, (n, 1))])
-        best, sigma = self._best_contrast(sites)
-        edges = self._edges(*(x.reshape(n, -1) for x in (best, sigma)))
-        contrast = np.repeat(self._inside(edges), len(nodes), axis=0)
-        return edges, self.log_prob(sites, contrast).reshape(n, len(nodes), -1)
+        outer = self._best_contrast(_sites(cells, self.nuisance.outer))
+        edges = self._edges(*(x.reshape(len(cells), -1) for x in outer))
+        contrast, n_nodes = self._inside(edges), len(self.nuisance.value)
+        sites = _sites(cells, self.nuisance.value)
+
+        def at(rows: IntArray, wanted: FloatArray) -> FloatArray:
+            return self.log_prob(sites[rows], wanted)
+
+        everywhere = np.arange(len(sites))
+        faint = at(everywhere, np.repeat(contrast[:, :FAINT_BOXES], n_nodes, axis=0))
+        low, high = (np.tile(x[:, None], n_nodes) for x in (edges[:, FAINT_BOXES], edges[:, -1]))
+        fine = profile(at, low, high, contrast[:, FAINT_BOXES:])
+        faint = faint.reshape(len(cells), n_nodes, FAINT_BOXES)
+        return edges, np.concatenate([faint, fine], axis=2)
 
     def _edges(self, best: FloatArray, sigma: FloatArray) -> FloatArray:
         """Boxes: logarithmic below the fine range, even in it; (n, n_nodes) → (n, n_boxes + 1)."""
@@ -341,29 +305,32 @@ class Integrand:
         at_once = max(1, BATCH // each)
         return [cells[k : k + at_once] for k in range(0, len(cells), at_once)]
 
-    def shares(self, cells: Cells) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Boxes, logarithm of their mass (n, n_nodes, n_boxes), and best log-likelihood (n,)."""
+    def shares(self, cells: Cells) -> Shares:
+        """What cells hold."""
+        return Shares.join([self._shares(batch) for batch in self.batches(cells)])
+
+    def _shares(self, cells: Cells) -> Shares:
         p = self.prior
         edges, log_prob = self.boxes(cells)
         ring = p.ring_cdf(cells.outer) - p.ring_cdf(cells.inner)
         place = np.log(ring * (cells.last - cells.first) / (2.0 * np.pi))
         bright = np.log(np.maximum(np.diff(p.contrast_cdf(edges), axis=1), 1e-300))
         log_mass = log_prob + (place[:, None] + bright)[:, None, :]
-        return edges, log_mass + self.nuisance.log_weight[:, None], log_prob.max(axis=(1, 2))
+        log_mass += self.nuisance.log_weight[:, None]
+        top = log_mass.max(axis=(1, 2))
+        share = np.exp(log_mass - np.where(np.isfinite(top), top, 0.0)[:, None, None])
+        return Shares(edges, top, share.sum(axis=1), share.sum(axis=2), log_prob.max(axis=(1, 2)))
 
     def delta_chi2(self, peak: FloatArray) -> FloatArray:
         """Δχ² over no companion of cells whose best log-likelihoods are given, (n,)."""
         gain = self.likelihood.noise.delta_chi2(peak - self.best_none)
         return np.minimum(gain, max(self.most, 2.0 * float(np.max(peak - self.best_none))))
 
-    def masses(self, cells: Cells) -> tuple[FloatArray, FloatArray]:
-        """Logarithm of each cell's share of the evidence, and its best log-likelihood."""
-        masses, peaks = [], []
-        for batch in self.batches(cells):
-            _, log_mass, peak = self.shares(batch)
-            masses.append(logsumexp(log_mass, axis=(1, 2)))
-            peaks.append(peak)
-        return np.concatenate(masses), np.concatenate(peaks)
+
+def _sites(cells: Cells, nodes: FloatArray) -> FloatArray:
+    """Position and nuisance parameters, (n_cells × n_nodes, 2 + n_nuisance)."""
+    place = np.repeat(np.column_stack(cells.position), len(nodes), axis=0)
+    return np.hstack([place, np.tile(nodes, (len(cells), 1))])
 
 
 def _parabola(

@@ -16,7 +16,8 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.binary import BinaryModel
 from amibayes.posterior.grid import grid_posterior
-from amibayes.posterior.integrand import log_evidence_none, polar_cells
+from amibayes.posterior.integrand import polar_cells
+from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, default_prior, edit_prior, parse_setting
 
 FIELD = (50.0, 400.0)

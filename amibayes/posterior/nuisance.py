@@ -1,0 +1,120 @@
+"""Quadrature of the nuisance parameters of a grid posterior, and the evidence of a star alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from amibayes.companion_search.optimise import fit_single
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.posterior.priors import Prior
+from amibayes.units import FloatArray
+
+NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.3
+"""Errors to each side that nodes reach, and nodes in each."""
+
+
+MIN_NODES, MAX_NODES = 10, 64
+"""Nodes of one parameter: half of a Gaussian, at a bound of the prior, needs the fewest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisance:
+    """Quadrature of the nuisance parameters.
+
+    Parameters
+    ----------
+    value : (n_nodes, n_nuisance) float array
+    log_weight : (n_nodes,) float array
+        Logarithm of the prior probability that a node stands for.
+    low, high : (n_nodes, n_nuisance) float array
+        Range that it stands for.
+    shape : tuple of int
+        Number of nodes of each parameter.
+    """
+
+    value: FloatArray
+    log_weight: FloatArray
+    low: FloatArray
+    high: FloatArray
+    shape: tuple[int, ...] = ()
+
+    @property
+    def outer(self) -> FloatArray:
+        """Nodes at the ends and in the middle of each parameter, (n, n_nuisance)."""
+        if not self.shape:
+            return self.value
+        three = np.ix_(*([0, n // 2, n - 1] for n in self.shape))
+        return self.value[np.arange(len(self.value)).reshape(self.shape)[three].ravel()]
+
+
+def nuisance_nodes(
+    prior: Prior, centres: FloatArray, errors: FloatArray, reach: float = NUISANCE_REACH
+) -> Nuisance:
+    """Gauss–Legendre nodes around fits, each parameter given the ones before it.
+
+    Parameters
+    ----------
+    prior : Prior
+    centres : (n_fits, n_nuisance) float array
+        Best values; nodes reach beyond all of them, as far as the prior goes.
+    errors : (n_nuisance, n_nuisance) float array
+        Their covariance: correlated parameters are followed along their ridge.
+    reach : float
+        Errors that nodes reach.
+    """
+    value, low, high = (np.empty((1, 0)) for _ in range(3))
+    log_weight, shape = np.zeros(1), []
+    for k, one in enumerate(prior.ranges):
+        bounds = one.low, one.high
+        turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
+        sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
+        if not 0.0 < sigma < bounds[1] - bounds[0]:
+            sigma, turn = bounds[1] - bounds[0], 0.0 * turn
+        middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
+        x, w, a, b = _axis(middle, sigma, bounds, reach)
+        n = x.shape[1]
+        shape.append(n)
+        value, low, high = (
+            np.hstack([np.repeat(old, n, axis=0), new.reshape(-1, 1)])
+            for old, new in ((value, x), (low, a), (high, b))
+        )
+        log_weight = np.repeat(log_weight, n) + (np.log(w) + one.log_density(x)).ravel()
+    return Nuisance(value, log_weight, low, high, tuple(shape))
+
+
+def _axis(
+    middle: FloatArray, sigma: float, bounds: tuple[float, float], reach: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Nodes, widths and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
+    centres = np.clip(middle, *bounds)
+    begin = np.maximum(centres.min(axis=1) - reach * sigma, bounds[0])[:, None]
+    length = np.minimum(centres.max(axis=1) + reach * sigma, bounds[1])[:, None] - begin
+    wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
+    x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, MIN_NODES, MAX_NODES)))
+    edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
+    weight = 0.5 * w * length
+    return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
+
+
+def log_evidence_none(
+    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
+) -> float:
+    """Logarithm of the evidence without a companion, nuisance parameters integrated.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With any number of companions in its model.
+    prior : Prior
+    single : (n_nuisance,) float array, optional
+        The best fit without a companion, if it is known.
+    """
+    alone = single_likelihood(likelihood)
+    best = fit_single(likelihood)[0] if single is None else single
+    errors = alone.errors(best) if len(best) else np.empty((0, 0))
+    # Where a star alone does not fit, more noise than in the errors makes its tails long.
+    nodes = nuisance_nodes(prior, best[None], errors, 2.0 * NUISANCE_REACH)
+    return float(logsumexp(alone.log_prob(nodes.value) + nodes.log_weight))
