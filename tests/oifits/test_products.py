@@ -140,6 +140,48 @@ def test_closure_errors_of_faint_fringes_are_those_of_their_noise(
     assert quoted == pytest.approx(np.sqrt(2 * 3 / 200) * SIGMA / 0.6, rel=0.1)
 
 
+@pytest.mark.parametrize("sigmas", [(SIGMA, SIGMA), (SIGMA, 0.3 * SIGMA), (0.3 * SIGMA, SIGMA)])
+@pytest.mark.parametrize("lengths", [(0.4, 0.95), (0.95, 0.4)])
+def test_closure_errors_of_unlike_fringes_are_those_of_their_noise(
+    lengths: tuple[float, float],
+    sigmas: tuple[float, float],
+    tmp_path: Path,
+    rng: np.random.Generator,
+) -> None:
+    """Each has σ √(Σ 1/|V|²) / √n of its own, whatever the other's |V|."""
+    n, spread = 200, rng.uniform(0.6, 1.0, (2, 21))
+    two = [
+        integrations(length * own + 0j, sigma, n, rng)
+        for length, own, sigma in zip(lengths, spread, sigmas, strict=True)
+    ]
+    found = read_oifits(write_product(tmp_path / "a.fits", "aminorm-oi", *two))
+    legs = MASK.triangle_baselines
+    true = sum(
+        sigma**2 / n * ((length * own[legs]) ** -2).sum(axis=1)
+        for length, own, sigma in zip(lengths, spread, sigmas, strict=True)
+    )
+    # Triangles share baselines: of the stated variances what 15 independent ones tell.
+    quoted = found.covariance.variance[21:]
+    assert np.sqrt(quoted.sum() / true.sum()) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.slow
+def test_closure_errors_of_unlike_fringes_are_true(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    layout = open_oifits(made("aminorm-oi", tmp_path / "a.fits", rng))
+    shape, other = (rng.uniform(0.3, 0.5, 21) + 0j, rng.uniform(0.8, 1.0, 21) + 0j)
+    values, variances = [], []
+    for _ in range(1500):
+        pair = (integrations(mean, SIGMA, 20, rng) for mean in (shape, other))
+        found = read_product(with_other_numbers(layout, columns_of("aminorm-oi", *pair)))
+        assert found is not None
+        values.append(found.data[21:])
+        variances.append(found.covariance.variance[21:])
+    true, quoted = np.var(values, axis=0, ddof=1), np.mean(variances, axis=0)
+    assert 0.97 < np.sqrt(quoted.sum() / true.sum()) < 1.03
+
+
 def test_noise_bias_of_vis2_is_taken_off(tmp_path: Path, rng: np.random.Generator) -> None:
     noisy = integrations(np.full(21, 0.5 + 0j), 0.1, 400, rng)
     found = read_oifits(write_product(tmp_path / "a.fits", "amimulti-oi", noisy))

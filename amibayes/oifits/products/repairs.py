@@ -5,7 +5,8 @@ source of 1.17 on.
 
 - VIS2ERR is divided by √N once too often, and `ami_normalize` exchanges those of target and
   calibrator. 2·VIS2DATA·VISAMPERR/VISAMP is a standard error to 2 %, whatever N.
-- T3PHIERR and VISPHIERR are the scatter across the mean phasor, not divided by its length.
+- T3PHIERR and VISPHIERR are the scatter across the mean phasor, not divided by its length;
+  `ami_normalize` adds those of target and calibrator as they are.
 - T3PHI may lie outside ±180°: linear averages, and differences that were not wrapped.
 - MJD is midnight and TIME 0; INT_TIME is that of one integration.
 - EFF_BAND is 5.6 % narrower than the filter at half its height.
@@ -184,43 +185,43 @@ def _divided(error: str, amplitude: str, code: str) -> Any:
 
 
 def _closure(product: Product, table: OITable, done: list[Repair]) -> dict[str, Any]:
-    """T3PHIERR over T3AMP; over those of target and calibrator where both are in it.
+    """T3PHIERR over T3AMP; of calibrated products, from the errors of amplitudes.
 
-    `ami_normalize` adds the two scatters in quadrature and keeps the target's T3AMP. With
-    noise of like size in both, the variance of the difference is the mean of what either
-    amplitude makes of it; the calibrator's follows from the calibrated amplitudes.
+    `ami_normalize` adds two scatters in quadrature, each times its own triple amplitude, and
+    keeps that of the target alone: with unlike visibilities no division mends it.
     """
     if not {"T3PHIERR", "T3AMP"} <= set(table.columns):
         return {}
-    amplitude = np.abs(np.asarray(table.columns["T3AMP"], dtype=float))
-    ratio = _amplitude_ratio(product, table) if product.kind == "aminorm-oi" else None
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gain = 1.0 / amplitude
-        if ratio is not None:
-            other = gain * ratio.reshape(gain.shape)
-            gain = np.sqrt(0.5 * (gain**2 + other**2))
-        sigma = table.columns["T3PHIERR"] * gain
-    if np.isfinite(sigma).any():
+    sigma = _from_amplitudes(product, table) if product.kind == "aminorm-oi" else None
+    what = "T3PHIERR made of VISAMPERR/VISAMP of three baselines"
+    if sigma is None:
         what = "T3PHIERR divided by T3AMP"
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sigma = table.columns["T3PHIERR"] / np.abs(table.columns["T3AMP"])
+    if np.isfinite(sigma).any():
         done.append(Repair("product-closure-error", table.name, what))
     return {"T3PHIERR": sigma}
 
 
-def _amplitude_ratio(product: Product, table: OITable) -> FloatArray | None:
-    """Product around each triangle of VISAMP, which `ami_normalize` has divided, (n,)."""
-    rows = product.table("OI_VIS")
-    if rows is None or not {"VISAMP", "STA_INDEX"} <= set(rows.columns):
+def _from_amplitudes(product: Product, table: OITable) -> FloatArray | None:
+    """Errors of closure phases, degrees, in the shape of T3PHIERR; None without OI_VIS.
+
+    Noise of a visibility is alike along it and across it, but for pistons, which closure phases
+    are free of: VISAMPERR/VISAMP, in which both stars have their part, is the error of a phase.
+    """
+    rows, triangles = product.table("OI_VIS"), table.columns.get("STA_INDEX")
+    if rows is None or triangles is None:
         return None
-    amplitude = np.abs(np.asarray(rows.columns["VISAMP"], dtype=float)).reshape(len(rows), -1)
-    known = {
-        frozenset(pair.tolist()): a
-        for pair, a in zip(rows.columns["STA_INDEX"], amplitude[:, 0], strict=True)
-    }
-    triangles = table.columns.get("STA_INDEX")
-    if triangles is None:
+    ratio = relative_amplitude_error(product, rows)
+    if ratio is None:
         return None
-    legs = [[frozenset(t[[i, j]].tolist()) for i, j in ((0, 1), (1, 2), (0, 2))] for t in triangles]
-    return np.array([np.prod([known.get(leg, np.nan) for leg in each]) for each in legs])
+    pairs = [frozenset(pair.tolist()) for pair in rows.columns["STA_INDEX"]]
+    variance = dict(zip(pairs, ratio[:, 0] ** 2, strict=True))
+    sides = [
+        [frozenset(t[[i, j]].tolist()) for i, j in ((0, 1), (1, 2), (0, 2))] for t in triangles
+    ]
+    total = [sum(variance.get(side, np.nan) for side in each) for each in sides]
+    return np.degrees(np.sqrt(total)).reshape(np.shape(table.columns["T3PHIERR"]))
 
 
 ERRORS = {
