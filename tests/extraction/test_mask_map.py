@@ -26,7 +26,7 @@ from amibayes.optics.holes import hole_transform
 from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
 
-COMMISSIONED = np.array([[0.99282, 0.00618605], [-0.00727008, 0.99854]])
+COMMISSIONED = np.array([[1.001417, 0.007333], [-0.006240, 1.007186]])
 NIRISS = load_instrument("niriss", "F480M")
 OPTIONS = ExtractOptions()
 

@@ -18,7 +18,7 @@ from amibayes.extraction.visits import visit_maps
 from amibayes.instrument import load_instrument
 from amibayes.simulation.program import read_program
 
-COMMISSIONED = np.array([[0.99282, 0.00618605], [-0.00727008, 0.99854]])
+COMMISSIONED = np.array([[1.001417, 0.007333], [-0.006240, 1.007186]])
 
 SCENE = """
 name = "binary"
@@ -115,3 +115,18 @@ def test_a_plan_is_one_of_the_mask_as_built(tmp_path: Path) -> None:
     # A mask of smaller area makes a wider image.
     area = np.linalg.det(COMMISSIONED)
     assert peaks["default"]["centred"] / peaks["paper"]["centred"] == pytest.approx(area, abs=3e-3)
+
+
+def test_fringes_of_the_mask_as_built_are_those_of_the_jwst_packages_model(
+    rng: np.random.Generator,
+) -> None:
+    """The package's fringes: 2 π k′·b/λ of holes (−y, −x), k′ made of k = (row, column)."""
+    mx, my, sx, sy = 0.99282, 0.99854, 0.00618605, -0.00727008
+    drawn = load_instrument("niriss", "F480M")
+    x, y = drawn.mask.holes_m.T
+    row, column = rng.uniform(-30.0, 30.0, (2, 50))
+    first = (my * row - sy * column) / (mx * my - sx * sy)
+    second = (-sx * row + mx * column) / (mx * my - sx * sy)
+    theirs = np.multiply.outer(first, -y) + np.multiply.outer(second, -x)
+    ours = np.stack([column, row], axis=1) @ drawn.as_built().mask.holes_m.T
+    np.testing.assert_allclose(ours, -theirs, atol=2e-4)
