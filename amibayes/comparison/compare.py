@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
-from amibayes.comparison.confusion import HOPELESS, QUICK, measure_confusion
+from amibayes.comparison.confusion import HOPELESS, measure_confusion
 from amibayes.comparison.fit_models import ModelFit, fit_model
 from amibayes.comparison.hypotheses import (
     MORE_GENERAL,
@@ -35,6 +35,9 @@ from amibayes.units import FloatArray
 
 DRAWS_VALUES, MIN_DRAWS = 4_000_000, 1024
 """Model values of the draws of an evidence, and their least number."""
+
+HURRIED = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=3)
+"""Effort for a model whose odds are below 1e-6 whatever its evidence is."""
 
 CONFUSION_VALUES, MIN_CONFUSION = 60_000, 20
 """Points × data sets of a confusion matrix, and the least number of data sets: with 20 a share
@@ -346,7 +349,7 @@ def _compared(
         draws, how = draw_posterior(likelihood, model.prior, rng, method), method
     else:
         n = int(np.clip(DRAWS_VALUES // len(likelihood.samples), MIN_DRAWS, Effort().modes))
-        effort = QUICK if hopeless else Effort(prior=2 * n, modes=n)
+        effort = HURRIED if hopeless else Effort(prior=2 * n, modes=n)
         draws = integrate(
             model, likelihood.observables.data, fit.cube, fit.chi2, rng, effort=effort
         )

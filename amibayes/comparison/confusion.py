@@ -14,25 +14,30 @@ import numpy as np
 
 from amibayes.comparison.fit_models import ModelFit, embedded
 from amibayes.comparison.fitting import least_squares
-from amibayes.comparison.integral import Effort, PriorDraws, integrate, log_z_laplace
+from amibayes.comparison.integral import PriorDraws, log_z_laplace
+from amibayes.comparison.pooled import PooledEffort, pooled_evidences
 from amibayes.comparison.verdict import Confusion
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.units import FloatArray
 
-RANDOM_STARTS, KNOWN_STARTS = 8, 4
+RANDOM_STARTS, KNOWN_STARTS = 4, 2
 """Starting points of each simulated data set beside those of the banks: random ones, and the best
 fits to the data themselves."""
 
-QUICK = Effort(prior=2048, modes=1024, repeats=0, centres=5, rounds=3)
+STEPS = 16
+"""Of a fit to simulated data: what is drawn around need not be the minimum to a digit."""
+
+QUICK = PooledEffort()
 """ln Z of simulated data is then known to 0.02 to 0.1: less than what decides."""
 
-THOROUGH = Effort(prior=2048, modes=2048, repeats=2, rounds=8)
-POOR = 0.2
-"""Effort where the quick one leaves a large error of ln Z, and that error: where data are so strong
-that the posterior is small and bent, few draws find it, and the evidence comes out too small."""
+THOROUGH = PooledEffort(draws=8192, rounds=6)
+POOR, EXCLUDED = 0.2, 8.0
+"""Effort where the shared draws leave a large error of ln Z, and that error: where data are so
+strong that the posterior is small and bent, few draws find it, and the evidence comes out too
+small. A model whose odds are below e⁻⁸ gets none of it."""
 
 LARGE = 1000
-SMALL_EFFORT = Effort(prior=512, modes=256, repeats=0, centres=3, rounds=2)
+SMALL = PooledEffort(prior=512, draws=1024, centres=8, rounds=2)
 """Points of the (u, v) plane from which on evidences of simulated data get this effort alone, and
 Laplace's approximation where it is poor: a draw costs as much as the data are many, and posteriors
 of so many data are compact."""
@@ -41,9 +46,13 @@ HOPELESS = 15.0
 """A model whose largest ln L, which no evidence exceeds, is so far below another's evidence has
 odds below 1e-6: its own evidence is not measured, and that bound stands for it."""
 
-PIECE = 8
+PIECE = 20
 """Simulated data sets that are compared together: fits of several share their arithmetic, and a
 run that was cut off loses no more than these."""
+
+
+Fits = tuple[FloatArray, FloatArray]
+"""Points of the cube (n, n_starts, n_dim) where fits of data sets end, and their χ²."""
 
 
 def measure_confusion(
@@ -72,9 +81,8 @@ def measure_confusion(
         Where finished pieces are kept.
     progress : callable, optional
     """
-    effort = efforts(fits[0])[0].prior
     prior = [
-        PriorDraws.of(f.model, effort, child) if f.model.n_dim else None
+        PriorDraws.of(f.model, effort_of(f).prior, child) if f.model.n_dim else None
         for f, child in zip(fits, rng.spawn(len(fits)), strict=True)
     ]
     sizes = [part.stop - part.start for part in slices(n_draws, PIECE)]
@@ -107,82 +115,83 @@ def evidences(
     rng: np.random.Generator,
     prior: Sequence[PriorDraws | None],
 ) -> FloatArray:
-    """ln Z of every model for data sets (n_data, n), (n, n_models)."""
-    tried: dict[str, tuple[FloatArray, FloatArray]] = {}
+    """ln Z of every model for data sets (n_data, n), (n, n_models).
+
+    Models that fit best come first: where one cannot come near them, the largest ln L stands.
+    """
+    tried: dict[str, Fits] = {}
     for fit in fits:
         tried[fit.hypothesis.name] = _fitted(fit, data, tried, fits, rng)
-    return np.array(
-        [
-            _evidences_of(fits, one, [(c[i], x[i]) for c, x in tried.values()], rng, prior)
-            for i, one in enumerate(data.T)
-        ]
-    )
-
-
-def _evidences_of(
-    fits: Sequence[ModelFit],
-    data: FloatArray,
-    tried: Sequence[tuple[FloatArray, FloatArray]],
-    rng: np.random.Generator,
-    prior: Sequence[PriorDraws | None],
-) -> FloatArray:
-    """ln Z (n_models,) of one data set, the models that fit best first."""
-    out = np.array([_bound(f, data, *t) for f, t in zip(fits, tried, strict=True)])
-    best = -np.inf
-    for k in np.argsort(-out, kind="stable"):
-        if out[k] < best - HOPELESS:
-            break
-        cube, chi2 = tried[k]
-        for effort in efforts(fits[k]):
-            found = integrate(fits[k].model, data, cube, chi2, rng, prior=prior[k], effort=effort)
-            if found.diagnostics["log_z_error"] < POOR:
-                break
-        out[k] = found.diagnostics["log_z"]
-        if found.diagnostics["log_z_error"] > POOR:
-            # Draws that miss a small, bent posterior make it too small, never too large.
-            laplace = log_z_laplace(fits[k].model, data, cube, chi2)
-            out[k] = max(out[k], laplace)
-        best = max(best, out[k])
+    found = [tried[fit.hypothesis.name] for fit in fits]
+    out = np.stack([_bound(f, data, *t) for f, t in zip(fits, found, strict=True)], axis=1)
+    best = np.full(data.shape[1], -np.inf)
+    for k in np.argsort(-out.mean(axis=0), kind="stable"):
+        near = np.flatnonzero(out[:, k] >= best - HOPELESS)
+        if len(near):
+            mine = found[k][0][near], found[k][1][near]
+            out[near, k] = _evidence(fits[k], data[:, near], mine, rng, prior[k], best[near])
+            best[near] = np.maximum(best[near], out[near, k])
     return out
 
 
-def efforts(fit: ModelFit) -> tuple[Effort, ...]:
-    """Efforts to try for the evidence of a simulated data set, the cheapest first."""
-    return (SMALL_EFFORT,) if len(fit.model.likelihood.samples) > LARGE else (QUICK, THOROUGH)
+def _evidence(
+    fit: ModelFit,
+    data: FloatArray,
+    tried: Fits,
+    rng: np.random.Generator,
+    prior: PriorDraws | None,
+    best: FloatArray,
+) -> FloatArray:
+    """ln Z (n,) of one model for data sets (n_data, n), where other models have ``best`` (n,)."""
+    model = fit.model
+    if prior is None:
+        return _bound(fit, data, *tried)
+    out, error = pooled_evidences(model, data, *tried, rng, prior, effort_of(fit))
+    poor = np.flatnonzero((error > POOR) & (out > best - EXCLUDED))
+    if len(poor) and len(model.likelihood.samples) <= LARGE:
+        mine = data[:, poor], tried[0][poor], tried[1][poor]
+        out[poor], error[poor] = pooled_evidences(model, *mine, rng, prior, THOROUGH)
+    for i in np.flatnonzero(error > POOR):
+        # Draws that miss a small, bent posterior make it too small, never too large.
+        out[i] = max(out[i], log_z_laplace(model, data[:, i], tried[0][i], tried[1][i]))
+    return out
+
+
+def effort_of(fit: ModelFit) -> PooledEffort:
+    """Effort of the evidences of simulated data sets."""
+    return SMALL if len(fit.model.likelihood.samples) > LARGE else QUICK
 
 
 def _fitted(
     fit: ModelFit,
     data: FloatArray,
-    tried: Mapping[str, tuple[FloatArray, FloatArray]],
+    tried: Mapping[str, Fits],
     fits: Sequence[ModelFit],
     rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray]:
+) -> Fits:
     """Fits (n, n_starts, n_dim) and χ² (n, n_starts) of data sets (n_data, n).
 
     They begin where the banks of seeds say, at random, at the fits to the data themselves, and
     where models that this one holds have their best fits.
     """
     model, n = fit.model, data.shape[1]
-    n_random = RANDOM_STARTS if len(model.likelihood.samples) <= LARGE else RANDOM_STARTS // 4
-    inner = [f for f in fits if f.hypothesis.name in tried and f.hypothesis.within(fit.hypothesis)]
-    seeds = []
-    for i, one in enumerate(data.T):
-        starts = [bank.seeds(one) for bank in fit.banks]
-        starts.append(rng.random((n_random if model.n_dim else 0, model.n_dim)))
-        for part in inner:
+    starts = [bank.seeds(data) for bank in fit.banks]
+    starts.append(rng.random((n, RANDOM_STARTS if model.n_dim else 0, model.n_dim)))
+    for part in fits:
+        if part.hypothesis.name in tried and part.hypothesis.within(fit.hypothesis):
             cube, chi2 = tried[part.hypothesis.name]
-            starts.append(embedded(model, part.model, cube[i, int(np.argmin(chi2[i]))])[None])
-        starts.append(fit.cube[: KNOWN_STARTS if model.n_dim else 1])
-        seeds.append(np.concatenate(starts))
-    # The banks' seeds come first: of data sets with more of them the worst are left out.
-    most = min(len(s) for s in seeds)
-    every = np.concatenate([s[-most:] for s in seeds])
-    cube, chi2 = least_squares(model, every, np.repeat(data, most, axis=1))
-    return cube.reshape(n, most, -1), chi2.reshape(n, most)
+            best = cube[np.arange(n), chi2.argmin(axis=1)]
+            starts.append(embedded(model, part.model, best)[:, None])
+    known = fit.cube[: KNOWN_STARTS if model.n_dim else 1]
+    starts.append(np.broadcast_to(known, (n, *known.shape)))
+    every = np.concatenate(starts, axis=1)
+    flat = np.concatenate(every)
+    cube, chi2 = least_squares(model, flat, np.repeat(data, every.shape[1], axis=1), STEPS)
+    return cube.reshape(every.shape), chi2.reshape(every.shape[:2])
 
 
-def _bound(fit: ModelFit, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> float:
-    """ln L of the best fit, which the evidence of a hopeless model is below."""
-    at = cube[[int(np.argmin(chi2))]]
-    return float(fit.model.log_prob(at, data)[0])
+def _bound(fit: ModelFit, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> FloatArray:
+    """ln L (n,) of the best fits, which the evidence of a hopeless model is below."""
+    at = cube[np.arange(len(cube)), chi2.argmin(axis=1)]
+    difference = fit.model.difference(fit.model.predict(at), data)
+    return fit.model.likelihood.noise.log_prob(difference)

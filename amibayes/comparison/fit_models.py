@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.comparison.fitting import SeedBank, least_squares
+from amibayes.comparison.fitting import STEPS, SeedBank, least_squares
 from amibayes.comparison.hypotheses import Hypothesis
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.units import FloatArray
@@ -15,6 +15,9 @@ from amibayes.units import FloatArray
 START_VALUES, MIN_STARTS, MAX_STARTS = 20_000, 16, 256
 """Model values of all random starting points of the data, and limits of their number. Of 300 that
 were fitted to strong NIRISS data, more than half ended in the best fit of rings and discs."""
+
+FIRST_STEPS, CONTINUED = 8, 64
+"""Steps that every fit takes, and how many, the best ones, go on to their end."""
 
 KEPT = 24
 """Fits that are kept of each model, the best ones."""
@@ -76,14 +79,16 @@ def fit_model(
     """
     data = model.likelihood.observables.data
     banks = tuple(_banks(model, parts, int(rng.integers(2**31))))
-    starts = [bank.seeds(data) for bank in banks]
+    starts = [bank.seeds(data[:, None])[0] for bank in banks]
     starts.append(rng.random((n_starts(model) if model.n_dim else 1, model.n_dim)))
     starts += [embedded(model, part.model, part.cube[0])[None] for part in parts]
     if known is not None:
         starts.append(model.cube(known))
     every = np.concatenate(starts)
-    cube, chi2 = least_squares(model, every, np.tile(data[:, None], (1, len(every))))
-    order = np.argsort(chi2, kind="stable")[:KEPT]
+    for steps, kept in ((FIRST_STEPS, CONTINUED), (STEPS, KEPT)):
+        cube, chi2 = least_squares(model, every, np.tile(data[:, None], (1, len(every))), steps)
+        order = np.argsort(chi2, kind="stable")[:kept]
+        every = cube[order]
     return ModelFit(model, cube[order], chi2[order], banks)
 
 
@@ -101,19 +106,20 @@ def _banks(model: CubeModel, parts: Sequence[ModelFit], seed: int) -> list[SeedB
 
 
 def embedded(model: CubeModel, part: CubeModel, cube: FloatArray) -> FloatArray:
-    """Point of the cube where a simpler model is at (n_dim,), other sources without light.
+    """Points of the cube (…, n_dim) where a simpler model is at, other sources without light.
 
     A crescent takes the place of a ring.
     """
-    out = np.full(model.n_dim, 0.5)
+    out = np.full((*cube.shape[:-1], model.n_dim), 0.5)
     for _, flux in model.groups:
-        out[flux] = 0.0
+        out[..., flux] = 0.0
     names = list(part.likelihood.parameters.names)
     for k, parameter in enumerate(model.likelihood.parameters):
         for name in (parameter.name, parameter.name.replace("crescent_", "ring_")):
             if name in names:
-                out[k] = cube[names.index(name)]
+                out[..., k] = cube[..., names.index(name)]
                 break
         else:
-            out[k] = 0.0 if parameter.name.endswith("_modulation") else out[k]
+            if parameter.name.endswith("_modulation"):
+                out[..., k] = 0.0
     return out

@@ -36,7 +36,7 @@ APART = 0.05
 
 
 def least_squares(
-    model: CubeModel, cube: FloatArray, data: FloatArray
+    model: CubeModel, cube: FloatArray, data: FloatArray, steps: int = STEPS
 ) -> tuple[FloatArray, FloatArray]:
     """Fit data sets from starting points, one each.
 
@@ -45,6 +45,8 @@ def least_squares(
     model : CubeModel
     cube : (n, n_dim) float array
     data : (n_data, n) float array
+    steps : int
+        No more than these.
 
     Returns
     -------
@@ -61,7 +63,7 @@ def least_squares(
     pull = np.zeros((n, model.n_dim))
     going = np.arange(n)
     chi2[going], normal[going], pull[going] = _linearised(model, cube, data)
-    for _ in range(STEPS):
+    for _ in range(steps):
         trial = model.inside(
             cube[going] + _steps(model, cube[going], normal[going], pull[going], damping[going])
         )
@@ -156,29 +158,40 @@ class SeedBank:
         return cls(model, reference, columns, flux, cube, without, linear, model.predict(bright))
 
     def seeds(self, data: FloatArray) -> FloatArray:
-        """Starting points for data (n_data,), (n, n_dim): the best of both banks."""
-        model, whiten = self.model, self.model.likelihood.noise.whiten
-        white = whiten(model.difference(self.without, data))
-        match, square = white @ self.faint, (self.faint**2).sum(axis=0)
+        """Starting points (m, 2 · SEEDS, n_dim) for data sets (n_data, m) that are nearly alike.
+
+        The best of both banks, the first of each again where too few differ.
+        """
+        model = self.model
+        white = model.likelihood.noise.whiten(model.difference(self.without[:, None], data))
+        match, square = self.faint.T @ white, (self.faint**2).sum(axis=0)[:, None]
         square = np.maximum(square, 1e-300)
         amount = np.clip(match / square, 0.0, BRIGHT)
         gain = 2.0 * amount * match - amount**2 * square
-        chi2 = (whiten(model.difference(self.bright, data[:, None])) ** 2).sum(axis=0)
-        first = self._chosen(gain)
-        seeds = [self._at(first, amount[first]), self._at(self._chosen(-chi2), BRIGHT)]
-        return np.concatenate(seeds)
+        chi2 = model.chi2_of_pairs(self.bright, data)
+        found = []
+        for k in range(data.shape[1]):
+            first = self._chosen(gain[:, k])
+            bright = self._at(self._chosen(-chi2[:, k]), BRIGHT)
+            found.append(np.concatenate([self._at(first, amount[first, k]), bright]))
+        return np.array(found)
 
     def _chosen(self, merit: FloatArray) -> IntArray:
-        """The best shapes that differ from each other."""
-        best = np.argsort(-merit, kind="stable")[: 40 * SEEDS]
-        kept: list[int] = []
-        for i in best:
-            gap = np.abs(self.model.apart(self.cube[i], self.cube[kept]))
-            if not kept or gap.max(axis=1).min() > APART:
-                kept.append(int(i))
-            if len(kept) == SEEDS:
-                break
+        """The best shapes that differ from each other, (SEEDS,)."""
+        best = np.argpartition(-merit, 40 * SEEDS)[: 40 * SEEDS]
+        best = best[np.argsort(-merit[best], kind="stable")]
+        kept = [int(best[0])]
+        gap = self._apart(best, best[0])
+        for _ in range(SEEDS - 1):
+            free = np.flatnonzero(gap > APART)
+            kept.append(int(best[free[0]]) if len(free) else kept[0])
+            gap = np.minimum(gap, self._apart(best, kept[-1]))
         return np.array(kept, dtype=np.intp)
+
+    def _apart(self, index: IntArray, one: int) -> FloatArray:
+        """Largest difference of shapes from one of them in any dimension, (n,)."""
+        change = self.model.apart(self.cube[index], self.cube[one])
+        return np.asarray(np.abs(change).max(axis=1))
 
     def _at(self, index: IntArray, flux: FloatArray | float) -> FloatArray:
         return _with_flux(self.model, self.cube[index], self.flux, flux)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from amibayes.comparison.unit_cube import CubeModel
+from amibayes.likelihood.quadrature import log_sum
 from amibayes.posterior.sampler import Draws
 from amibayes.units import FloatArray
 
@@ -36,8 +37,8 @@ REACHES = np.geomspace(0.5, 1e-4, 13)
 """Steps along one dimension of the cube, a factor of two from one to the next."""
 
 GOOD_ERROR, REPEATS = 0.15, 3
-"""Error of ln Z below which no more draws are made: odds change by 3 at ln Z 1; and how often the
-draws may be doubled for it."""
+"""Error of ln Z below which no more draws are made: odds change by 3 at ln Z 1; and how often
+twice as many draws may be made for it."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,8 @@ class Effort:
     modes : int
         Draws around the best fits that count; each adaptation takes half as many.
     repeats : int
-        How often the draws that count are doubled where the error is large.
+        How often the mixture is fitted again, and drawn from twice as much, where the error is
+        large.
     centres : int
         Best fits that are drawn around.
     rounds : int
@@ -121,9 +123,8 @@ class Mixture:
             out[k] = norm - log_volume - 0.5 * (TAILS + d) * np.log1p(size / TAILS)
         return out + np.log(self.share)[:, None]
 
-    def adapted(self, cube: FloatArray, log_weight: FloatArray) -> Mixture:
-        """Fit to weighted draws, by one step of expectation and maximisation."""
-        weight = _tempered(log_weight, ENOUGH * self.model.n_dim)
+    def adapted(self, cube: FloatArray, weight: FloatArray) -> Mixture:
+        """Fit to draws with weights that sum to 1, by one step of expectation and maximisation."""
         parts = self.log_parts(cube)
         belongs = np.exp(parts - log_sum(parts)) * weight
         share = belongs.sum(axis=1)
@@ -137,17 +138,17 @@ class Mixture:
             spread = (step - mean).T @ ((step - mean) * part[:, None])
             centre[k] = centre[k] + mean
             scatter[k] = _cholesky(1.2 * spread)
-        share = np.maximum(share / share.sum(), LEAST_SHARE)
+        share = np.maximum(share / share.sum(), min(LEAST_SHARE, 0.25 / len(share)))
         return Mixture(self.model, centre, scatter, share / share.sum())
 
 
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights that sum to 1, raised to the power at which enough draws count.
+def tempered(log_weight: FloatArray, n_dim: int) -> FloatArray:
+    """Weights that sum to 1, raised to the power at which enough draws count for a fit.
 
     A mixture that is too narrow gives a few draws nearly all of the weight; fitted to these it
     would become narrower still.
     """
-    power, weight = 1.0, np.zeros(0)
+    power, weight, least = 1.0, np.zeros(0), ENOUGH * n_dim
     while power > LEAST_POWER:
         weight = np.exp(power * (log_weight - log_weight.max()))
         weight /= weight.sum()
@@ -174,41 +175,61 @@ def first_mixture(model: CubeModel, cube: FloatArray, chi2: FloatArray, centres:
         if len(kept) == centres or (kept and chi2[i] > chi2[kept[0]] + MODE_LIMIT):
             break
         kept.append(int(i))
-    centre = cube[kept]
-    slopes = model.linear(centre)[1]
+    share = np.exp(-0.25 * (chi2[kept] - chi2[kept[0]])) + LEAST_SHARE
+    shapes = laplace_shapes(model, cube[kept])
+    return Mixture(model, off_edges(model, cube[kept], shapes), shapes, share / share.sum())
+
+
+def off_edges(model: CubeModel, centre: FloatArray, shapes: FloatArray) -> FloatArray:
+    """Centres (k, n_dim) that are 1σ from the edges of the cube.
+
+    Of a fit that stands at many edges (no flux, no width, no disc of the star) hardly a draw
+    would lie inside. Other dimensions follow as the covariance says, and the data do not.
+    """
+    found = np.array(centre)
+    for one, triangle in zip(found, shapes, strict=True):
+        covariance = triangle @ triangle.T
+        for k in np.flatnonzero(~model.turning):
+            away = min(float(np.sqrt(covariance[k, k])), 0.5)
+            step = np.clip(one[k], away, 1.0 - away) - one[k]
+            one += step * covariance[:, k] / covariance[k, k]
+    return np.where(model.turning, found, np.clip(found, 0.0, 1.0))
+
+
+def laplace_shapes(model: CubeModel, centre: FloatArray) -> FloatArray:
+    """Lower triangles (k, n_dim, n_dim) of the covariances of fits (k, n_dim)."""
     scatter = []
-    for one, part in zip(centre, slopes, strict=True):
+    for part, reach in zip(model.linear(centre)[1], _reach(model, centre), strict=True):
         precision = part.T @ part + UNIFORM_PRECISION * np.eye(model.n_dim)
-        reach = _reach(model, one)
         bent = np.diag(precision) < 0.1 / reach**2
         precision[bent, bent] = 1.0 / reach[bent] ** 2
         scatter.append(_cholesky(np.linalg.inv(precision)))
-    share = np.exp(-0.25 * (chi2[kept] - chi2[kept[0]])) + LEAST_SHARE
-    return Mixture(model, centre, np.array(scatter), share / share.sum())
+    return np.array(scatter)
 
 
 def _reach(model: CubeModel, centre: FloatArray) -> FloatArray:
-    """How far from a point each dimension alone changes the data by 1σ, (n_dim,).
+    """How far from points (k, n_dim) each dimension alone changes the data by 1σ, (k, n_dim).
 
     At an edge, as of a ring without width, the data do not move to first order: their slopes
     leave open what is well known.
     """
-    step = np.concatenate([REACHES, -REACHES])
-    trial = centre + np.eye(model.n_dim)[:, None] * step[:, None]
-    inside = ((trial >= 0.0) & (trial <= 1.0)).all(axis=2) | model.turning[:, None]
-    predicted = model.predict(model.inside(trial.reshape(-1, model.n_dim)))
-    change = model.likelihood.wrapped(predicted - model.predict(centre[None]))
-    size = (model.likelihood.noise.whiten(change) ** 2).sum(axis=0).reshape(trial.shape[:2])
+    step, d = np.concatenate([REACHES, -REACHES]), model.n_dim
+    trial = centre[:, None, None] + np.eye(d)[:, None] * step[:, None]
+    inside = ((trial >= 0.0) & (trial <= 1.0)).all(axis=3) | model.turning[:, None]
+    there = np.repeat(model.predict(centre), d * len(step), axis=1)
+    change = model.predict(model.inside(trial.reshape(-1, d))) - there
+    white = model.likelihood.noise.whiten(model.likelihood.wrapped(change))
+    size = (white**2).sum(axis=0).reshape(inside.shape)
     seen = np.where(inside & (size < 1.0), np.abs(step), REACHES[-1])
-    return np.asarray(seen.max(axis=1))
+    return np.asarray(seen.max(axis=2))
 
 
 def log_z_laplace(model: CubeModel, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> float:
     """ln Z of a Gaussian at the best fit, half of it in every dimension that is at an edge."""
-    mixture = first_mixture(model, cube, chi2, 1)
-    best = mixture.centre[0]
+    best = cube[int(np.argmin(chi2))]
     edges = ((best <= 0.0) | (best >= 1.0)) & ~model.turning
-    volume = np.log(np.diag(mixture.scatter[0])).sum() + 0.5 * len(best) * np.log(2.0 * np.pi)
+    triangle = laplace_shapes(model, best[None])[0]
+    volume = np.log(np.diag(triangle)).sum() + 0.5 * len(best) * np.log(2.0 * np.pi)
     at_best = model.log_prob(best[None], data)[0]
     return float(at_best + min(volume - np.log(2.0) * edges.sum(), 0.0))
 
@@ -250,36 +271,25 @@ def integrate(
     mixture = first_mixture(model, cube, chi2, effort.centres)
     for _ in range(effort.rounds):
         drawn, value = _drawn(model, data, mixture, effort.modes // 2, rng)
-        every = np.concatenate([known.cube, drawn])
-        values = np.concatenate([at_prior, value])
-        share = len(known.cube) / len(every)
-        mixture = mixture.adapted(every, values - _log_density(mixture, every, share))
-    return _counted(model, data, mixture, known.cube, at_prior, rng, effort)
-
-
-def _counted(
-    model: CubeModel,
-    data: FloatArray,
-    mixture: Mixture,
-    known: FloatArray,
-    at_prior: FloatArray,
-    rng: np.random.Generator,
-    effort: Effort,
-) -> Draws:
-    """Draw those that count, until the evidence is known well enough."""
-    drawn, value, tried = np.zeros((0, model.n_dim)), np.zeros(0), 0
+        mixture = _refitted(mixture, (known.cube, drawn), (at_prior, value))
     for k in range(1 + effort.repeats):
-        n = effort.modes * max(1, 2 ** (k - 1))
-        more, values = _drawn(model, data, mixture, n, rng)
-        drawn, value, tried = (
-            np.concatenate([drawn, more]),
-            np.concatenate([value, values]),
-            tried + n,
-        )
-        found = _weighed(model, mixture, (known, drawn), (at_prior, value), tried)
+        n = effort.modes * 2**k
+        drawn, value = _drawn(model, data, mixture, n, rng)
+        found = _weighed(model, mixture, (known.cube, drawn), (at_prior, value), n)
         if found.diagnostics["log_z_error"] < GOOD_ERROR:
             break
+        # What was drawn places the mixture better; the draws that count are then new ones.
+        mixture = _refitted(mixture, (known.cube, drawn), (at_prior, value))
     return found
+
+
+def _refitted(
+    mixture: Mixture, cubes: tuple[FloatArray, FloatArray], values: tuple[FloatArray, FloatArray]
+) -> Mixture:
+    """Fit a mixture to draws from the prior and from itself, and their log-likelihoods."""
+    cube = np.concatenate(cubes)
+    log_weight = np.concatenate(values) - log_density(mixture, cube, len(cubes[0]) / len(cube))
+    return mixture.adapted(cube, tempered(log_weight, mixture.model.n_dim))
 
 
 def _weighed(
@@ -292,7 +302,7 @@ def _weighed(
     """Weights of draws from the prior and from the mixture; those outside count as 0."""
     n = len(cubes[0]) + tried
     cube, value = np.concatenate(cubes), np.concatenate(values)
-    log_weight = value - _log_density(mixture, cube, len(cubes[0]) / n)
+    log_weight = value - log_density(mixture, cube, len(cubes[0]) / n)
     log_z = float(log_sum(log_weight) - np.log(n))
     relative = np.exp(log_weight - log_z)
     error = float(np.sqrt(max((relative**2).sum() / n - 1.0, 0.0) / n))
@@ -309,13 +319,7 @@ def _drawn(
     return cube, model.log_prob(cube, data) if len(cube) else np.zeros(0)
 
 
-def _log_density(mixture: Mixture, cube: FloatArray, prior_share: float) -> FloatArray:
+def log_density(mixture: Mixture, cube: FloatArray, prior_share: float) -> FloatArray:
     """Log-density of the prior and the mixture together."""
     parts = mixture.log_parts(cube) + np.log1p(-prior_share)
     return np.asarray(np.logaddexp(np.log(prior_share), log_sum(parts)))
-
-
-def log_sum(log: FloatArray) -> FloatArray:
-    """ln Σ exp along the first axis; scipy's takes three times as long over short axes."""
-    top = log.max(axis=0)
-    return np.asarray(top + np.log(np.exp(log - top).sum(axis=0)))

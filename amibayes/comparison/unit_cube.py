@@ -18,6 +18,13 @@ STEP = 1e-5
 BATCH_VALUES = 400_000
 """Model values (points × parameter sets) that are worked on together: they stay in the cache."""
 
+FAR = 25.0
+"""Models whose ln L is so far below the best fit's count for nothing in an evidence (1e-11)."""
+
+WIDE_PHASES = 1.0
+"""Scatter of closure phases between data sets, in radians, from which on differences of whitened
+data do not tell which models are near: a difference may go the other way round the circle."""
+
 
 @dataclass(frozen=True, eq=False)
 class CubeModel:
@@ -84,6 +91,42 @@ class CubeModel:
     def log_prob_of(self, predicted: FloatArray, data: FloatArray) -> FloatArray:
         """Log-likelihood (n,) of data (n_data,) given what models predict (n_data, n)."""
         return self.likelihood.noise.log_prob(self.difference(predicted, data[:, None]))
+
+    def log_prob_of_many(
+        self, predicted: FloatArray, data: FloatArray, best: FloatArray
+    ) -> FloatArray:
+        """Log-likelihoods (n, m) of data sets (n_data, m) given what models predict (n_data, n).
+
+        Where ln L is below that of a best fit, of χ² (m,), by more than `FAR`, it is −∞: which
+        pairs these are is seen in one product of matrices of whitened data.
+        """
+        noise = self.likelihood.noise
+        # Where even the best fit is bad, noise of unknown amount makes up for it: what counts as
+        # far away goes with that.
+        scale = np.maximum(1.0, best / noise.n_independent)
+        seen = self._near(predicted, data, best + scale * noise.delta_chi2(np.full(1, FAR)))
+        out = np.full(seen.shape, -np.inf)
+        for k, one in enumerate(data.T):
+            if seen[:, k].any():
+                out[seen[:, k], k] = self.log_prob_of(predicted[:, seen[:, k]], one)
+        return out
+
+    def _near(self, predicted: FloatArray, data: FloatArray, limit: FloatArray) -> BoolArray:
+        """Which pairs of a model (n) and a data set (m) have a χ² below the limits (m,)."""
+        apart = self.difference(data[:, :1], data)[self.likelihood.observables.n_vis2 :]
+        if np.abs(apart).max(initial=0.0) > WIDE_PHASES:
+            return np.ones((predicted.shape[1], data.shape[1]), dtype=bool)
+        return np.asarray(self.chi2_of_pairs(predicted, data) < limit)
+
+    def chi2_of_pairs(self, predicted: FloatArray, data: FloatArray) -> FloatArray:
+        """χ² (n, m) of predictions (n_data, n) for data sets (n_data, m) that are nearly alike.
+
+        Closure phases go the short way round to the first data set, and from there to the others.
+        """
+        whiten, first = self.likelihood.noise.whiten, data[:, :1]
+        near, far = whiten(self.difference(first, data)), whiten(self.difference(predicted, first))
+        sizes = (far**2).sum(axis=0)[:, None] + (near**2).sum(axis=0)
+        return np.asarray(sizes + 2.0 * far.T @ near)
 
     def difference(self, predicted: FloatArray, data: FloatArray) -> FloatArray:
         """Data minus model, closure phases the short way round."""

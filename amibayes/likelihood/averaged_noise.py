@@ -34,7 +34,7 @@ from amibayes.likelihood.noise_terms import (
     kinds_of,
     with_nodes,
 )
-from amibayes.likelihood.quadrature import Marginal
+from amibayes.likelihood.quadrature import Marginal, log_sum
 from amibayes.likelihood.residuals import files_of, groups_of
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -86,7 +86,7 @@ class AveragedNoise(FittedNoise):
 
     def log_prob(self, residual: FloatArray) -> FloatArray:
         """Log-likelihood (n,) of residuals (n_data, n), averaged over the amounts."""
-        parts = [logsumexp(term.log_parts(residual), axis=0) for term in self.terms]
+        parts = [log_sum(term.log_parts(residual)) for term in self.terms]
         return np.asarray(np.sum(parts, axis=0))
 
     def delta_chi2(self, log_gain: FloatArray) -> FloatArray:

