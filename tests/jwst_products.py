@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.instrument import load_instrument
+from amibayes.instrument import Mask, load_instrument
 from amibayes.oifits.products.repairs import with_columns
 from amibayes.oifits.tables import OIFits, open_oifits
 from amibayes.units import ComplexArray, FloatArray
@@ -25,23 +25,29 @@ ROLL_DEG, EXPMID = 37.3, 60000.17
 PAIRS, TRIANGLES = MASK.pairs, MASK.triangles
 
 
-def sky_holes(turned_deg: float = ROLL_DEG) -> FloatArray:
+def sky_holes(turned_deg: float = ROLL_DEG, mask: Mask = MASK) -> FloatArray:
     """Holes (7, 2) on the sky, east and north, at some orientation."""
     angle = np.radians(turned_deg)
     c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(MASK.holes_m @ np.array([[-c, s], [s, c]]))
+    return np.asarray(mask.holes_m @ np.array([[-c, s], [s, c]]))
 
 
-def baselines(turned_deg: float = ROLL_DEG) -> FloatArray:
+def baselines(turned_deg: float = ROLL_DEG, mask: Mask = MASK) -> FloatArray:
     """(21, 2) baselines u, v."""
-    holes = sky_holes(turned_deg)
+    holes = sky_holes(turned_deg, mask)
     return np.asarray(holes[PAIRS[:, 1]] - holes[PAIRS[:, 0]])
 
 
-def binary(contrast: float, east_mas: float, north_mas: float, turned_deg: float = ROLL_DEG) -> Any:
+def binary(
+    contrast: float,
+    east_mas: float,
+    north_mas: float,
+    turned_deg: float = ROLL_DEG,
+    mask: Mask = MASK,
+) -> Any:
     """Visibilities (21,) of a star with a companion, at one wavelength."""
     mas = np.pi / 180 / 3.6e6
-    phase = baselines(turned_deg) @ (np.array([east_mas, north_mas]) * mas) / WAVELENGTH_M
+    phase = baselines(turned_deg, mask) @ (np.array([east_mas, north_mas]) * mas) / WAVELENGTH_M
     return (1.0 + contrast * np.exp(-2j * np.pi * phase)) / (1.0 + contrast)
 
 
@@ -142,6 +148,20 @@ def _frame(kind: str, n: int, keywords: dict[str, Any], turned_deg: float) -> tu
     return primary, stations, hdu(target, name="OI_TARGET"), wave
 
 
+def _log(mx: float, my: float, sx: float, sy: float) -> Any:
+    """What the pipeline keeps of its log, its lines broken as in its files."""
+    text = (
+        f"cal_logs:\n    ['2026-11-22T04:36:14.213\n      - jwst.ami.ami_analyze - INFO - Using "
+        f"affine transform with parameters:', \"2026-11-22T04:36:14.213\n      - "
+        f'jwst.ami.ami_analyze - INFO - \\tmx={mx:.6f}\\tmy={my:.6f}", "2026-11-22T04:36:14.214\n'
+        f'      - jwst.ami.ami_analyze - INFO - \\tsx={sx:.6f}\\tsy={sy:.6f}", '
+        f'"2026-11-22T04:36:14.214\n      - jwst.ami.ami_analyze - INFO - \\trotradccw=None"]\n'
+    )
+    content = np.frombuffer(text.encode(), np.uint8)[None]
+    column = fits.Column("ASDF_METADATA", f"{content.size}B", array=content)
+    return fits.BinTableHDU.from_columns([column], name="ASDF")
+
+
 def columns_of(
     kind: str, visibility: ComplexArray, calibrator: ComplexArray | None = None
 ) -> dict[str, dict[str, Any]]:
@@ -176,9 +196,13 @@ def product(
     calibrator: ComplexArray | None = None,
     *,
     turned_deg: float = ROLL_DEG,
+    affine: tuple[float, float, float, float] | None = (1.0, 1.0, 0.0, 0.0),
     **keywords: Any,
 ) -> Any:
-    """HDUs of a product of integrations (n, 21), and of a calibrator's for ``aminorm-oi``."""
+    """HDUs of a product of integrations (n, 21), and of a calibrator's for ``aminorm-oi``.
+
+    ``affine`` (mx, my, sx, sy) is in the log that it keeps; None for no log.
+    """
     values = columns_of(kind, visibility, calibrator)
     uv, holes = baselines(turned_deg), sky_holes(turned_deg)
     two = {"UCOORD": uv[:, 0], "VCOORD": uv[:, 1]}
@@ -195,6 +219,7 @@ def product(
             _data("OI_VIS2", values["OI_VIS2"], two, PAIRS),
             _data("OI_Q4", quads, {}, np.tile(np.arange(4), (35, 1))),
             wave,
+            *([] if affine is None else [_log(*affine)]),
         ]
     )  # fmt: skip
 

@@ -39,6 +39,11 @@ WHY = {
         "warning",
         "EFF_BAND is 5.6 % narrower than the filter: bandwidth smearing is underestimated",
     ),
+    "product-mask-map": (
+        "error",
+        "(u, v) are of the mask as drawn, the fringes of one that is larger and turned: positions "
+        "are off by what is stated",
+    ),
     "product-stations": (
         "warning",
         "STAXYZ is in the axes of the mask, (u, v) are on the sky: they do not belong together",

@@ -11,6 +11,7 @@ source of 1.17 on.
 - MJD is midnight and TIME 0; INT_TIME is that of one integration.
 - EFF_BAND is 5.6 % narrower than the filter at half its height.
 - STAXYZ is in the mask's frame, not turned to the sky; CTRS_EQT is.
+- (u, v) are of the mask as drawn, not of the one that the fringes were fitted with.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 
 from amibayes.errors import DataError, UsageError
 from amibayes.instrument import load_instrument
+from amibayes.oifits.products.mask_map import ProductMap, map_of, mapped_columns
 from amibayes.oifits.products.recognise import Product
 from amibayes.oifits.tables import OIFits, OITable, plain
 from amibayes.units import FloatArray
@@ -64,12 +66,17 @@ def repaired(product: Product) -> tuple[OIFits, list[Repair]]:
     list of Repair
     """
     done: list[Repair] = []
-    tables = tuple(_repaired_table(product, table, done) for table in product.oifits.tables)
+    found = map_of(product)
+    tables = tuple(_repaired_table(product, table, done, found) for table in product.oifits.tables)
     return replace(product.oifits, tables=tables), done
 
 
-def _repaired_table(product: Product, table: OITable, done: list[Repair]) -> OITable:
+def _repaired_table(
+    product: Product, table: OITable, done: list[Repair], found: ProductMap | None
+) -> OITable:
     new: dict[str, Any] = {}
+    if table.name in DATA and found is not None and found.changes:
+        new |= _mapped(found, table, done)
     if table.name in DATA and len(table):
         new |= _times(product, table, done)
     if table.name in ERRORS and product.kind != "amimulti-oi":
@@ -79,7 +86,7 @@ def _repaired_table(product: Product, table: OITable, done: list[Repair]) -> OIT
     if table.name == "OI_WAVELENGTH" and "EFF_BAND" in table.columns:
         new |= _band(product, table, done)
     if table.name == "OI_ARRAY":
-        new |= _stations(product, table, done)
+        new |= _stations(product, table, done, found)
     return with_columns(table, new)
 
 
@@ -262,7 +269,20 @@ def _band(product: Product, table: OITable, done: list[Repair]) -> dict[str, Any
     return {"EFF_BAND": new}
 
 
-def _stations(product: Product, table: OITable, done: list[Repair]) -> dict[str, Any]:
+def _mapped(found: ProductMap, table: OITable, done: list[Repair]) -> dict[str, Any]:
+    new = mapped_columns(found, table)
+    if new:
+        change = (
+            f"(u, v) made those of the mask that the fringes were fitted with ({found.known_from})"
+        )
+        turned = f"angles were {found.angle_deg:+.2f} deg off, {found.uncertainty}"
+        done.append(Repair("product-mask-map", table.name, f"{change}: {turned}"))
+    return new
+
+
+def _stations(
+    product: Product, table: OITable, done: list[Repair], found: ProductMap | None
+) -> dict[str, Any]:
     """Places of the holes on the sky, from CTRS_EQT, where they give the file's (u, v)."""
     turned, rows = table.columns.get("CTRS_EQT"), product.table("OI_VIS2")
     index = table.columns.get("STA_INDEX")
@@ -279,4 +299,5 @@ def _stations(product: Product, table: OITable, done: list[Repair]) -> dict[str,
     if np.abs(uv - stated).max() > 1e-3 * np.abs(stated).max():
         return {}
     done.append(Repair("product-stations", table.name, "STAXYZ turned to the sky (CTRS_EQT)"))
+    sky = sky if found is None else sky @ found.on_sky.T
     return {"STAXYZ": np.column_stack([sky, np.zeros(len(sky))])}
