@@ -15,12 +15,18 @@ field span are few numbers (`amibayes.companion_search.reduction`).
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, Self
 
 import numpy as np
 
 from amibayes.companion_search.grid import Grid, trial_rates
+from amibayes.companion_search.matched_filter import (
+    MatchedFilter,
+    dense_filter,
+    few,
+    positive,
+)
 from amibayes.companion_search.reduction import Reduction, reduction_of
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.companion_search.templates import (
@@ -38,9 +44,6 @@ from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
-
-MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
-
 
 class TemplateBank:
     """Whitened templates of a faint companion, nuisance directions projected out.
@@ -233,15 +236,17 @@ class TemplateBank:
 
         Contrasts below zero gain nothing.
         """
-        rows = self._rows(self.project(residuals)[:, None])
+        data = self.project(residuals)
+        if not self.joint and few(self.n_rows, len(self._samples)):
+            response = self._even, self._odd, self._offset
+            return dense_filter(*response, self.nuisance_basis, data, self._waves_into)
+        rows = self._rows(data[:, None])
 
         def best(position: FloatArray) -> tuple[FloatArray, float]:
             templates = self._at(position)
             match = [m[0] for m in templates.match(rows)]
             if not self.joint:
-                signed = float(match[0][0])
-                contrast = signed * templates.sigma[:, 0]
-                return contrast, max(signed, 0.0) ** 2
+                return positive(float(match[0][0]), float(templates.sigma[0, 0]))
             units, gain = templates.best(match)
             top = int(gain.argmax())
             rate = self.rates_mas_yr[top] if self._moves else np.empty(0)
@@ -323,17 +328,17 @@ class TemplateBank:
     ) -> tuple[FloatArray, FloatArray]:
         """Cosine and sine, (n_samples, m), of places (m,) or of moving ones (n_samples, m)."""
         cosine, sine = np.empty((2, len(self._samples), np.shape(east_mas)[-1]))
-        fringes_into(cosine, sine, self._samples, east_mas, north_mas, self._smearing)
-        self._seen(cosine, sine, east_mas, north_mas)
+        self._waves_into(cosine, sine, east_mas, north_mas)
         return cosine, sine
 
-    def _seen(
+    def _waves_into(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
     ) -> None:
-        """Apply the companion's disc, and the extraction's response off the axis, in place.
+        """Fill what `_waves_at` gives: fringes, with the companion's disc and the response off the axis.
 
         dV/dc = ρDE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
         """
+        fringes_into(cosine, sine, self._samples, east_mas, north_mas, self._smearing)
         if self._disc is not None:
             cosine *= self._disc
             sine *= self._disc
