@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import emcee
 import numpy as np
@@ -22,6 +23,7 @@ from amibayes.calibration.transfer import ClosureSet, Transfer, closure_sets
 from amibayes.calibration.weighted import TransferFunction, shared_changes
 from amibayes.errors import RunError
 from amibayes.support.ensemble_moves import along_others
+from amibayes.support.shared_results import shared
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 PRIOR_WIDTH = 5.0
@@ -288,6 +290,20 @@ def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:
     return tau
 
 
+def _tau_of(population: Population, rng: np.random.Generator) -> FloatArray:
+    """Draws of `sample_tau`, which targets of a survey share where their calibrators are the same.
+
+    The target's own data are no part of the population.
+    """
+
+    def drawn() -> tuple[FloatArray, Any]:
+        return sample_tau(population, rng), rng.bit_generator.state
+
+    tau, after = shared(drawn, "scatter between calibrators", population, rng.bit_generator.state)
+    rng.bit_generator.state = after
+    return tau
+
+
 def hierarchical_response(
     transfers: Sequence[Transfer],
     keys: Keys,
@@ -303,7 +319,7 @@ def hierarchical_response(
     """
     known = np.asarray(np.array([t.seen for t in transfers]).any(axis=0))
     population = population_of(transfers, keys, known, covariate)
-    tau = sample_tau(population, rng)
+    tau = _tau_of(population, rng)
     value, covariance = predictive(population, tau, len(keys))
 
     def combine(changes: FloatArray) -> FloatArray:

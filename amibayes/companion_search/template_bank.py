@@ -45,6 +45,7 @@ from amibayes.units import FloatArray, IntArray, SingleArray
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
 
+
 class TemplateBank:
     """Whitened templates of a faint companion, nuisance directions projected out.
 
@@ -334,7 +335,7 @@ class TemplateBank:
     def _waves_into(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
     ) -> None:
-        """Fill what `_waves_at` gives: fringes, with the companion's disc and the response off the axis.
+        """Fill what `_waves_at` gives: fringes, the companion's disc, the response off the axis.
 
         dV/dc = ρDE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
         """

@@ -26,7 +26,7 @@ from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
-from amibayes.detection.statistic import pieces_of
+from amibayes.detection.null_draws import pieces_of
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of

@@ -9,7 +9,6 @@ simulated data sets are drawn and searched by the same one as the data are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Protocol, Self
 
 import numpy as np
@@ -18,6 +17,7 @@ from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult, null_likelihood
 from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.detection.null_draws import null_draws
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.treatments import (
     ErrorTreatment,
@@ -31,19 +31,9 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.linear_response import companions_beside
 from amibayes.likelihood.rotation_null import rotation_null
 from amibayes.likelihood.student import SymmetricWhitening
-from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
+from amibayes.parallel import Executor, Journal, Progress
 from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray, IntArray
-
-DRAWS_AT_ONCE, NUMBERS_AT_ONCE = 2048, 8_000_000
-"""Null data sets per matrix product: what keeps the product in cache, and at most so many numbers
-of data, which keeps large data within 64 MB."""
-
-
-def pieces_of(n_draws: int, n_data: int) -> list[int]:
-    """Sizes of the pieces that null draws are made in."""
-    at_once = max(1, min(DRAWS_AT_ONCE, NUMBERS_AT_ONCE // max(n_data, 1)))
-    return [len(range(n_draws)[part]) for part in slices(n_draws, at_once)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +261,10 @@ class BankStatistic:
         rng : numpy.random.Generator
         executor, progress, journal : optional, see `amibayes.parallel.run_job`
         """
-        sizes = pieces_of(n, self.bank.n_rows)
-        pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
-        work, where = partial(_null_piece, self), executor or SerialExecutor()
-        done = run_job(work, pieces, where, journal=journal, progress=progress)
-        return np.concatenate([piece["statistic"] for piece in done])
+        return null_draws(
+            self.bank, self.treatment, self.ratio, n, rng,
+            executor=executor, progress=progress, journal=journal,
+        )  # fmt: skip
 
     def gain_at(self, statistic: FloatArray) -> FloatArray:
         """Gain in χ², in units of the noise, that reaches values of the statistic, any shape."""
@@ -298,13 +287,6 @@ class BankStatistic:
     def null_rests_on_residuals(self) -> bool:
         """Whether `with_noise_of` other residuals changes the distribution of null draws."""
         return self.treatment.null_rests_on_residuals
-
-
-def _null_piece(
-    test: BankStatistic, piece: tuple[np.random.SeedSequence, int]
-) -> dict[str, FloatArray]:
-    seed, size = piece
-    return {"statistic": test.simulated(size, np.random.default_rng(seed)).statistic}
 
 
 @checks_arguments

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
 from amibayes.pipeline.warnings import calibration_warnings, vetting_warnings
+from amibayes.support.shared_results import shared
 
 MIN_TO_VET = 3
 """Of two calibrators that disagree the bad one cannot be known."""
@@ -147,14 +149,7 @@ def _calibrated(
     sizes = diameters or [(0.0, 0.0)] * len(references)
     if len(references) >= MIN_TO_VET and not options.keep_all:
         with run.stage("vet"):
-            vetting = vet(
-                [without_disc(r, size) for r, (size, _) in zip(references, sizes, strict=True)],
-                separation_mas=options.separation_mas,
-                null_draws=VETTING_DRAWS,
-                limits=False,
-                fewest=MIN_TO_VET,
-                seed=options.seed,
-            )
+            vetting = _vetted(references, [size for size, _ in sizes], options)
             serving = _kept(references, vetting)
     kept = {id(reference) for reference in serving}
     sizes = [d for r, d in zip(references, sizes, strict=True) if id(r) in kept]
@@ -174,6 +169,23 @@ def _calibrated(
         serving=tuple(serving),
         diameters_mas=tuple(sizes),
     )
+
+
+def _vetted(
+    references: list[Observables], sizes_mas: list[float], options: SearchOptions
+) -> Vetting:
+    """Vet the calibrators, once for all targets of a survey that have the same ones."""
+    points = [without_disc(r, size) for r, size in zip(references, sizes_mas, strict=True)]
+    vetted = partial(
+        vet,
+        points,
+        separation_mas=options.separation_mas,
+        null_draws=VETTING_DRAWS,
+        limits=False,
+        fewest=MIN_TO_VET,
+        seed=options.seed,
+    )
+    return shared(vetted, "vetting", points, options.separation_mas, options.seed)
 
 
 def _kept(references: list[Observables], vetting: Vetting) -> list[Observables]:

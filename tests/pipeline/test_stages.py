@@ -28,7 +28,7 @@ def test_finished_null_draws_are_kept(target: Path, tmp_path: Path, monkeypatch)
     def fail(*arguments: object) -> None:
         raise AssertionError("drawn again")
 
-    monkeypatch.setattr("amibayes.detection.statistic._null_piece", fail)
+    monkeypatch.setattr("amibayes.detection.null_draws._piece", fail)
     again = search_companion([target], [], QUICK, journals=journals)
     assert first.significance is not None
     assert again.significance is not None

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from amibayes.cli.options import common
 from amibayes.errors import AmibayesError, DataError, UsageError
 from amibayes.support.atomic_files import output_locks
+from amibayes.support.shared_results import sharing
 
 if TYPE_CHECKING:
     from amibayes.pipeline.batch import SurveyTarget
@@ -386,7 +387,7 @@ def _performed(job: Job) -> str:
     assert job.arguments is not None
     common.configure_logging(job.arguments)
     try:
-        with output_locks():
+        with output_locks(), sharing():
             job.command.perform(job.arguments)
     except AmibayesError as error:
         return error.command_line
