@@ -1,12 +1,16 @@
 """Surveys of simulated stars: stated and realised rates, frequency coverage, cost, a cost model.
 
     python -m benchmarks.survey_study simulate FOLDER --targets 200 --companions 10
-    python -m benchmarks.survey_study study --surveys 20 --targets 50 --companions 5
-    python -m benchmarks.survey_study cost --targets 40 > docs/howto/survey_cost.md
+    python -m benchmarks.survey_study study FILE --surveys 20 --targets 50 --share 0.05 --spread 0.7
+    python -m benchmarks.survey_study table FILE | python docs/pages.py howto/survey.md \\
+        "study: benchmarks/survey_study.py"
+    python -m benchmarks.survey_study cost --targets 40 | python docs/pages.py howto/survey.md \\
+        "cost: benchmarks/survey_study.py"
 
 `simulate` writes NIRISS files and their table, at the level of V² and closure phases. `study`
-searches whole surveys and counts false discoveries and covered frequencies. `cost` measures what
-a target costs and what a dask scheduler does with a task, and says what 10⁵ targets cost.
+searches whole surveys and adds a line of JSON for each to FILE, of which `table` counts false
+discoveries and covered frequencies. `cost` measures what a target costs and what a dask scheduler
+does with a task, and says what 10⁵ targets cost.
 """
 
 from __future__ import annotations
@@ -42,6 +46,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.logistic import fit_logistic
 from amibayes.oifits import write_oifits
 from amibayes.survey.completeness import DetectionProbability
+from amibayes.survey.false_alarms import false_alarms
 from amibayes.survey.rows import Outcome
 
 FIELD = (70.0, 400.0)
@@ -63,20 +68,26 @@ class Star:
     delta_mag: float | None = None
 
 
-def sheet() -> Observables:
-    """NIRISS through F480M: V² to 0.5 %, closure phases to 0.3°."""
+def sheet(factor: float = 1.0) -> Observables:
+    """NIRISS through F480M: V² to 0.5 %, closure phases to 0.3°, times a factor."""
     holes = load_instrument("niriss", "F480M").mask.holes_m
+    errors = 0.005 * factor, np.radians(0.3) * factor
     return point_source(
-        holes, 4.817e-6, 0.302e-6, vis2_error=0.005, closure_error_rad=np.radians(0.3)
+        holes, 4.817e-6, 0.302e-6, vis2_error=errors[0], closure_error_rad=errors[1]
     )
 
 
-def simulated(n: int, n_companions: int, rng: np.random.Generator) -> list[Star]:
-    """Simulate a survey; stars with companions come first."""
-    empty = sheet()
-    likelihood = Likelihood(empty)
+def simulated(
+    n: int, n_companions: int, rng: np.random.Generator, spread: float = 0.0
+) -> list[Star]:
+    """Simulate a survey; stars with companions come first.
+
+    Errors of a star are those of `sheet` times a factor, ln of which is within ``spread`` of 0.
+    """
     stars = []
     for k in range(n):
+        empty = sheet(float(np.exp(rng.uniform(-spread, spread)) if spread else 1.0))
+        likelihood = Likelihood(empty)
         theta, place = [0.0, 0.0, 0.0], (None, None)
         if k < n_companions:
             rho = float(np.exp(rng.uniform(*np.log(FIELD))))
@@ -115,78 +126,107 @@ def search(table: Path, out: Path, *words: object) -> dict[str, Any]:
     return content
 
 
-@dataclass(frozen=True)
-class Tried:
-    """One simulated survey and what was found: see `study`."""
-
-    listed: int
-    false: int
-    found: int
-    detected: int
-    nulls: list[float]
-    frequency: dict[str, Any]
-    truth: float
-
-
-def study(surveys: int, targets: int, share: float, seed: int, workers: int) -> list[Tried]:
-    """Search whole surveys of stars of which a share has companions, and compare with the truth."""
-    out = []
+def study(
+    path: Path, surveys: int, targets: int, share: float, seed: int, spread: float, *, limits: bool
+) -> None:
+    """Search whole surveys of stars of which a share has companions; add a line for each."""
     for k in range(surveys):
         rng = np.random.default_rng([seed, k])
-        stars = simulated(targets, int(rng.binomial(targets, share)), rng)
+        stars = simulated(targets, int(rng.binomial(targets, share)), rng, spread)
+        begin = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
             table = write(Path(folder), stars, rng)
-            content = search(table, Path(folder) / "out", "--seed", k + 1, "--workers", workers)
-        alarms, frequency = content["false_alarms"], content["companion_frequency"]
-        single = {s.name for s in stars if s.delta_mag is None}
-        listed = set(alarms["discovered"])
-        entries = content["targets"]
-        nulls = [e["false_alarm_probability"] for e in entries if e["name"] in single]
-        inside = (frequency["delta_mag"][1] - DEPTHS[0]) / (DEPTHS[1] - DEPTHS[0])
-        found = len(listed - single)
-        out.append(
-            Tried(len(listed), len(listed & single), found, alarms["n_detected"], nulls,
-                  frequency, share * inside)
-        )  # fmt: skip
-        print(f"survey {k + 1}: {found} companions and {len(listed & single)} others listed",
-              file=sys.stderr, flush=True)  # fmt: skip
-    return out
+            words = () if limits else ("--no-limits",)
+            content = search(table, Path(folder) / "out", "--seed", 1000 * seed + k, *words)
+        single = {star.name: star.delta_mag is None for star in stars}
+        p = [(single[e["name"]], e["false_alarm_probability"]) for e in content["targets"]]
+        line = {
+            "targets": targets, "share": share, "spread": spread, "seed": [seed, k],
+            "cpu_s": round(time.process_time() - begin, 2),
+            "nulls": [value for alone, value in p if alone],
+            "companions": [value for alone, value in p if not alone],
+            "frequency": content["companion_frequency"],
+        }  # fmt: skip
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(line) + "\n")
 
 
-def study_lines(tried: list[Tried], targets: int, share: float) -> str:
-    """Tell what came of `study`."""
-    false = np.array([t.false / max(t.listed, 1) for t in tried])
-    nulls = np.concatenate([t.nulls for t in tried])
-    medians = np.array([t.frequency["median"] for t in tried])
-    truth = np.mean([t.truth for t in tried])
-    small = ", ".join(f"{(nulls <= alpha).mean():.3f}" for alpha in (0.01, 0.05, 0.2))
-    table = {
-        "false discoveries at a stated rate of 0.05": _mean(false),
-        "listed: with companions, without": f"{sum(t.found for t in tried)}, "
-        f"{sum(t.false for t in tried)}",
-        "stars without: p below 0.01, 0.05, 0.2": f"{small} of {len(nulls)}",
-        "uniformity of their p": f"{stats.kstest(nulls, 'uniform').pvalue:.2f}",
-        "true frequency inside of the interval": f"{_covered(tried, 68)} (68 %), "
-        f"{_covered(tried, 95)} (95 %)",
-        "mean of the medians": f"{_mean(medians)}; truth {truth:.3f}",
+def tables(path: Path) -> list[str]:
+    """Tables of what came of `study`: of all surveys, and of those with limits."""
+    tried = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    alike = {
+        "equal errors": [t for t in tried if not t["spread"] and not t["frequency"]],
+        "errors of their own": [t for t in tried if t["spread"] and not t["frequency"]],
     }
-    head = (
-        f"{len(tried)} surveys of {targets} stars, {share:.0%} with companions at "
-        f"{FIELD[0]:g} to {FIELD[1]:g} mas and {DEPTHS[0]:g} to {DEPTHS[1]:g} mag:"
-    )
-    rows = [f"| {name} | {value} |" for name, value in table.items()]
-    return "\n".join([head, "", "| | |", "|---|---|", *rows])
+    alike |= {"both": [t for part in alike.values() for t in part]}
+    columns = {name: _rates(part) for name, part in alike.items() if part}
+    rows = [
+        f"| {name} | " + " | ".join(column[name] for column in columns.values()) + " |"
+        for name in next(iter(columns.values()))
+    ]
+    head = "| | " + " | ".join(columns) + " |"
+    covered = _frequencies([t for t in tried if t["frequency"]])
+    return [head, "|---" * (1 + len(columns)) + "|", *rows, "", "| | |", "|---|---|", *covered]
+
+
+def _rates(tried: list[dict[str, Any]]) -> dict[str, str]:
+    """What is listed at a stated false-discovery rate, survey by survey and all together."""
+    every = [_listed(t["nulls"], t["companions"]) for t in tried]
+    nulls = np.concatenate([t["nulls"] for t in tried])
+    false, found = _listed(nulls, np.concatenate([t["companions"] for t in tried]))
+    rate = np.array([n / max(n + right, 1) for n, right in every])
+    n, n_targets = len(nulls), sum(t["targets"] for t in tried)
+    cpu = sum(t["cpu_s"] for t in tried)
+    return {
+        "surveys, stars, companions": f"{len(tried)}, {n_targets}, "
+        f"{sum(len(t['companions']) for t in tried)}",
+        "false discoveries at a stated rate of 0.05": _mean(rate),
+        "listed by the single surveys: with companions, without": f"{sum(e[1] for e in every)}, "
+        f"{sum(e[0] for e in every)}",
+        "… all as one survey": f"{found}, {false}",
+        **{
+            f"stars without: p ≤ {alpha}": f"{(nulls <= alpha).mean():.4f} ± "
+            f"{np.sqrt(alpha * (1 - alpha) / n):.4f}"
+            for alpha in (0.001, 0.01, 0.05, 0.2)
+        },
+        "uniformity of their p (Kolmogorov and Smirnov)": f"{_uniform(nulls):.2f}",
+        "CPU of a target, with its share of the survey's files": f"{cpu / n_targets:.2f} s",
+    }
+
+
+def _uniform(probability: np.ndarray) -> float:
+    return float(stats.kstest(probability, "uniform").pvalue)
+
+
+def _listed(nulls: Any, companions: Any) -> tuple[int, int]:
+    """Stars without and with companions that are listed at `FDR_LEVEL`."""
+    found = false_alarms(np.concatenate([nulls, companions])).discovered
+    return int(found[: len(nulls)].sum()), int(found[len(nulls) :].sum())
+
+
+def _frequencies(tried: list[dict[str, Any]]) -> list[str]:
+    """How often the interval of the frequency holds the truth."""
+    if not tried:
+        return []
+    span = DEPTHS[1] - DEPTHS[0]
+    truth = [t["share"] * (t["frequency"]["delta_mag"][1] - DEPTHS[0]) / span for t in tried]
+    bounds = {level: [t["frequency"][f"interval_{level}"] for t in tried] for level in (68, 95)}
+    inside = {
+        level: sum(low <= f <= high for f, (low, high) in zip(truth, each, strict=True))
+        for level, each in bounds.items()
+    }
+    medians = np.array([t["frequency"]["median"] for t in tried])
+    return [
+        f"| surveys with limits, stars | {len(tried)}, {sum(t['targets'] for t in tried)} |",
+        f"| true frequency inside of the interval | {inside[68]} of {len(tried)} (68 %), "
+        f"{inside[95]} of {len(tried)} (95 %) |",
+        f"| mean of the medians of the frequency | {_mean(medians)}; truth {np.mean(truth):.3f} |",
+    ]
 
 
 def _mean(values: np.ndarray) -> str:
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return f"{values.mean():.3f} ± {error:.3f}"
-
-
-def _covered(tried: list[Tried], level: int) -> str:
-    bounds = [t.frequency[f"interval_{level}"] for t in tried]
-    inside = sum(low <= t.truth <= high for t, (low, high) in zip(tried, bounds, strict=True))
-    return f"{inside} of {len(tried)}"
 
 
 def _cpu() -> float:
@@ -318,24 +358,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("part", choices=("simulate", "study", "cost"))
-    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("part", choices=("simulate", "study", "table", "cost"))
+    parser.add_argument("path", nargs="?", type=Path)
     parser.add_argument("--targets", type=int, default=24)
     parser.add_argument("--companions", type=int, default=5)
     parser.add_argument("--share", type=float, default=0.3)
     parser.add_argument("--surveys", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--spread", type=float, default=0.0)
+    parser.add_argument("--limits", action="store_true")
     arguments = parser.parse_args()
     if arguments.part == "cost":
         print(cost(arguments.targets, arguments.seed))
     elif arguments.part == "study":
-        numbers = arguments.surveys, arguments.targets, arguments.share
-        tried = study(*numbers, arguments.seed, arguments.workers)
-        print(study_lines(tried, arguments.targets, arguments.share))
+        numbers = arguments.surveys, arguments.targets, arguments.share, arguments.seed
+        study(arguments.path, *numbers, arguments.spread, limits=arguments.limits)
+    elif arguments.part == "table":
+        print("\n".join(tables(arguments.path)))
     else:
         rng = np.random.default_rng(arguments.seed)
-        write(arguments.folder, simulated(arguments.targets, arguments.companions, rng), rng)
+        write(arguments.path, simulated(arguments.targets, arguments.companions, rng), rng)
 
 
 if __name__ == "__main__":
