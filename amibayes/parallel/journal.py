@@ -17,10 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.parallel.kept_stages import read_stage, write_stage
 from amibayes.support.atomic_files import atomic_path, cannot_write
 
 NAMES = {"null": "the null searches", "limits": "the injections"}
 """What the jobs of a search are called."""
+
+STAGE = "stage-{}.pickle"
+"""Name of the file of a finished stage."""
 
 Columns = dict[str, NDArray[Any]]
 """What a journalled piece returns: named arrays."""
@@ -95,6 +99,25 @@ class Journals:
         """Open the journal of a job."""
         return Journal(self.path, job, resume=self._resume)
 
+    def read_stage(self, stage: str) -> Any | None:
+        """Give what a finished stage made; None where it has to be done."""
+        return read_stage(self.path / STAGE.format(stage)) if self._resume else None
+
+    def write_stage(self, stage: str, result: Any) -> None:
+        """Keep what a stage made, which has now ended.
+
+        Raises
+        ------
+        RunError
+            Where the folder cannot be written or the disk is full.
+        """
+        path = self.path / STAGE.format(stage)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            write_stage(path, result)
+        except OSError as error:
+            raise cannot_write(path, error) from error
+
     def under(self, part: str) -> Journals:
         """Open the journals of a part of the run."""
         return Journals(self.path, part, resume=self._resume)
@@ -115,12 +138,16 @@ class Journals:
 
     def kept(self, chain: Path | None = None) -> str:
         """Say in words what a run that is cut off leaves for `resume`."""
+        begin, end = STAGE.split("{}")
+        files = sorted(self.path.rglob(STAGE.format("*")), key=lambda path: path.stat().st_mtime_ns)
+        ended = list(dict.fromkeys(path.name[len(begin) : -len(end)] for path in files))
         pieces = sorted(self.path.rglob("piece-*.npz"), reverse=True)  # null searches come first
         folders = [path.relative_to(self.path).parts[:-1] for path in pieces]
         stages = Counter(
             next((NAMES[part] for part in parts if part in NAMES), parts[0]) for parts in folders
         )
-        parts = [f"{n} piece{'' if n == 1 else 's'} of {name}" for name, n in stages.items()]
+        parts = [f"the stages {', '.join(ended)}"] if ended else []
+        parts += [f"{n} piece{'' if n == 1 else 's'} of {name}" for name, n in stages.items()]
         if chain is not None and chain.is_file():
             parts.append("the chain so far")
         return f"kept {', '.join(parts)}" if parts else "no stage that can be kept was begun"

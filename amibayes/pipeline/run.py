@@ -6,8 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 from amibayes.parallel import Executor, Journal, Journals, Progress
+
+Made = TypeVar("Made")
 
 Announce = Callable[[str], None]
 
@@ -47,6 +50,29 @@ class Run:
         begin = time.perf_counter()
         yield
         self.seconds[name] = time.perf_counter() - begin
+
+    def keep(self, part: str, make: Callable[[], Made]) -> Made:
+        """Give what a part of the job makes, or made before it was cut off.
+
+        Parameters
+        ----------
+        part : str
+            Name of its file.
+        make : callable
+            Ends by giving all that the rest of the job takes from it; random numbers that it
+            draws are its own.
+        """
+        if self.journals is None:
+            return make()
+        kept: tuple[Made, dict[str, float]] | None = self.journals.read_stage(part)
+        if kept is None:
+            before = set(self.seconds)
+            made = make()
+            own = {name: s for name, s in self.seconds.items() if name not in before}
+            self.journals.write_stage(part, (made, own))
+            return made
+        self.seconds.update(kept[1])
+        return kept[0]
 
     def journal(self, job: str) -> Journal | None:
         """Open the journal of a job, where finished pieces are kept."""

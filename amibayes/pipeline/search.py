@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from threadpoolctl import threadpool_limits
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
 from amibayes.companion_search.with_extra_noise import noise_averaged
+from amibayes.comparison.compare import ModelComparison
+from amibayes.comparison.limits import LimitsBeside
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.verdict import Verdict
@@ -31,7 +34,7 @@ from amibayes.pipeline.models import (
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
-from amibayes.pipeline.run import Announce, Run, silent
+from amibayes.pipeline.run import Announce, Made, Run, silent
 from amibayes.pipeline.warnings import consistency_warnings, search_warnings
 from amibayes.posterior.bootstrap import Bootstrap, bootstrap
 from amibayes.posterior.ensemble import Posterior, sample
@@ -93,14 +96,14 @@ def search_companion(
     rng = _streams(options.seed)
     # One BLAS thread: the same bits on every machine and for any number of workers.
     with threadpool_limits(1):
-        ready = prepare(targets, calibrators, options, rng["calibration"], run)
-        found = _searched(ready, options, run)
+        ready = run.keep(
+            "data", lambda: prepare(targets, calibrators, options, rng["calibration"], run)
+        )
+        found = run.keep("search", lambda: _searched(ready, options, run))
         tests = _tested(ready, found, options, rng, run)
-        limits = _limits(found, tests, options, rng["limits"], run)
+        limits = run.keep("limits", lambda: _limits(found, tests, options, rng["limits"], run))
         posterior = _inferred(ready, found, options, rng, run, (chain, resume))
-        prior = _prior(found.result, options)
-        models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
-        beside = limits_stage(models, found, options, rng["models"], run)
+        models, beside = run.keep("models", lambda: _compared(ready, found, options, rng, run))
     report = _report(options, ready, found, tests, limits, posterior)
     return replace(
         with_models(report, models, beside),
@@ -108,6 +111,15 @@ def search_companion(
         calibrators=tuple(str(p) for p in calibrators),
         timing_s=run.seconds,
     )
+
+
+def _compared(
+    ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run
+) -> tuple[ModelComparison | None, LimitsBeside | None]:
+    """Compare models of the sky, and measure limits beside a disc; None where not asked for."""
+    prior = _prior(found.result, options)
+    models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
+    return models, limits_stage(models, found, options, rng["models"], run)
 
 
 def _streams(seed: int) -> Streams:
@@ -149,25 +161,35 @@ class Tests:
 def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run) -> Tests:
     if options.null_draws == 0:
         return Tests()
+    first, second = run.keep("significance", lambda: _significance(found, options, rng, run))
+    if first.detected is None:
+        return Tests(first, second)
+
+    def stated() -> tuple[Verdict, tuple[Consistency, ...]]:
+        with run.stage("verdict"):
+            return verdict_of(
+                found.result, first, ready.observables, options, rng["verdict"], run.executor,
+                ready.exchangeable,
+            )  # fmt: skip
+
+    return Tests(first, second, *run.keep("verdict", stated))
+
+
+def _significance(
+    found: Found, options: SearchOptions, rng: Streams, run: Run
+) -> tuple[Significance, Significance | None]:
+    """Of the companion, and of a second one where it was searched for."""
     with run.stage("significance"):
         first = false_alarm(
             found.result, options, rng["significance"], run.executor, run.progress,
             journal=run.journal("null"),
         )  # fmt: skip
-    second = None
-    if found.two is not None:
-        with run.stage("significance of the second"):
-            second = second_false_alarm(
-                found.result, options, rng["second"], run.executor, run.progress
-            )
-    if first.detected is None:
-        return Tests(first, second)
-    with run.stage("verdict"):
-        statement, splits = verdict_of(
-            found.result, first, ready.observables, options, rng["verdict"], run.executor,
-            ready.exchangeable,
-        )  # fmt: skip
-    return Tests(first, second, statement, splits)
+    if found.two is None:
+        return first, None
+    with run.stage("significance of the second"):
+        return first, second_false_alarm(
+            found.result, options, rng["second"], run.executor, run.progress
+        )
 
 
 def _limits(
@@ -218,31 +240,32 @@ def _inferred(
         prior=noise_prior(ready.observables.only(options.observables), options),
     )
     prior, counts = _prior(result, options), _counts(options)
-    grid = samples = evidence = None
+    grid = samples = evidence = resampled = None
     if (options.posterior or counts) and affordable(result.likelihood, prior):
-        with run.stage("integrate"):
-            grid = grid_posterior(result.likelihood, prior)
+        grid = _stage(run, "integrate", lambda: grid_posterior(result.likelihood, prior))
     if options.posterior:
         path, resume = chain
-        with run.stage("posterior"):
-            samples = sample(
-                result, prior, rng["posterior"],
-                path=path, resume=resume, grid=grid, progress=run.progress,
-            )  # fmt: skip
+        own = partial(sample, path=path, resume=resume, grid=grid, progress=run.progress)
+        samples = _stage(run, "posterior", lambda: own(result, prior, rng["posterior"]))
     if counts:
-        with run.stage("evidence"):
-            evidence = compare_models(
-                result, prior, rng["evidence"],
-                companions=counts, grid=grid, two=two, method=options.evidence_method,
-            )  # fmt: skip
-    resampled = None
+        method = options.evidence_method
+        compared = partial(compare_models, companions=counts, grid=grid, two=two, method=method)
+        evidence = _stage(run, "evidence", lambda: compared(result, prior, rng["evidence"]))
     if options.bootstrap:
-        with run.stage("bootstrap"):
-            resampled = bootstrap(
-                found.result, found.noise, options.bootstrap, rng["bootstrap"],
-                progress=run.progress,
-            )  # fmt: skip
+        fits = partial(bootstrap, found.result, found.noise, options.bootstrap)
+        again = partial(fits, rng["bootstrap"], progress=run.progress)
+        resampled = _stage(run, "bootstrap", again)
     return Inference(samples, grid, evidence, _noise_posterior(result, samples), resampled)
+
+
+def _stage(run: Run, name: str, make: Callable[[], Made]) -> Made:
+    """Do a stage, unless it is kept."""
+
+    def timed() -> Made:
+        with run.stage(name):
+            return make()
+
+    return run.keep(name, timed)
 
 
 def _noise_posterior(

@@ -42,6 +42,38 @@ def test_the_stated_rate_is_realised(level: float) -> None:
     assert abs(np.mean(share) - level * 40 / 60) < 4 * error
 
 
+def counted(statistic: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Probabilities of statistics (m,) by the same null draws."""
+    null = np.sort(null)
+    return (1 + len(null) - np.searchsorted(null, statistic)) / (1 + len(null))
+
+
+def test_null_draws_in_common_keep_the_rate() -> None:
+    """60 stars, 20 with companions; such probabilities depend positively (Bates et al. 2023)."""
+    rng, level, n = np.random.default_rng(12), 0.1, 1500
+    signal, share = np.repeat([5.0, 0.0], [20, 40]), np.zeros(n)
+    for k in range(n):
+        p = counted(rng.exponential(size=60) + signal, rng.exponential(size=600))
+        found = false_alarms(p, level).discovered
+        share[k] = found[20:].sum() / max(found.sum(), 1)
+    error = share.std() / np.sqrt(n)
+    assert abs(share.mean() - level * 40 / 60) < 4 * error
+
+
+def test_null_draws_in_common_widen_the_number_of_false_alarms() -> None:
+    """It follows the beta-binomial law: with B draws 1 + m/B times the variance of m targets."""
+    rng, m, draws, below = np.random.default_rng(13), 200, 99, 5
+    alpha, n = below / (1 + draws), 3000
+    number = [
+        (counted(rng.exponential(size=m), rng.exponential(size=draws)) <= alpha).sum()
+        for _ in range(n)
+    ]
+    law = stats.betabinom(m, below, 1 + draws - below)
+    assert abs(np.mean(number) - law.mean()) < 4 * law.std() / np.sqrt(n)
+    assert abs(np.var(number) / law.var() - 1.0) < 6 * np.sqrt(2.0 / n)
+    assert law.var() / stats.binom(m, alpha).var() == pytest.approx(1.0 + m / draws, rel=0.05)
+
+
 def test_survey_wide_is_how_often_noise_gives_one_as_small() -> None:
     rng = np.random.default_rng(3)
     m, n = 40, 20000
