@@ -106,10 +106,7 @@ class ErrorTreatment(Protocol):
 
     @property
     def of_nulls(self) -> Self:
-        """The treatment that null sets are drawn with: numbers that hardly matter are rounded.
-
-        Targets with the same errors then have one null distribution, see `LATTICE`.
-        """
+        """The same for null sets, with numbers rounded that hardly matter."""
         return self
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
@@ -138,10 +135,9 @@ class KnownErrors(ErrorTreatment):
 
 
 LATTICE = 0.05
-"""Step of ln scale at which null sets are drawn. A scale that n data measure is uncertain by
-1/√(2n), 0.15 to 0.2 of NIRISS. The logarithm of a false-alarm probability changes by about as much
-as that of a scale (measured at 0.01): by 2.5 % at most, a quarter of what ten thousand draws leave
-uncertain of 0.01."""
+"""Step of ln scale at which null sets are drawn, so that targets of equal errors share them. A
+probability changes by about as large a part as a scale (measured at 0.01): at most by 2.5 %, a
+quarter of what ten thousand draws leave uncertain, and scales themselves are known to 15 %."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,7 @@ TASKS = 10_000
 """A table of more targets than twice that is handed out several targets at a time: a scheduler does
 some hundred tasks in a second, and a thousand workers would wait for it."""
 
-CALIBRATORS_OF_POOL = 4
-"""Three tell their scatter, and one more may be dropped."""
+CALIBRATORS_OF_POOL = 4  # three tell their scatter, and one more may be dropped
 
 WRITE_EVERY_S, WRITE_SHARE = 20.0, 0.02
 """While targets are done the survey's table is written this often, and in at most this share of
