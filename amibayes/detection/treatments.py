@@ -182,9 +182,8 @@ class FreeScale(ErrorTreatment):
     @property
     def of_nulls(self) -> Self:
         """The same with scales on a lattice, and relative ones where a common one drops out."""
-        common = 1.0 if self.least else self.scale[0]
-        steps = np.rint(np.log(self.scale / common) / LATTICE)
-        return replace(self, scale=np.exp(LATTICE * steps))
+        relative = self.scale / (1.0 if self.least else self.scale[0])
+        return replace(self, scale=np.exp(LATTICE * np.rint(np.log(relative) / LATTICE)))
 
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets, each group's data weighted by its own scatter.
