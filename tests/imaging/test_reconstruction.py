@@ -21,7 +21,7 @@ from amibayes.imaging.data_term import DataTerm
 from amibayes.imaging.folds import folds_of
 from amibayes.imaging.grid import PixelGrid, PixelResponse, pixel_response
 from amibayes.imaging.reconstruct import Problem, choose_grid
-from amibayes.imaging.regularisers import REGULARISERS
+from amibayes.imaging.regularisers import REGULARISERS, default_image
 from amibayes.kpfits import kernel_observables
 from amibayes.models.uv_points import uv_points_of
 
@@ -192,3 +192,21 @@ def test_command_writes_image_with_coordinates(tmp_path: Path) -> None:
     east, north = (sky.ra.deg - 50.0) * np.cos(np.radians(-20.0)), sky.dec.deg + 20.0
     assert np.array([east, north]) * 3.6e6 == pytest.approx([120.0, 60.0], abs=31.0)
     assert main(["image", str(file), "--out", str(out), "--diameter", "free"]) == 2
+
+
+def test_default_image_is_a_gaussian_half_as_wide_as_the_field() -> None:
+    grid = PixelGrid(41, 10.0)
+    image = default_image(grid).reshape(41, 41)
+    assert image.sum() == pytest.approx(1.0)
+    # Half of the maximum at a quarter of the field from the middle.
+    from_middle = np.abs(grid.east_mas.reshape(41, 41)[20])
+    at = np.interp(0.25 * 410.0, from_middle[20:], image[20, 20:])
+    assert at == pytest.approx(0.5 * image[20, 20], rel=1e-2)
+
+
+def test_an_image_of_vis2_alone_has_no_misfit_of_phases() -> None:
+    data = seen("spiral")
+    alone = data.select(np.ones(len(data.vis2), bool), np.zeros(len(data.closure_phase), bool))
+    image = ab.reconstruct_image(alone, weight=30.0)
+    assert np.isfinite(image.chi2_vis2)
+    assert np.isnan(image.chi2_phase)

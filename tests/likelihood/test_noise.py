@@ -129,3 +129,22 @@ def test_profiled_statistic_does_not_depend_on_the_scale(rng) -> None:
     expected = -15 * np.log(1 - gain / (white**2).sum(axis=0))
     np.testing.assert_allclose(first, expected, rtol=1e-6)
     np.testing.assert_allclose(Ratio.scale_free(36)(np.array([1e-6]), 36.0), 1e-6, rtol=1e-5)
+
+
+def test_files_have_one_noise_unless_told_otherwise() -> None:
+    """Noise in one of two files: of both together, its variance is half of that."""
+    rng = np.random.default_rng(5)
+    theta = [110.0, -75.0, 0.05]
+    parts = []
+    for k, extra in enumerate([ExtraNoise(0.04), ExtraNoise()]):
+        named = replace(niriss(), setups=(replace(niriss().setups[0], source=f"{k}.oifits"),))
+        parts += [
+            understated(theta, rng, extra, _at(named, 60000.0 + 2 * j + k)) for j in range(10)
+        ]
+    stated = Likelihood(join(parts))
+    common = fit_noise(stated, np.array(theta))
+    assert not common.files
+    # 420 V² of one amount: 3.5 % of σ, and more where it is in half of them; 5 sigma.
+    assert common.vis2 == pytest.approx(0.04 / np.sqrt(2.0), rel=0.35)
+    own = fit_noise(stated, np.array(theta), per_file=True)
+    assert [f.vis2 for f in own.files] == [pytest.approx(0.04, rel=0.25), 0.0]

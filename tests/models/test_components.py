@@ -13,7 +13,9 @@ from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.companion import Companion
 from amibayes.models.limb_darkening import power_law_disc, power_law_slopes
+from amibayes.models.uv_points import uv_points_of
 from amibayes.scene.disc import uniform_disc
 from amibayes.units import MAS
 
@@ -122,3 +124,17 @@ def test_a_disc_of_no_size_takes_out_the_direction_of_a_small_one() -> None:
     none, small = (TemplateBank(likelihood, grid, np.array([d])) for d in (0.0, 0.5))
     np.testing.assert_allclose(np.abs(none.nuisance_basis), np.abs(small.nuisance_basis), atol=1e-4)
     assert np.abs(none.nuisance_basis).max() < 0.6
+
+
+def test_companions_are_smeared_unless_told_otherwise() -> None:
+    """The mean over a broad channel of phase and amplitude, summed over wavelengths."""
+    data = point_source(STATIONS, 1.6e-6, 0.4e-6, vis2_error=1.0, closure_error_rad=1.0)
+    samples = uv_points_of(data)
+    # Frequencies across the channel about that of its middle; a shift of 20 mas.
+    share, weight = np.polynomial.legendre.leggauss(60)
+    half = 0.5 * samples.relative_band[:, None]
+    angle = 2.0 * np.pi * MAS * 20.0 * samples.u[:, None] * (1.0 + half * share)
+    expected = np.exp(-1j * angle) @ (0.5 * weight)
+    found = Companion().source(samples, np.array([[20.0], [0.0], [0.1]]))
+    np.testing.assert_allclose(found.wave[:, 0], expected, atol=1e-9)
+    assert np.abs(expected).min() < 0.9

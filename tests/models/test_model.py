@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import NIRISS_HOLES, niriss, numerical_gradient, simulated
 
+from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
 from amibayes.errors import UsageError
+from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.uv_points import uv_points_of
@@ -146,3 +150,23 @@ def test_one_data_set_is_wrapped_as_several_are() -> None:
 def test_theta_of_wrong_length_is_refused() -> None:
     with pytest.raises(UsageError, match=r"2 columns, not 3 .*east_mas, north_mas, contrast"):
         Likelihood(niriss()).log_prob([[1.0, 2.0]])
+
+
+def test_a_companion_at_rest_is_where_it_was_at_every_date() -> None:
+    parts = []
+    for mjd in (60000.0, 60400.0):
+        sheet = niriss()
+        parts.append(
+            replace(
+                sheet,
+                vis2=replace(sheet.vis2, mjd=np.full(len(sheet.vis2), mjd)),
+                closure_phase=replace(
+                    sheet.closure_phase, mjd=np.full(len(sheet.closure_phase), mjd)
+                ),
+            )
+        )
+    likelihood = Likelihood(join(parts))
+    moving = joint_likelihood(likelihood, motion=True)
+    places = np.array([[120.0, -60.0, 0.05], [-80.0, 10.0, 0.02]])
+    still = likelihood.predict(places)
+    np.testing.assert_allclose(moving.predict(moving.model.at_rest(places)), still, atol=1e-12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.companion import point_visibility
+from amibayes.models.off_axis import OffAxis
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.optics.sampling import lattice_images, shifted_images
 from amibayes.units import MAS
@@ -146,3 +148,16 @@ def test_file_keeps_the_response(tmp_path, rng: np.random.Generator) -> None:
     np.testing.assert_allclose(after.to_node, before.to_node, rtol=1e-12)
     np.testing.assert_allclose(after.pointing, before.pointing, rtol=1e-12)
     assert after.single
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_baselines_on_one_line_move_the_centre_along_it_alone(axis: int) -> None:
+    """A shift by s turns the phases by −2π u·s; across the line nothing is known, nothing moves."""
+    uv = np.zeros((3, 2))
+    uv[:, axis] = [1.0, 2.0, -3.0]
+    exposure = SimpleNamespace(rows=np.arange(3), uv=uv, pointing=np.zeros(2))
+    shift = np.array([0.02, 0.03])
+    seen = np.exp(-2j * np.pi * uv @ shift)[:, None]
+    found = np.array(OffAxis(3, (exposure,)).centre(seen))[:, 0, 0]
+    assert abs(found[axis]) == pytest.approx(shift[axis], rel=1e-6)
+    assert found[1 - axis] == pytest.approx(0.0, abs=1e-9)

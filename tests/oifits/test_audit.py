@@ -489,3 +489,43 @@ def test_any_column_may_be_anything(spoilt: str, tmp_path: Path) -> None:
         except DataError as refused:
             said = [f"{column} {refused}"] if str(path) in str(refused) else []
         assert any(column in text for text in said), (name, column)
+
+
+def test_numbers_of_stations_are_unique(rng: np.random.Generator, tmp_path: Path) -> None:
+    twice = changed(rng, tmp_path / "a.fits", set_column("OI_ARRAY", "STA_INDEX", 1, 1))
+    (finding,) = [f for f in audit(twice).findings if f.code == "repeated"]
+    assert "STA_INDEX in OI_ARRAY" in finding.what
+
+
+@pytest.mark.parametrize(("minutes", "told"), [(10.0, False), (2000.0, True)])
+def test_integration_times_are_read_in_their_unit(
+    minutes: float, told: bool, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """2000 minutes are longer than a night, 2000 s are not."""
+
+    def in_minutes(hdus: fits.HDUList) -> None:
+        hdus["OI_VIS2"].columns["INT_TIME"].unit = "min"
+        hdus["OI_VIS2"].data["INT_TIME"] = minutes
+
+    found = codes(changed(rng, tmp_path / "a.fits", in_minutes))
+    assert ("integration-time" in found) == told
+
+
+@pytest.mark.parametrize("vis2", [0.1, 0.8])
+def test_errors_in_radians_are_told_at_any_vis2(
+    vis2: float, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """σ(CP) = √3 σ(V²)/2V², as given by three independent baselines of equal V²."""
+    right = np.sqrt(3.0) * 1e-3 / (2.0 * vis2)
+
+    def with_errors(sigma: float) -> Change:
+        def change(hdus: fits.HDUList) -> None:
+            hdus["OI_VIS2"].data["VIS2DATA"], hdus["OI_VIS2"].data["VIS2ERR"] = vis2, 1e-3
+            hdus["OI_T3"].data["T3PHIERR"] = sigma
+            hdus["OI_T3"].data["T3PHI"] *= DEGREE
+
+        return change
+
+    for sigma, told in ((right, True), (np.degrees(right), False)):
+        found = codes(changed(rng, tmp_path / "a.fits", with_errors(sigma), kind="diagonal"))
+        assert ("phase-in-radians" in found) == told

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from amibayes.cube import DO_NOT_USE, JUMP_DET, Cube
+from amibayes.cube.container import flag_bits
 from amibayes.cube.ramps import RampFile
 from amibayes.cube.timing import GroupTiming
 from amibayes.instrument import load_instrument
@@ -216,3 +217,15 @@ def test_capacitance_between_pixels_hardly_matters() -> None:
     coupled = replace(SILENT, interpixel_capacitance=0.006)
     found = fit_migration([measured(3, 8, 8, coupled)]).migration
     np.testing.assert_allclose(found.value[:2], TRUE, rtol=0.01)
+
+
+@pytest.mark.parametrize("flag", [DO_NOT_USE, flag_bits(("DEAD",))])
+def test_pixels_flagged_for_the_whole_exposure_are_not_used(flag: int) -> None:
+    file = ramp_file(3, 8, 6, MOVING)
+    flags = np.zeros((N, N), dtype=np.uint32)
+    flags[9, 9] = flag
+    file.hdus["PIXELDQ"] = Held(flags)
+    found = curvature_of(file)
+    assert found is not None
+    assert not found.used[9, 9]
+    assert found.used[20, 20]

@@ -22,7 +22,7 @@ from amibayes.simulation.ramps import (
     read_ramps,
     to_neighbours,
 )
-from amibayes.simulation.slopes import SlopeFit, slope_weights
+from amibayes.simulation.slopes import SlopeFit, electron_variance, slope_weights
 
 QUIET = Detector(
     photon_noise=False, read_noise_e=0.0, dark_e_s=0.0, background_e_s=0.0, flat_error=0.0
@@ -269,3 +269,10 @@ def test_the_converter_errs_by_its_waves() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-3)
     assert 3.0 < np.abs(found - reads).max() < 12.0
     assert converted(reads, QUIET) is reads
+
+
+def test_light_without_photon_noise_has_no_variance() -> None:
+    rate = np.full((4, 4), 100.0)
+    noisy = replace(QUIET, photon_noise=True, interpixel_capacitance=0.0)
+    assert not electron_variance(rate, QUIET).any()
+    np.testing.assert_allclose(electron_variance(rate, noisy), 100.0 * FRAME)
