@@ -111,3 +111,16 @@ def test_a_small_library_is_refused() -> None:
     stars = visits(Drift(), 60000.0 + np.arange(5.0), np.random.default_rng(1))
     with pytest.raises(DataError, match="a population takes 6"):
         calibrate(stars[0], stars[1:], method="population")
+
+
+def test_likelihoods_beyond_the_range_of_numbers_predict_as_well() -> None:
+    """300 stars that are all alike but for tiny noise: likelihoods differ by e to the 1000."""
+    rng = np.random.default_rng(9)
+    mode = np.linalg.qr(rng.standard_normal((Q, 1)))[0][:, 0]
+    days = np.linspace(0.0, 3.0, 300)
+    amplitude = 5.0 * np.cos(days / 3.0)
+    noise = np.full(300, 1e-8)
+    data = amplitude[:, None] * mode + 1e-4 * rng.standard_normal((300, Q))
+    made = predict(components(data, noise), data, noise, days, 1.5)
+    assert np.isfinite(made.mean).all()
+    assert made.mean @ mode == pytest.approx(5.0 * np.cos(0.5), abs=1e-2)

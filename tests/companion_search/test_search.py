@@ -7,7 +7,9 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.field import default_separation, resolves_stars
+from amibayes.companion_search import search as search_module
+from amibayes.companion_search.field import default_separation, resolution_mas, resolves_stars
+from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.seeds import peaks
@@ -15,6 +17,7 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.parameters import Box
 from amibayes.units import MAS, offset
 
 
@@ -146,3 +149,32 @@ def test_peaks_are_distinct_and_ordered(rng) -> None:
     apart = np.hypot(east[:, None] - east, north[:, None] - north) + 1e9 * np.eye(len(chosen))
     assert apart.min() >= 94.0
     assert gain[chosen[0]] == gain.max()
+
+
+def test_as_many_peaks_as_asked_for_and_further_ones_while_they_are_near_the_best() -> None:
+    """Peaks of known heights, far apart: heights within 25 of the best are kept beyond five."""
+    grid = make_grid(50.0, 1200.0, 20.0)
+    places = [(r * np.sin(t), r * np.cos(t)) for r in (500.0, 1000.0) for t in np.arange(6.0)]
+    at = [int(np.hypot(grid.east_mas - e, grid.north_mas - n).argmin()) for e, n in places]
+    for heights, kept in (
+        ([60.0, 58.0, 56.0, 54.0, 52.0, 50.0, 48.0, 46.0, 34.0, 33.0, 32.0, 31.0], 8),
+        ([60.0, *np.arange(30.0, 19.0, -1.0)], 5),
+        ([60.0, *np.arange(59.0, 48.0, -1.0)], 9),
+    ):
+        gain = np.full(len(grid), 1e-3)
+        gain[at] = heights
+        chosen = peaks(grid, gain, 60.0, 5, 9)
+        assert chosen.tolist() == at[:kept]
+
+
+@pytest.mark.parametrize("outer_mas", [2700.0, 3300.0])
+def test_a_large_field_is_searched_at_a_bounded_cost(
+    outer_mas: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the finest and the coarsest lattice positions times data are a given number."""
+    monkeypatch.setattr(search_module, "AFFORDABLE_WORK", 1e6)
+    likelihood = Likelihood(niriss())
+    fringe = resolution_mas(likelihood)
+    grid = search_module._grid(likelihood, Box(1000.0, outer_mas, fringe))
+    assert search_module.MIN_STEPS < fringe / grid.step_mas < search_module.MAX_STEPS
+    assert len(grid) * likelihood.n_independent == pytest.approx(1e6, rel=0.02)

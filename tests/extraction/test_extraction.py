@@ -627,3 +627,20 @@ def test_calints_made_by_mirage(data: Path) -> None:
     found = extract_all(cube)[0]
     assert found.frames.used.sum() >= 66
     assert found.average.vis2.min() > 0.8
+
+
+@pytest.mark.parametrize("kelvin", [3000.0, 8000.0])
+def test_temperatures_of_stars_are_taken(kelvin: float) -> None:
+    assert ExtractOptions(temperature_k=kelvin).temperature_k == kelvin
+
+
+@pytest.mark.parametrize("kelvin", [1.0, np.nan])
+def test_temperatures_without_light_are_refused(kelvin: float) -> None:
+    with pytest.raises(UsageError, match="temperature"):
+        ExtractOptions(temperature_k=kelvin)
+
+
+def test_images_without_dates_have_none(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(3), (0.0, 0.0), 0.0), 17)
+    undated = replace(cube_of(images, niriss), mjd=None)
+    assert not np.any(extract(undated).vis2.mjd)

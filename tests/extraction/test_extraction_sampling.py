@@ -157,3 +157,23 @@ def test_single_precision_is_enough(method: str) -> None:
     assert np.abs(single.vis2 - exact.vis2).max() < 1e-6
     assert np.degrees(np.abs(single.closure_phase - exact.closure_phase)).max() < 1e-4
     assert [f.frames.n_bad.tolist() for f in found] == [[0, 0, 1, 0, 0, 0]] * 2
+
+
+def test_slopes_are_those_of_small_changes(splodges: Splodges) -> None:
+    """V² and closure phases of an image that is no point, by light added in random patterns."""
+    rng = np.random.default_rng(4)
+    image = 1e4 * (splodges.star + 0.5 * np.roll(splodges.star, 57))
+
+    def observed(light: FloatArray) -> FloatArray:
+        flux, samples = splodges.apply(light[None])
+        power = splodges.power(samples)[0] / flux[0] ** 2
+        return np.concatenate([power, np.angle(splodges.bispectrum(samples)[0])])
+
+    flux, samples = splodges.apply(image[None])
+    slopes = splodges.slopes(float(flux[0]), samples[0])
+    for _ in range(3):
+        change = 1e-4 * image.max() * rng.standard_normal(image.size)
+        wide = observed(image + change) - observed(image - change)
+        for part in (slice(0, N), slice(N, None)):
+            scale = np.abs(wide[part]).max()
+            np.testing.assert_allclose((slopes @ change)[part], 0.5 * wide[part], atol=1e-4 * scale)

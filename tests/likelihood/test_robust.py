@@ -232,3 +232,19 @@ def test_a_companion_is_found_as_surely_as_by_gaussian_residuals(rng) -> None:
     for whitening in (None, symmetric_whitening(data)):
         test = make_statistic(*made, whitening=whitening)
         assert test.value > 1.2 * test.draw_null(4000, rng).max()
+
+
+def test_errors_of_normal_residuals_are_those_of_the_efficiency() -> None:
+    """E[ψ′]²/E[ψ²] of ψ(x) = (ν + 1)x/(ν + x²), integrated: the mean weight of 720 residuals."""
+    likelihood = Likelihood(niriss(channels=20))
+    white = np.random.default_rng(12).standard_normal(likelihood.n_independent)
+    stretch = RobustFits(likelihood, FIELD, free_scale=False)._stretch(white)[0]
+    nu, pdf = DEGREES, stats.norm.pdf
+
+    def mean(of) -> float:
+        return float(integrate.quad(lambda x: of(x) * pdf(x), -12.0, 12.0)[0])
+
+    slope = mean(lambda x: (nu + 1.0) * (nu - x * x) / (nu + x * x) ** 2)
+    efficiency = slope**2 / mean(lambda x: ((nu + 1.0) * x / (nu + x * x)) ** 2)
+    # Weights scatter by 0.3: 5 sigma of the mean is 6 %.
+    assert np.mean(stretch**-2.0) == pytest.approx(efficiency, rel=0.06)

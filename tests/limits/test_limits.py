@@ -88,6 +88,7 @@ def test_probability_of_any_companion_is_that_of_injections(setting) -> None:
     assert limit.probability(rho[k], 1e-9) < 1e-3
     assert limit.probability(rho[k], 1.0) > 0.9999
     assert np.isnan([limit.probability(r, 1e-3) for r in (0.9 * rho[0], 1.1 * rho[-1])]).all()
+    assert np.isfinite([limit.probability(r, 1e-3) for r in rho]).all()
     for ring in (0, len(rho) - 1):
         half = limit.probability(rho[ring], limit.contrast_50[ring])
         assert half == pytest.approx(0.5, abs=5e-3)

@@ -529,3 +529,45 @@ def test_errors_in_radians_are_told_at_any_vis2(
     for sigma, told in ((right, True), (np.degrees(right), False)):
         found = codes(changed(rng, tmp_path / "a.fits", with_errors(sigma), kind="diagonal"))
         assert ("phase-in-radians" in found) == told
+
+
+def reformatted(name: str, column: str, form: str) -> Change:
+    """Give a column another format, a multiple of its first number where that is longer."""
+
+    def change(hdus: fits.HDUList) -> None:
+        old = hdus[name]
+        values = {c.name: old.data[c.name] for c in old.columns}
+        if form[0].isdigit() and form[-1] != "A":
+            values[column] = np.tile(
+                values[column].reshape(len(old.data), -1)[:, :1], int(form[:-1])
+            )
+        columns = [
+            fits.Column(c.name, form if c.name == column else c.format, c.unit,
+                        array=values[c.name])
+            for c in old.columns
+        ]  # fmt: skip
+        new = fits.BinTableHDU.from_columns(columns)
+        kept = ("EXTNAME", "OI_REVN", "INSNAME", "ARRNAME", "DATE-OBS")
+        new.header.update({key: old.header[key] for key in kept if key in old.header})
+        hdus[hdus.index_of(name)] = new
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "form", "told"),
+    [
+        ("OI_VIS2", "UCOORD", "E", True),
+        ("OI_VIS2", "VIS2DATA", "2D", True),
+        ("OI_VIS2", "STA_INDEX", "3I", True),
+        ("OI_VIS2", "STA_INDEX", "2I", False),
+        ("OI_TARGET", "TARGET", "40A", False),
+    ],
+)
+def test_columns_of_another_format_are_told(
+    table: str, column: str, form: str, told: bool, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """The standard: doubles, a number for each channel, two stations, texts of any length."""
+    path = changed(rng, tmp_path / "a.fits", reformatted(table, column, form))
+    formats = [f for f in audit(path).findings if f.code == "column-format"]
+    assert [column in f.what for f in formats] == [True] * told

@@ -229,3 +229,8 @@ def test_pixels_flagged_for_the_whole_exposure_are_not_used(flag: int) -> None:
     assert found is not None
     assert not found.used[9, 9]
     assert found.used[20, 20]
+
+
+def test_one_integration_has_no_batches() -> None:
+    assert len(measured(3, 1, 6, MOVING).batches) == 0
+    assert len(measured(3, 4, 6, MOVING).batches) == 4

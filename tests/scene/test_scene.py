@@ -24,6 +24,7 @@ from amibayes.scene.sources import (
     SkyImage,
     UniformDisc,
 )
+from amibayes.scene.spectrum import Tabulated
 from amibayes.units import DEGREE, MAS, FloatArray, offset
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "paper_scene.toml"
@@ -359,6 +360,8 @@ def test_bad_components_are_refused() -> None:
         ("wider than it is across", lambda: Ring(diameter_rad=1.0, width_rad=2.0)),
         ("pixel scale", lambda: SkyImage(np.ones((2, 2)), np.zeros((2, 2)))),
         ("finite pixels", lambda: SkyImage(np.full((2, 2), np.nan), np.eye(2))),
+        ("do not rise", lambda: Tabulated("a", np.array([-1e-6, 1e-6]), np.ones(2))),
+        ("do not rise", lambda: Tabulated("a", np.array([2e-6, 1e-6]), np.ones(2))),
     ):
         with pytest.raises(DataError, match=fault):
             make()
