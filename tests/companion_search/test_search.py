@@ -10,9 +10,10 @@ from scipy import stats
 from amibayes.companion_search import search as search_module
 from amibayes.companion_search.field import default_separation, resolution_mas, resolves_stars
 from amibayes.companion_search.grid import make_grid
+from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
-from amibayes.companion_search.seeds import peaks
+from amibayes.companion_search.seeds import may_be_bright, peaks
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
@@ -178,3 +179,14 @@ def test_a_large_field_is_searched_at_a_bounded_cost(
     grid = search_module._grid(likelihood, Box(1000.0, outer_mas, fringe))
     assert search_module.MIN_STEPS < fringe / grid.step_mas < search_module.MAX_STEPS
     assert len(grid) * likelihood.n_independent == pytest.approx(1e6, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "gain", "bright"), [(0.01, 50.0, False), (0.1, 50.0, True), (0.01, 500.0, True)]
+)
+def test_bright_companions_are_those_of_a_large_contrast_or_a_large_gain(
+    contrast: float, gain: float, bright: bool
+) -> None:
+    each = np.array([contrast, 1e-4])
+    survey = ScanResult(each, each, np.array([gain, 0.0]), each[:, None])
+    assert may_be_bright(survey, np.array([0])) == bright

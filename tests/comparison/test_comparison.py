@@ -10,7 +10,7 @@ from helpers import niriss, simulated
 from scipy.special import logsumexp
 
 from amibayes.companion_search.search import search
-from amibayes.comparison.compare import NoiseSetting, compare_sky_models
+from amibayes.comparison.compare import NoiseSetting, _best_noise, compare_sky_models
 from amibayes.comparison.fit_models import embedded, fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import Hypothesis, hypotheses, prior_of
@@ -18,6 +18,7 @@ from amibayes.comparison.integral import Effort, integrate, log_z_laplace
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.comparison.verdict import Confusion, choose
 from amibayes.errors import UsageError
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.posterior.priors import Prior, PriorSetting
@@ -253,3 +254,17 @@ def test_laplace_of_a_strong_fit_is_near_the_integral() -> None:
     sampled = integrate(found.model, data, found.cube, found.chi2, np.random.default_rng(1))
     laplace = log_z_laplace(found.model, data, found.cube, found.chi2)
     assert laplace == pytest.approx(sampled.diagnostics["log_z"], abs=1.0)
+
+
+@pytest.mark.parametrize("of_search", [ExtraNoise(0.3), ExtraNoise()])
+def test_noise_is_that_of_the_most_likely_model_with_its_own(of_search: ExtraNoise) -> None:
+    """A companion of 10 % that the star alone would take for noise; errors are as stated."""
+    base = base_of("companion", [110.0, -75.0, 0.1])
+    fits = [fitted(name, base) for name in ("star", "companion")]
+    setting = NoiseSetting(of_search, NoisePrior())
+    clean = base.observables
+    noisy = with_noise(base, of_search)
+    found, likelihood, one = _best_noise(fits, noisy, clean, setting)
+    assert (one.name, found.any) == ("companion", False)
+    at = fits[1].theta[None]
+    assert likelihood.log_prob(at) == pytest.approx(base.log_prob(at))

@@ -26,7 +26,7 @@ from amibayes.data.degrees_of_freedom import (
 )
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
-from amibayes.data.shrinkage import shrunk_covariance
+from amibayes.data.shrinkage import _loss, shrunk_covariance
 from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood
@@ -363,3 +363,16 @@ def test_result_states_what_the_covariance_rests_on() -> None:
     assert stated["n_over_p"] == pytest.approx(25 / 36)
     assert stated["scatter_share"] == pytest.approx(24 / 38)
     assert data_json(search(Likelihood(niriss()), FIELD))["n_over_p"] is None
+
+
+def test_slopes_of_the_marginal_likelihood_are_differences() -> None:
+    """By the freedom, the two scales and the variance that all V² share."""
+    rng = np.random.default_rng(6)
+    draws = rng.standard_normal((30, 8)) * np.geomspace(0.5, 2.0, 8)
+    groups, shared = np.arange(8) < 5, np.where(np.arange(8) < 5, rng.uniform(0.5, 1.5, 8), 0.0)
+    arguments = draws.T @ draws, 29, groups, shared
+    at = np.array([2.0, 0.3, -0.4, -1.0])
+    _, slope = _loss(at, *arguments)
+    for k, step in enumerate(1e-5 * np.eye(4)):
+        wide = _loss(at + step, *arguments)[0] - _loss(at - step, *arguments)[0]
+        assert slope[k] == pytest.approx(wide / 2e-5, rel=1e-5)

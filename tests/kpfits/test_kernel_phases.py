@@ -313,3 +313,40 @@ def test_search_with_calibrators_writes_everything(tmp_path: Path) -> None:
     assert "80 kernel phases" in (out / "report.html").read_text()
     again = kernel_observables(out / "calibrated_kpfits.fits")
     assert again.n_independent == 80
+
+
+def test_audit_of_a_covariance_without_an_inverse(tmp_path: Path) -> None:
+    """Several directions of next to no error: the least is compared with the largest."""
+    inner = np.linalg.qr(np.random.default_rng(5).standard_normal((80, 80)))[0]
+    size = np.r_[1e-15, np.full(4, 1e-14), np.ones(75)] * 4e-6
+    singular = (inner * size) @ inner.T
+    one = np.sqrt(np.diag(singular))[None, None]
+    path = kernel_file(tmp_path / "a.fits", KP_COV=singular[None, None], KP_SIGM=one)
+    assert "kp-singular" in {f.code for f in audit_kpfits(path).findings}
+
+
+def test_scatter_is_carried_for_every_channel(tmp_path: Path) -> None:
+    """Frames at two wavelengths: the measured scatter of both goes along."""
+    value = noisy(np.random.default_rng(8), 60)
+    path = kernel_file(tmp_path / "a.fits", value)
+    with fits.open(path) as hdus:
+        cov, sigma = hdus["KP-COV"].data, hdus["KP-SIGM"].data
+        twice = {
+            "KP-DATA": np.stack([value, value[::-1]], axis=1),
+            "KP-COV": np.repeat(cov, 2, axis=1),
+            "KP-SIGM": np.repeat(sigma, 2, axis=1),
+        }
+        for name, array in twice.items():
+            hdus[hdus.index_of(name)] = fits.ImageHDU(array, name=name)
+        waves = hdus["CWAVEL"].data
+        columns = [
+            fits.Column(n, "D", array=waves[n][0] * np.array([1.0, 1.1])) for n in waves.names
+        ]
+        hdus[hdus.index_of("CWAVEL")] = fits.BinTableHDU.from_columns(columns, name="CWAVEL")
+        hdus.writeto(tmp_path / "b.fits")
+    one, two = (kernel_observables(tmp_path / n) for n in ("a.fits", "b.fits"))
+    assert one.scatter is not None
+    assert two.scatter is not None
+    assert two.scatter.shape[0] == 2 * one.scatter.shape[0]
+    first = two.scatter.toarray()[: one.scatter.shape[0], : one.scatter.shape[0]]
+    np.testing.assert_allclose(first, one.scatter.toarray(), rtol=1e-6, atol=1e-12)

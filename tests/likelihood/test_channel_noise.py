@@ -279,3 +279,12 @@ def test_a_coherent_error_changes_v2_and_closure_phase_as_the_slopes_say(rng) ->
     slope = np.concatenate([data.vis2.coherent_slope, data.closure_phase.coherent_slope])
     spread = likelihood.wrapped(change).std(axis=1) / size
     np.testing.assert_allclose(spread / slope, 1.0, atol=4.5 / np.sqrt(2 * 4000))
+
+
+def test_amplitudes_are_what_a_coherent_error_does() -> None:
+    """V² of 0.64 moves by 2|V| = 1.6 with the visibility; a closure phase not at all."""
+    data = niriss(0.01, 0.1, channels=4)
+    data = replace(data, vis2=replace(data.vis2, value=np.full(data.n_vis2, 0.64)))
+    layout = channel_layout(data)
+    np.testing.assert_allclose(layout.amplitude[layout.vis2], 1.6 / 0.01)
+    assert not layout.amplitude[~layout.vis2].any()

@@ -26,6 +26,7 @@ from amibayes import (
     simulate,
 )
 from amibayes.data.observables import Observables
+from amibayes.limits.injection import at_its_place
 from amibayes.scene.sources import Point
 from amibayes.units import DEGREE, MAS, offset
 
@@ -156,3 +157,9 @@ def test_images_and_observables_agree_on_how_many_are_found(way: str) -> None:
     assert 0.2 < p < 0.8
     spread = np.sqrt(n * p * (1 - p) + (n * np.std(expected)) ** 2 / 10)
     assert abs(found - n * p) < 4.0 * spread
+
+
+def test_places_are_the_same_within_half_a_fringe() -> None:
+    places = np.array([[100.0, 0.0], [-30.0, 40.0], [10.0, 10.0]])
+    moved = places + np.array([[3.0, 4.0], [12.0, 0.0], [0.0, -9.9]])
+    assert at_its_place(moved, places, 20.0).tolist() == [True, False, True]

@@ -10,9 +10,10 @@ from helpers import NIRISS_HOLES, niriss, numerical_gradient, simulated
 
 from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
-from amibayes.errors import UsageError
+from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.bands import dates
 from amibayes.models.binary import BinaryModel
 from amibayes.models.uv_points import uv_points_of
 from amibayes.units import MAS
@@ -170,3 +171,19 @@ def test_a_companion_at_rest_is_where_it_was_at_every_date() -> None:
     places = np.array([[120.0, -60.0, 0.05], [-80.0, 10.0, 0.02]])
     still = likelihood.predict(places)
     np.testing.assert_allclose(moving.predict(moving.model.at_rest(places)), still, atol=1e-12)
+
+
+def test_the_file_without_a_date_is_named() -> None:
+    """One number of the second of three files."""
+    parts = []
+    for k in range(3):
+        sheet = niriss()
+        setups = (replace(sheet.setups[0], source=f"{k}.oifits"),)
+        mjd = np.full(len(sheet.vis2), 60000.0 + k)
+        closures = replace(sheet.closure_phase, mjd=np.full(len(sheet.closure_phase), mjd[0]))
+        mjd[4] = 0.0 if k == 1 else mjd[4]
+        vis2 = replace(sheet.vis2, mjd=mjd)
+        parts.append(replace(sheet, setups=setups, vis2=vis2, closure_phase=closures))
+    with pytest.raises(DataError, match="without a date") as caught:
+        dates(join(parts))
+    assert str(caught.value).startswith("1.oifits")

@@ -571,3 +571,47 @@ def test_columns_of_another_format_are_told(
     path = changed(rng, tmp_path / "a.fits", reformatted(table, column, form))
     formats = [f for f in audit(path).findings if f.code == "column-format"]
     assert [column in f.what for f in formats] == [True] * told
+
+
+def test_tables_without_flags_are_looked_at(rng: np.random.Generator, tmp_path: Path) -> None:
+    def without(hdus: fits.HDUList) -> None:
+        hdus["OI_VIS2"].columns.del_col("FLAG")
+        hdus["OI_VIS2"].data["VIS2DATA"][3] = 1.4
+
+    found = codes(changed(rng, tmp_path / "a.fits", without, sigma=1e-3))
+    assert {"vis2-above-one", "column-missing"} <= found
+
+
+def test_unknown_stations_are_no_station_twice(rng: np.random.Generator, tmp_path: Path) -> None:
+    """Zeros say that stations are not known; they are made of (u, v) then."""
+    zeros = set_column("OI_VIS2", "STA_INDEX", slice(None), 0)
+    assert "station-twice" not in codes(changed(rng, tmp_path / "a.fits", zeros))
+
+
+def test_correlations_of_the_datum_before_the_first(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    path = changed(rng, tmp_path / "a.fits", set_column("OI_CORR", "IINDX", 3, 0))
+    assert any("indices outside" in f.what for f in audit(path).findings)
+
+
+@pytest.mark.parametrize("column", ["STAXYZ", "DIAMETER"])
+@pytest.mark.parametrize("damage", ["gone", "text", "zero"])
+def test_arrays_without_positions_or_sizes_are_read(
+    column: str, damage: str, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    def change(hdus: fits.HDUList) -> None:
+        if damage == "zero":
+            hdus["OI_ARRAY"].data[column] = 0.0
+            return
+        old = hdus["OI_ARRAY"]
+        kept = [c for c in old.columns if c.name != column]
+        kept += [fits.Column(column, "4A", array=["much"] * 7)] if damage == "text" else []
+        new = fits.BinTableHDU.from_columns(fits.ColDefs(kept))
+        new.header.update({key: old.header[key] for key in ("EXTNAME", "OI_REVN", "ARRNAME")})
+        hdus[hdus.index_of("OI_ARRAY")] = new
+
+    path = changed(rng, tmp_path / "a.fits", change)
+    found, whole = read_oifits(path), read_oifits(tmp_path / "a.fits")
+    np.testing.assert_array_equal(found.vis2.u_m, whole.vis2.u_m)
+    assert len(found.vis2) == 21

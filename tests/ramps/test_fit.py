@@ -11,7 +11,7 @@ import pytest
 
 from amibayes.cube import DO_NOT_USE, JUMP_DET, Cube
 from amibayes.cube.container import flag_bits
-from amibayes.cube.ramps import RampFile
+from amibayes.cube.ramps import GAIN_E_DN, RampFile
 from amibayes.cube.timing import GroupTiming
 from amibayes.instrument import load_instrument
 from amibayes.optics import scene_image
@@ -234,3 +234,16 @@ def test_pixels_flagged_for_the_whole_exposure_are_not_used(flag: int) -> None:
 def test_one_integration_has_no_batches() -> None:
     assert len(measured(3, 1, 6, MOVING).batches) == 0
     assert len(measured(3, 4, 6, MOVING).batches) == 4
+
+
+def test_errors_do_not_depend_on_the_unit() -> None:
+    """The same reads in electrons and in DN of 1.6 electrons."""
+    electrons = ramp_file(3, 8, 6, MOVING)
+    in_dn = replace(
+        electrons,
+        template=replace(electrons.template, unit="DN"),
+        hdus={"SCI": Held(np.asarray(electrons.hdus["SCI"].section[:]) / GAIN_E_DN)},
+    )
+    a, b = curvature_of(electrons), curvature_of(in_dn)
+    used = a.used & b.used
+    np.testing.assert_allclose(a.sigma[used], b.sigma[used], rtol=1e-3)
