@@ -30,7 +30,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,11 +78,16 @@ def sheet(factor: float = 1.0) -> Observables:
 
 
 def simulated(
-    n: int, n_companions: int, rng: np.random.Generator, spread: float = 0.0
+    n: int,
+    n_companions: int,
+    rng: np.random.Generator,
+    spread: float = 0.0,
+    larger: float = 1.0,
 ) -> list[Star]:
     """Simulate a survey; stars with companions come first.
 
-    Errors of a star are those of `sheet` times a factor, ln of which is within ``spread`` of 0.
+    Errors of a star are those of `sheet` times a factor, ln of which is within ``spread`` of 0;
+    its data scatter by ``larger`` times that.
     """
     stars = []
     for k in range(n):
@@ -94,7 +99,8 @@ def simulated(
             mag, angle = float(rng.uniform(*DEPTHS)), rng.uniform(0.0, 2.0 * np.pi)
             theta = [rho * np.sin(angle), rho * np.cos(angle), 10.0 ** (-0.4 * mag)]
             place = (rho, mag)
-        data = likelihood.predict([theta])[:, 0] + empty.covariance.draw(rng, 1)[:, 0]
+        noise = larger * empty.covariance.draw(rng, 1)[:, 0]
+        data = likelihood.predict([theta])[:, 0] + noise
         one = empty.with_data(data)
         stars.append(Star(f"star{k:05d}", one, *place))
     return stars
@@ -257,31 +263,59 @@ def _memory(pid: int) -> float:
 
 def cost(targets: int, seed: int) -> str:
     """Measure what targets cost, and what a scheduler does with a task; model 10⁵ targets."""
-    rng = np.random.default_rng(seed)
     rows, per = [], {}
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        whole = write(folder, simulated(targets, targets // 10, rng), rng)
-        Table.read(whole)[:2].write(folder / "few.ecsv")
-        for name, words in PARTS.items():
-            base = ["search", "--overwrite", *(w for w in QUICK if w not in DROP.get(name, ()))]
-            base += words
-            start = _timed([*base, "--batch", folder / "few.ecsv", "--out", folder / "few"])
-            full = _timed([*base, "--batch", whole, "--out", folder / "whole"])
+        lists = _lists(folder, targets, np.random.default_rng(seed))
+        for name, (which, words) in PARTS.items():
+            base = ["search", "--overwrite", "--quiet", *words, "--batch"]
+            start = _timed([*base, folder / f"few_{which}.ecsv", "--out", folder / "few"])
+            full = _timed([*base, lists[which], "--out", folder / "whole"])
             per[name] = (full[0] - start[0]) / (targets - 2)
             set_up = start[0] - 2 * per[name]
             rows.append(f"| {name} | {per[name]:.2f} s | {set_up:.1f} s | {full[2]:.0f} MB |")
-        base = ["search", "--overwrite", *QUICK, "--no-limits", "--batch", whole]
-        base += ["--out", folder / "w", "--workers"]
-        one, two = (_timed([*base, n])[1] for n in (1, 2))
-    efficiency = (
-        f"{targets} targets took {one:.1f} s with one process and {two:.1f} s with two, set-up "
-        f"included: an efficiency of {one / two / 2:.0%}, on a machine with a load of "
-        f"{os.getloadavg()[0]:.1f} for {os.cpu_count()} cores."
-    )
-    heads = ["| a target of NIRISS, V² and closure phases | CPU | set-up of a process | memory |",
+        efficiency = _efficiency(lists["equal"], folder / "w", targets, next(iter(per.values())))
+    heads = ["| a target of NIRISS, V² and closure phases | CPU | set-up, first target | memory |",
              "|---|---|---|---|"]  # fmt: skip
     return "\n".join([*heads, *rows, "", efficiency, *_model(per)])
+
+
+def _lists(folder: Path, targets: int, rng: np.random.Generator) -> dict[str, Path]:
+    """Tables of targets: of equal errors; of their own, too small by `TOO_SMALL`, calibrated too.
+
+    And the first two targets of each beside them.
+    """
+    sky, found = simulated(targets, targets // 10, rng), {}
+    own = simulated(targets, targets // 10, rng, 0.7, TOO_SMALL)
+    calibrators = [replace(s, name=f"cal{k}") for k, s in enumerate(simulated(3, 0, rng, 0.7))]
+    write(folder / "calibrators", calibrators, rng)
+    for name, stars in {"equal": sky, "own": own, "calibrated": own}.items():
+        found[name] = write(folder / name, stars, rng)
+        table = Table.read(found[name])
+        table["target"] = [f"{name}/{file}" for file in table["target"]]
+        if name == "calibrated":
+            table["cal"] = ["calibrators/cal*.oifits"] * targets
+        table.write(folder / f"{name}.ecsv")
+        table[:2].write(folder / f"few_{name}.ecsv")
+    return {name: folder / f"{name}.ecsv" for name in found}
+
+
+TOO_SMALL = 1.5
+"""Scatter of the data, in units of the stated errors, where a search has to find that out."""
+
+
+def _efficiency(table: Path, out: Path, targets: int, each: float) -> str:
+    """CPU and wall time with one process and with two, and what that makes of 300 targets."""
+    base = ["search", "--overwrite", "--quiet", *BARE, "--batch", table, "--out", out, "--workers"]
+    (one, wall, _), (two, wall_two, _) = (_timed([*base, n]) for n in (1, 2))
+    set_up, workers = one - targets * each, two - one
+    alone, together = set_up + 300 * each, set_up + 0.5 * workers + 150 * each
+    return (
+        f"{targets} targets took one process {one:.1f} s of CPU and {wall:.1f} s, two processes "
+        f"{two:.1f} s of CPU and {wall_two:.1f} s, on a machine with a load of "
+        f"{os.getloadavg()[0]:.1f} for {os.cpu_count()} cores. By CPU time 300 targets on two "
+        f"idle cores have an efficiency of {alone / together / 2:.0%}."
+    )
 
 
 def _model(per: dict[str, float]) -> list[str]:
@@ -303,15 +337,18 @@ def _model(per: dict[str, float]) -> list[str]:
     ]
 
 
-PARTS: dict[str, tuple[str, ...]] = {
-    "search, significance": ("--no-limits",),
-    "… and limits": (),
-    "… and pictures, without limits": ("--no-limits",),
-}
-"""What is measured, with the words of the command beside `QUICK`."""
+NARROW = ("--separation", f"{FIELD[0]:g}:{FIELD[1]:g}")
+BARE = ("--no-posterior", "--no-limits", "--no-pictures", *NARROW)
 
-DROP = {"… and pictures, without limits": ("--no-pictures",)}
-"""Words of `QUICK` that a part goes without."""
+PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "search, significance": ("equal", BARE),
+    "… of errors of their own, too small by a third, in the default field": ("own", BARE[:3]),
+    "… with the same three calibrators": ("calibrated", BARE[:3]),
+    "search, significance, limits": ("equal", ("--no-posterior", "--no-pictures", *NARROW)),
+    "… and posterior": ("equal", ("--no-pictures", *NARROW)),
+    "search, significance, pictures": ("equal", ("--no-posterior", "--no-limits", *NARROW)),
+}
+"""What is measured: the table, and words of the command."""
 
 
 def _nothing(piece: Any) -> Any:

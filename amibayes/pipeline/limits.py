@@ -166,7 +166,7 @@ def measure_limits(
     with threadpool_limits(1):
         # The fourth stream, as in the main job: the same calibration for the same seed.
         rng = np.random.default_rng(seeds[3])
-        ready = prepare(targets, calibrators, options.search, rng, run)
+        ready = run.keep("data", lambda: prepare(targets, calibrators, options.search, rng, run))
         limits, notes = _all_limits(ready, options, seeds[5:], run)
         models, beside = beside_models(
             ready.observables, limits[0], options.search, np.random.default_rng(seeds[4]), run
@@ -277,8 +277,12 @@ def _one_limit(
     name = NAMES[search.observables]
     run = run.under("-".join(search.observables))
     streams = [np.random.default_rng(k) for k in seed.spawn(2)]
-    with run.stage(f"search {name}"):
-        found = search_field(data, search)
+
+    def searched() -> FieldSearch:
+        with run.stage(f"search {name}"):
+            return search_field(data, search)
+
+    found = run.keep("search", searched)
     tested, search = None, _with_draws(found.result, search)
     if search.null_draws != 0:
         with run.stage(f"null searches {name}"):
