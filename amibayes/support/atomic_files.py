@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import glob
 import hashlib
 import json
 import os
@@ -21,6 +22,9 @@ except ImportError:  # Windows has other locks
 
 from amibayes.errors import RunError, UsageError
 
+TEMPORARY = ".{}.{}{}"
+"""Name of a file that is being written: stem, 8 random digits, suffix."""
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -32,7 +36,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         Where the folder cannot be written or the disk is full.
     """
     final = Path(path)
-    temporary = final.with_name(f".{final.stem}.{secrets.token_hex(4)}{final.suffix}")
+    temporary = final.with_name(TEMPORARY.format(final.stem, secrets.token_hex(4), final.suffix))
     try:
         # Made with the mode of any new file: asking for the umask would change it for a moment,
         # for all threads.
@@ -156,8 +160,22 @@ def output_locks() -> Iterator[None]:
             os.close(handle)
 
 
-def _hold(folder: Path) -> None:
+def _sweep(folder: Path, names: Sequence[str]) -> None:
+    """Take away what a run that was killed while it wrote these files has left of them."""
+    for name in map(Path, names):
+        if len(name.parts) == 1:
+            pattern = TEMPORARY.format(glob.escape(name.stem), "[0-9a-f]" * 8, name.suffix)
+            for left in folder.glob(pattern):
+                left.unlink(missing_ok=True)
+
+
+def _hold(folder: Path) -> bool:
     """Keep other runs out of a folder; the lock ends with this process, however it ends.
+
+    Returns
+    -------
+    bool
+        Whether it was taken now: nobody else writes there.
 
     Raises
     ------
@@ -167,7 +185,7 @@ def _hold(folder: Path) -> None:
     key = folder.resolve()
     run = _run.get()
     if fcntl is None or run.has(key):
-        return
+        return False
     handle = os.open(key, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -178,8 +196,9 @@ def _hold(folder: Path) -> None:
         ) from None
     except OSError:  # a file system without locks: nothing can be known, and work goes on
         os.close(handle)
-    else:
-        run.held[key] = handle
+        return False
+    run.held[key] = handle
+    return True
 
 
 def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> Path:
@@ -206,7 +225,8 @@ def output_folder(folder: str | Path, names: list[str], *, overwrite: bool) -> P
         raise UsageError("cannot be written into", source=path, remedy="choose another --out")
     if is_new:
         _run.get().made.add(path.resolve())
-    _hold(path)
+    if _hold(path):
+        _sweep(path, names)
     present = [name for name in names if (path / name).exists()]
     if present and not overwrite:
         raise UsageError(

@@ -140,8 +140,10 @@ def test_killed_twice_and_resumed(survey: Path, tmp_path: Path, workers: int) ->
 
 
 def test_interrupt_says_what_is_kept(survey: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    words = ("amibayes", "search", "--batch", survey / "targets.ecsv", *WORDS, "--out", out)
+    out, many = tmp_path / "out", 60  # more than are done before the signal comes
+    names = {"target": ["s0.oifits"] * many, "name": [f"t{k}" for k in range(many)]}
+    Table(names).write(survey / "many.ecsv")
+    words = ("amibayes", "search", "--batch", survey / "many.ecsv", *WORDS, "--out", out)
     process = start(*words, stderr=subprocess.PIPE)
     limit = time.monotonic() + 100.0
     while finished_targets(out) < 1 and time.monotonic() < limit:
@@ -150,7 +152,7 @@ def test_interrupt_says_what_is_kept(survey: Path, tmp_path: Path) -> None:
     error = process.communicate(timeout=60.0)[1].decode().strip()
     assert process.returncode == 4
     assert "interrupted: " in error, error
-    told = int(error.split("interrupted: ")[1].split(" of 6 targets are done")[0])
+    told = int(error.split("interrupted: ")[1].split(f" of {many} targets are done")[0])
     entries = json.loads((out / "survey.json").read_text())["targets"]
     assert told == sum(e["status"] == "done" for e in entries)
     assert told in (finished_targets(out), finished_targets(out) - 1)

@@ -45,3 +45,17 @@ def test_a_part_of_a_run_shares_its_locks(tmp_path: Path) -> None:
         with output_locks():
             output_folder(tmp_path, [], overwrite=True)
             output_folder(tmp_path / "inner", [], overwrite=True)
+
+
+def test_what_a_killed_run_left_half_written_is_taken_away(tmp_path: Path) -> None:
+    ours = [".survey.0123abcd.ecsv", ".result.00000000.json"]
+    others = [".survey.0123abc.ecsv", ".other.0123abcd.ecsv", "survey.ecsv", ".survey.ecsv"]
+    for name in (*ours, *others):
+        (tmp_path / name).touch()
+    with output_locks():
+        output_folder(tmp_path, ["survey.ecsv", "result.json"], overwrite=True)
+        assert {p.name for p in tmp_path.iterdir()} == set(others)
+        # Of the run itself, while it writes.
+        (tmp_path / ours[0]).touch()
+        output_folder(tmp_path, ["survey.ecsv"], overwrite=True)
+        assert (tmp_path / ours[0]).exists()
