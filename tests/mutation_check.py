@@ -100,12 +100,12 @@ class Work:
             (to.parent / "shared").symlink_to(ROOT.parent / "shared")
         return to
 
-    def entries(self) -> dict[str, dict]:
-        """What was tried, the last word on each."""
+    def entries(self, *, last: bool = True) -> dict[str, dict]:
+        """What was tried, the last word on each, or the first."""
         if not self.record.is_file():
             return {}
         lines = self.record.read_text(encoding="utf-8").splitlines()
-        return {entry["key"]: entry for entry in map(json.loads, lines)}
+        return {entry["key"]: entry for entry in map(json.loads, lines[:: 1 if last else -1])}
 
     def write(self, entry: dict) -> None:
         with self.record.open("a", encoding="utf-8") as stream:
@@ -253,26 +253,25 @@ def _try_all(work: Work, jobs: list[tuple[Mutant, list[str], float]], workers: i
         list(pool.map(lambda job: tried(work, *job, folders), jobs))
 
 
+KINDS_OF_END = {"killed": "noticed", "same": "no behaviour differs", "survived": "not noticed"}
+
+
 def table(work: Work) -> None:
-    """Print outcomes by kind of change, and the survivors."""
+    """Print outcomes by kind of change, at first and now, and what no test notices."""
     counts: dict[str, Counter] = defaultdict(Counter)
-    for entry in work.entries().values():
-        counts[entry["kind"]][entry["outcome"]] += 1
-        counts["all"][entry["outcome"]] += 1
-    outcomes = ("killed", "same", "survived")
-    print(f"{'change':14}" + "".join(f"{name:>10}" for name in ("tried", *outcomes)))
-    for kind, row in sorted(counts.items(), key=lambda item: -sum(item[1].values())):
-        print(f"{kind:14}{sum(row.values()):10}" + "".join(f"{row[name]:10}" for name in outcomes))
-    for entry in work.entries().values():
-        if entry["outcome"] != "killed":
-            print(
-                entry["outcome"],
-                entry["key"],
-                entry["before"],
-                "→",
-                entry["after"],
-                entry.get("reason", ""),
-            )
+    first = work.entries(last=False)
+    for key, entry in work.entries().items():
+        for kind in ("all", entry["kind"]):
+            counts[kind].update(["tried", entry["outcome"]])
+            counts[kind]["at first"] += first[key]["outcome"] == "killed"
+    print("| change | tried | noticed at first | " + " | ".join(KINDS_OF_END.values()) + " |")
+    print("|---" * (3 + len(KINDS_OF_END)) + "|")
+    for kind, row in sorted(counts.items(), key=lambda item: -item[1]["tried"]):
+        shown = (row[name] for name in ("tried", "at first", *KINDS_OF_END))
+        print(f"| {kind} | " + " | ".join(map(str, shown)) + " |")
+    for entry in (e for e in work.entries().values() if e["outcome"] != "killed"):
+        change = f"{entry['before']} → {entry['after']}"
+        print(entry["outcome"], entry["key"], change, entry.get("reason", ""))
 
 
 def main() -> None:

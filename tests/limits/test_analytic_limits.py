@@ -108,6 +108,7 @@ def test_closure_phases_with_the_companion_are_fitted_better_by_it(noise: float)
     result = searched(noise, ("cp",))
     likelihood = result.likelihood
     limit = analytic_limit(result, "closure-phase", separation_mas=RINGS)
+    assert "(delta chi2 36)" in replace(limit, sigmas=3.0).criterion
     covariance, n = likelihood.observables.covariance, 200_000
     for east, north, contrast in positions(limit):
         companion = likelihood.predict([[east, north, contrast]])

@@ -208,3 +208,13 @@ def test_slopes_through_a_response_off_the_axis() -> None:
         ends = [at + s * step * np.eye(len(at))[k] for s in (1.0, -1.0)]
         high, low = likelihood.log_prob(np.array(ends))
         assert (high - low) / (2.0 * step) == pytest.approx(gradient[k], rel=1e-4, abs=1e-6)
+
+
+def test_rings_are_smeared_unless_told_otherwise() -> None:
+    samples, values = uv_points_of(niriss()), np.array([[0.3], [180.0], [0.6], [70.0]])
+    found, told, sharp = (
+        Extended("ring", "ring", **options).source(samples, values).wave
+        for options in ({}, {"smearing": True}, {"smearing": False})
+    )
+    np.testing.assert_array_equal(found, told)
+    assert np.abs(found - sharp).max() > 1e-4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.binary import BinaryModel
-from amibayes.posterior.grid import grid_posterior
+from amibayes.posterior.grid import GridPosterior, grid_posterior
 from amibayes.posterior.integrand import polar_cells
 from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, default_prior, edit_prior, parse_setting
@@ -231,3 +232,21 @@ def test_draws_and_density_of_a_prior_agree(contrast, position) -> None:
     for ranks in (prior.ring_cdf(np.hypot(*theta[:, :2].T)), prior.contrast_cdf(theta[:, 2])):
         assert abs(ranks.mean() - 0.5) < 5.0 / np.sqrt(12 * n)
         assert abs((ranks**2).mean() - 1 / 3) < 5.0 * np.sqrt(4 / 45 / n)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 35.0, 250.0])
+def test_cells_have_the_width_of_their_shape(degrees: float) -> None:
+    """Scatter along east and north of points in a cell 4 mas deep and 12 mas wide."""
+    angle, rng = np.radians(degrees), np.random.default_rng(1)
+    cells = SimpleNamespace(
+        centre=(np.array([300.0]), np.array([angle])),
+        position=300.0 * np.array([[np.sin(angle)], [np.cos(angle)]]),
+        **{"inner": np.array([298.0]), "outer": np.array([302.0])},
+        **{"first": np.array([angle - 0.02]), "last": np.array([angle + 0.02])},
+    )
+    one = SimpleNamespace(cells=cells, probability=np.ones(1))
+    rho, turn = rng.uniform(298.0, 302.0, 40_000), rng.uniform(angle - 0.02, angle + 0.02, 40_000)
+    for direction, drawn in (((1, 0), rho * np.sin(turn)), ((0, 1), rho * np.cos(turn))):
+        found = GridPosterior._along(one, *direction)
+        width = float((found.high - found.low)[0])
+        assert width / np.sqrt(12.0) == pytest.approx(drawn.std(), rel=0.03)
