@@ -24,6 +24,7 @@ from amibayes.ramps.correction import MigrationFree, electrons_of, slope_time_s
 from amibayes.ramps.curvature import Curvature, curvature_of
 from amibayes.ramps.fit import MigrationFit, fit_migration
 from amibayes.ramps.migration import Migration
+from amibayes.ramps.own_response import OwnResponse
 from amibayes.ramps.transfer import KINDS, gain
 from amibayes.units import ComplexArray, FloatArray
 
@@ -66,10 +67,13 @@ class CubeMigration:
         if not isinstance(file, RampFile):
             return MigrationFree(file, self.migration, electrons, slope_time_s(template.header))
         converter = self.migration.of_converter
+        own = self.fit.own if self.fit and self.fit.pixels_differ else None
+        if own is not None and own.value.shape != template.images.shape[1:]:
+            own = None
         if converter is None or self.waves is None:
-            return MigrationFree(file, self.migration, electrons)
+            return MigrationFree(file, self.migration, electrons, own=own)
         file = replace(file, excess_dn=table(converter.value))
-        return MigrationFree(file, self.migration, electrons, waves=self.waves.current)
+        return MigrationFree(file, self.migration, electrons, waves=self.waves.current, own=own)
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers: value, error, source, and the tests of a fit."""
@@ -152,6 +156,11 @@ def _decided(known: _Known, fit: MigrationFit | None, options: ExtractOptions) -
                 None, fit, (*notes, f"charge migration not taken out: the header lacks {missing}")
             )
     text = stated(migration.of_pixels if waves is None else migration)
+    if known.is_ramp and fit is not None and fit.own is not None and fit.pixels_differ:
+        text += (
+            f"; single pixels differ in their linearity by {1e7 * fit.own.spread:.2f} e-7 per "
+            "electron (rms), taken out as far as they tell it"
+        )
     return CubeMigration(migration, fit, (*notes, text), waves)
 
 
@@ -222,13 +231,17 @@ def observable_changes(
     Returns
     -------
     (n_observables, r) array
-        For one standard deviation along each of `Migration.directions`.
+        For one standard deviation along each of `Migration.directions`, and of each pixel that
+        changes of its own.
     """
     migration, sampling = file.migration, operator.sampling
     current = operator.reference.image * file.electrons
     charge = file.mean_time_s * current
     moved = np.stack([_change(kind, charge, current, file.waves) for kind in migration.kinds])
     images = -np.tensordot(migration.directions.T, moved, axes=1) / file.electrons
+    images = np.concatenate(
+        [images, -_of_single_pixels(file.own, charge, current) / file.electrons]
+    )
     view = operator.view
     pixels = images[:, view.rows, view.columns].reshape(len(images), operator.scatter.size)
     by_flux, by_samples = sampling.apply(pixels)
@@ -240,6 +253,19 @@ def observable_changes(
     (high, high3), (low, low3) = sides
     closure = np.angle(high3 * low3.conj())
     return np.asarray(0.5 * np.concatenate([high - low, closure], axis=1).T)
+
+
+def _of_single_pixels(
+    own: OwnResponse | None, charge: FloatArray, current: FloatArray
+) -> FloatArray:
+    """Currents (m, ny, nx) that errors of single pixels make, one standard deviation each."""
+    if own is None:
+        return np.empty((0, *current.shape))
+    row, column = own.carried.T
+    images = np.zeros((len(row), *current.shape))
+    number = np.arange(len(row))
+    images[number, row, column] = (own.error * charge * current)[row, column]
+    return images
 
 
 def _change(

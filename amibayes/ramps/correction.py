@@ -15,6 +15,7 @@ from amibayes.cube.source import Source
 from amibayes.cube.timing import timing_of
 from amibayes.ramps.curvature import filled
 from amibayes.ramps.migration import Migration
+from amibayes.ramps.own_response import OwnResponse
 from amibayes.ramps.transfer import gains
 from amibayes.units import BoolArray, FloatArray
 
@@ -37,6 +38,8 @@ class MigrationFree:
     waves : (len(WAVES), ny, nx) array, optional
         Currents (e⁻/s) that amplitudes of 1 of the converter's errors make, where these have
         been taken off the ramps.
+    own : OwnResponse, optional
+        What single pixels do, taken off too.
     """
 
     source: Source
@@ -44,6 +47,7 @@ class MigrationFree:
     electrons: float
     time_s: float | None = None
     waves: FloatArray | None = None
+    own: OwnResponse | None = None
 
     @property
     def template(self) -> Cube:
@@ -74,13 +78,18 @@ class MigrationFree:
             return cube
         # What is taken off is a percent of the current: single precision is enough for it.
         current = np.asarray(cube.images * self.electrons, dtype=np.float32)
-        lost = charge_lost(self.migration.of_pixels, current, time, cube.bad)
+        value = None if self.own is None else self.own.value
+        lost = charge_lost(self.migration.of_pixels, current, time, cube.bad, value)
         images = cube.images - (lost / self.electrons).astype(cube.images.dtype)
         return replace(cube, images=images)
 
 
 def charge_lost(
-    migration: Migration, current: NDArray[Any], time_s: FloatArray, bad: BoolArray
+    migration: Migration,
+    current: NDArray[Any],
+    time_s: FloatArray,
+    bad: BoolArray,
+    own: FloatArray | None = None,
 ) -> NDArray[Any]:
     """Current (n, ny, nx) that migration has added to measured currents.
 
@@ -93,6 +102,8 @@ def charge_lost(
         Mean time from the reset of the measurement.
     bad : (n, ny, nx) bool array
         Pixels whose current is not known: it is taken as that of their neighbours.
+    own : (ny, nx) array, optional
+        Coefficients of single pixels, per electron.
     """
     measured = current
     some = bad.any(axis=(1, 2))
@@ -105,7 +116,8 @@ def charge_lost(
         # Migration grows with the charge: half of what is lost by the end has collected so far.
         charge = when * (measured - 0.5 * lost)
         moved = gains(migration.kinds, charge, measured - lost)
-        lost = np.tensordot(migration.value.astype(measured.dtype), moved, axes=1)
+        alone = 0.0 if own is None else own.astype(measured.dtype) * charge * (measured - lost)
+        lost = np.tensordot(migration.value.astype(measured.dtype), moved, axes=1) + alone
     return np.asarray(lost)
 
 

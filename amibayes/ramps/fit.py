@@ -19,6 +19,7 @@ from scipy.stats import chi2 as chi2_distribution
 from amibayes.ramps.converter import WAVE_PRIOR, WAVES
 from amibayes.ramps.curvature import Curvature
 from amibayes.ramps.migration import Migration
+from amibayes.ramps.own_response import OwnResponse, own_response
 from amibayes.ramps.transfer import FURTHER, KINDS, LINEARITY, SIDES, gains
 from amibayes.units import FloatArray
 
@@ -67,6 +68,8 @@ class MigrationFit:
     error_scale : float
         What the scatter of parts made of the errors; 1 where it agrees with the noise.
     exposures : tuple of Curvature
+    own : OwnResponse, optional
+        What single pixels do of their own, of exposures that have the same pixels.
     """
 
     migration: Migration
@@ -78,6 +81,12 @@ class MigrationFit:
     bend_p_value: float
     error_scale: float
     exposures: tuple[Curvature, ...]
+    own: OwnResponse | None = None
+
+    @property
+    def pixels_differ(self) -> bool:
+        """Whether single pixels change by more than noise makes them."""
+        return self.own is not None and self.own.p_value <= ASKED_FOR
 
     @property
     def explained(self) -> bool:
@@ -100,6 +109,14 @@ class MigrationFit:
             "error_scale": self.error_scale,
             "explained": self.explained,
             "n_exposures": len(self.exposures),
+            "pixels": None
+            if self.own is None
+            else {
+                "spread_per_e": self.own.spread,
+                "spread_error_per_e": self.own.spread_error,
+                "p_value": self.own.p_value,
+                "corrected": self.pixels_differ,
+            },
         }
 
 
@@ -129,7 +146,43 @@ def fit_migration(exposures: Sequence[Curvature]) -> MigrationFit:
             break
         found = more
     none = _solved(exposures, (LINEARITY, *of_converter))
-    return replace(found, chi2_without=none.chi2)
+    return _with_pixels(replace(found, chi2_without=none.chi2))
+
+
+def _with_pixels(fit: MigrationFit) -> MigrationFit:
+    """Tell what single pixels do; the coefficients' errors have their part."""
+    exposures, migration = fit.exposures, fit.migration
+    if len({e.current.shape for e in exposures}) > 1:
+        return fit
+    gain = [_refined(e, migration.of_pixels)[KINDS.index(LINEARITY)] for e in exposures]
+    systems = [_system(e, _columns(e, migration)) for e in exposures]
+    left = [e.change - fit.predicted(e) - _drift(e, fit) for e in exposures]
+    own = own_response(left, gain, [e.sigma for e in exposures])
+    fit = replace(fit, own=own)
+    pulled = np.zeros((len(migration.kinds), *exposures[0].current.shape))
+    for exposure, system, g in zip(exposures, systems, gain, strict=True):
+        used = exposure.used
+        pulled[:, used] += system.rows * (g[used] / exposure.sigma[used])
+    moved = migration.covariance / fit.error_scale**2 @ pulled.reshape(len(pulled), -1)
+    # What is not seen of it is no less than what a correction for linearity leaves.
+    spread = np.hypot(own.spread, LINEARITY_PRIOR)
+    more = migration.covariance + spread**2 * moved @ moved.T
+    return replace(fit, migration=replace(migration, covariance=more))
+
+
+def _drift(exposure: Curvature, fit: MigrationFit) -> FloatArray:
+    """Change (ny, nx) that is the exposure's alone: flux and pointing that drift."""
+    own, used = _drifts(exposure), exposure.used
+    weight = 1.0 / exposure.sigma[used]
+    data = (exposure.change - fit.predicted(exposure))[used] * weight
+    found = np.linalg.lstsq((own[:, used] * weight).T, data, rcond=None)[0]
+    return np.tensordot(found, own, axes=1)
+
+
+def _drifts(exposure: Curvature) -> FloatArray:
+    """Changes (4, ny, nx) by flux, pointing along x and y, and one that all pixels share."""
+    slope_y, slope_x = np.gradient(exposure.current)
+    return np.stack([exposure.current, slope_x, slope_y, np.ones_like(slope_x)])
 
 
 def _misfit(fit: MigrationFit) -> float:
@@ -178,6 +231,8 @@ class _System:
         Pixels less what was fitted of the exposure alone.
     scores : (b, k) array
         Right-hand sides of its parts.
+    rows : (k, n_used) array
+        Columns of the used pixels in units of their errors.
     """
 
     normal: FloatArray
@@ -185,6 +240,7 @@ class _System:
     chi2: float
     n_data: int
     scores: FloatArray
+    rows: FloatArray
 
     def left(self, value: FloatArray) -> float:
         """χ² with coefficients (k,)."""
@@ -198,14 +254,13 @@ def _bend_system(exposure: Curvature, kinds: tuple[str, ...]) -> _System:
     if exposure.waves is not None and WAVES[0] in kinds:
         own = [kinds.index(wave) for wave in WAVES]
         normal[np.ix_(own, own)], right[own] = exposure.waves.normal, exposure.waves.right
-    return _System(normal, right, exposure.bend_chi2, n, np.empty((0, k)))
+    return _System(normal, right, exposure.bend_chi2, n, np.empty((0, k)), np.empty((k, 0)))
 
 
 def _system(exposure: Curvature, columns: FloatArray) -> _System:
     used = exposure.used
     weight = 1.0 / exposure.sigma[used]
-    slope_y, slope_x = np.gradient(exposure.current)
-    own = np.stack([exposure.current, slope_x, slope_y, np.ones_like(slope_x)])[:, used] * weight
+    own = _drifts(exposure)[:, used] * weight
     basis = np.linalg.qr(own.T)[0]
     rows = columns[:, used] * weight
     rows = rows - (rows @ basis) @ basis.T
@@ -213,7 +268,7 @@ def _system(exposure: Curvature, columns: FloatArray) -> _System:
     data = data - basis @ (basis.T @ data)
     scores = (exposure.batches[:, used] * weight) @ rows.T
     n_data = int(used.sum()) - basis.shape[1]
-    return _System(rows @ rows.T, rows @ data, float(data @ data), n_data, scores)
+    return _System(rows @ rows.T, rows @ data, float(data @ data), n_data, scores, rows)
 
 
 def _excess(systems: Sequence[_System], kinds: tuple[str, ...]) -> float:
