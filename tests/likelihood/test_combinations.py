@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
-from itertools import product
+from itertools import product, starmap
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import NIRISS_HOLES
+from scipy.optimize import nnls
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits, with_shared
@@ -17,6 +20,7 @@ from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
+from amibayes.detection.statistic import make_statistic
 from amibayes.errors import UsageError
 from amibayes.likelihood.averaged_noise import averaged_noise
 from amibayes.likelihood.channel_noise import ChannelShare, Correlation
@@ -25,6 +29,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.student import symmetric_whitening
 from amibayes.likelihood.student_noise import averaged_student_noise
 from amibayes.models.parameters import Box
 
@@ -107,7 +112,7 @@ def theta_of(likelihood: Likelihood, companions: int = 1) -> np.ndarray:
 @pytest.mark.parametrize("covariance", COVARIANCES)
 @pytest.mark.parametrize("channels", CHANNELS)
 def test_every_combination_works_or_is_refused(channels, covariance, scope, bank) -> None:
-    """Fit the noise, make the bank, search one data set, and evaluate the posterior."""
+    """Fit the noise, search one data set and null sets, and evaluate the posterior."""
     data = data_of(covariance, scope, channels)
     stated = likelihood_of(data, bank)
     per_file = scope != "common"
@@ -130,7 +135,8 @@ def test_every_combination_works_or_is_refused(channels, covariance, scope, bank
         value = delivered.log_prob(sets)
         assert np.isfinite(value).all()
         assert value[0] > value[1], asked
-        bank_statistic_is_finite(fitted, theta, companions)
+        gain_is_that_of_least_squares(fitted, theta, companions)
+        data_and_nulls_have_a_statistic(stated, fitted, theta, asked)
 
 
 @cache
@@ -175,12 +181,39 @@ def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
     return profile.with_noise(noise), theta
 
 
-def bank_statistic_is_finite(fitted: Likelihood, theta: np.ndarray, companions: int) -> None:
+def gain_is_that_of_least_squares(fitted: Likelihood, theta: np.ndarray, companions: int) -> None:
+    """The bank's gain at one place: contrasts that are not below zero, by the model's slopes."""
     grid = make_grid(100.0, 160.0, 30.0)
     beside = theta if companions == 2 else None
     bank = TemplateBank(fitted, grid, np.empty(0), beside=beside)
     left = fitted.residuals(theta) if companions == 2 else single_likelihood(fitted).residuals([[]])
-    assert np.isfinite(bank.survey(left[:, 0]).gain).all()
+    gain, at = bank.survey(left[:, 0]).gain, 3
+    one, parameters = fitted.model, fitted.parameters
+    faint = one.at_rest(np.array([[grid.east_mas[at], grid.north_mas[at], 1e-9]]))
+    slopes = fitted.jacobian(faint[0])[:, parameters.contrasts]
+    known = np.empty((len(left), 0)) if beside is None else fitted.jacobian(beside)
+    basis = np.linalg.qr(known)[0]
+    slopes, data = (x - basis @ (basis.T @ x) for x in (slopes, left[:, 0]))
+    expected = data @ data - nnls(slopes, data)[1] ** 2
+    if one.moves:  # the bank takes the best of some rates, 0 among them
+        assert gain[at] >= expected * (1.0 - 1e-4) - 1e-4
+    else:
+        assert gain[at] == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def data_and_nulls_have_a_statistic(
+    stated: Likelihood, fitted: Likelihood, theta: np.ndarray, asked: Combination
+) -> None:
+    """One statistic of the data and of null sets, as the significance asks for it."""
+    grid, beside = make_grid(100.0, 160.0, 30.0), theta if asked.companions == 2 else None
+    whitening = None
+    if asked.residuals == "student":
+        fitted, whitening = stated, symmetric_whitening(stated.observables)
+    test = make_statistic(fitted, grid, np.empty(0), beside=beside, whitening=whitening)
+    null = test.draw_null(3, np.random.default_rng(1))
+    assert np.isfinite([test.value, *null]).all(), asked
+    if asked.companions == 1:
+        assert test.value > null.max(), asked  # a companion of 5 % in data of errors of 0.5 %
 
 
 @pytest.mark.parametrize("bank", BANKS)
@@ -189,3 +222,16 @@ def test_methods_for_one_contrast_at_rest_refuse_more(bank) -> None:
     for method in ("closed limits", "grid posterior"):
         why = refusal(combination_of(likelihood, method=method))
         assert (why is None) == (bank == "tied")
+
+
+def test_the_documentation_lists_every_refusal() -> None:
+    """Each reason that any combination has stands in the page, and the page has no other."""
+    methods = ("search", "closed limits", "grid posterior")
+    every = starmap(
+        Combination,
+        product(COVARIANCES, NOISES, RESIDUALS, SCOPES, BANKS, COMPANIONS, methods, CHANNELS),
+    )
+    reasons = {why[0] for asked in every if (why := refusal(asked)) is not None}
+    page = (Path(__file__).parents[2] / "docs" / "statistics.md").read_text(encoding="utf-8")
+    section = page.partition("## What is refused")[2].partition("\n## ")[0]
+    assert set(re.findall(r'- "([^"]+)":', " ".join(section.split()))) == reasons
