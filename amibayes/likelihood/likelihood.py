@@ -37,6 +37,9 @@ def _told_apart(model: BinaryModel) -> tuple[object, ...]:
     return model.bands, model.moves, model.coloured
 
 
+BATCH = 1_500_000
+"""Model values (samples × parameter sets) held at once by `Likelihood.log_prob_in_batches`."""
+
 FAINTEST = 0.005
 """Visibility below which that of a fit is not taken for the size of a fringe: calibration errors
 alone are as large."""
@@ -173,6 +176,11 @@ class Likelihood(Shown):
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
         return self.noise.log_prob(self.difference(theta))
+
+    def log_prob_in_batches(self, theta: FloatArray) -> FloatArray:
+        """Log-likelihood of parameter sets (n, n_dim), (n,), in batches that fit in memory."""
+        pieces = np.array_split(theta, 1 + len(theta) * len(self.samples) // BATCH)
+        return np.concatenate([self.log_prob(piece) for piece in pieces])
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""

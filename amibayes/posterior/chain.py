@@ -44,6 +44,10 @@ N_TRIALS = 20_000
 """Draws of the prior among which walkers without a start find one: half a second."""
 
 
+Leaps = Callable[[FloatArray, np.random.RandomState], tuple[FloatArray, FloatArray]]
+"""Places (n, n_dim) proposed for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
+
+
 @dataclass(frozen=True, eq=False)
 class EnsembleSampler:
     """Goodman & Weare's walkers (emcee).
@@ -57,6 +61,8 @@ class EnsembleSampler:
         Part of the field that is sampled; all of it unless given.
     grid : GridPosterior, optional
         Of the same likelihood and prior: gives the `IndependenceProposal`.
+    leaps : callable, optional
+        Another such proposal, where there is no grid (`emcee.moves.MHMove`).
     path : path, optional
         HDF5 file of the chain, readable by `emcee.backends.HDFBackend`.
     resume : bool
@@ -70,6 +76,7 @@ class EnsembleSampler:
     start: FloatArray | None = None
     region: Region | None = None
     grid: GridPosterior | None = None
+    leaps: Leaps | None = None
     path: str | Path | None = None
     resume: bool = False
     max_steps: int = MAX_STEPS
@@ -132,17 +139,20 @@ class EnsembleSampler:
 
     def _moves(self) -> list[tuple[emcee.moves.Move, float]]:
         """Moves and how often each is made."""
-        along = along_others()
-        if self.grid is None:
+        along, leaps = along_others(), self.leaps if self.grid is None else self._from_grid()
+        if leaps is None:
             return along
+        return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(leaps), 0.5)]
+
+    def _from_grid(self) -> Leaps | None:
+        assert self.grid is not None
         grid, position = self.grid, self.grid.cells.position
         inside = np.full(len(grid.probability), True)
         if self.region is not None:
             inside = self.region.holds(*position)
         if not grid.probability[inside].any():  # too improbable for cells of its own
-            return along
-        leaps = IndependenceProposal(grid.within(inside))
-        return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(leaps), 0.5)]
+            return None
+        return IndependenceProposal(grid.within(inside))
 
     def _log_posterior(
         self, log_prob: LogProb, prior: ModelPrior

@@ -29,6 +29,7 @@ from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
+from amibayes.posterior.polynomial import PolynomialLogProb, polynomial_log_prob
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import ModelPrior
 from amibayes.support.arguments import checks_arguments, one_of
@@ -231,9 +232,27 @@ def sample(
     """
     region, parameters = Region.of(result), result.likelihood.parameters
     start = _start(result, prior, region, rng)
-    walkers = EnsembleSampler(start, region, grid, path, resume, max_steps, progress)
-    chain = walkers.run(result.likelihood.log_prob, ModelPrior(prior, parameters), rng)
+    everything = ModelPrior(prior, parameters)
+    quick = None if grid is not None else _quick(result, everything, rng)
+    leaps = None if quick is None else quick.leaps
+    walkers = EnsembleSampler(start, region, grid, leaps, path, resume, max_steps, progress)
+    chain = walkers.run(quick or result.likelihood.log_prob, everything, rng)
     return _posterior(chain, result, prior, grid)
+
+
+MANY_SAMPLES = 500
+"""Points of the (u, v) plane from which on a polynomial costs less than the likelihood."""
+
+
+def _quick(
+    result: SearchResult, prior: ModelPrior, rng: np.random.Generator
+) -> PolynomialLogProb | None:
+    """ln L of one strong mode of many data as a polynomial, where it is one."""
+    likelihood, modes = result.likelihood, modes_to_sample(result)
+    if len(likelihood.samples) < MANY_SAMPLES or len(modes) > 1:
+        return None
+    centre, scatter = gaussian_of(likelihood, np.array(modes[0].theta), prior.prior, START_WIDTH)
+    return polynomial_log_prob(likelihood.log_prob_in_batches, prior, centre, scatter, rng)
 
 
 def _start(

@@ -16,14 +16,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from amibayes.companion_search.result import Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.laplace import gaussian_of, log_evidence_laplace, physical, sampled
+from amibayes.posterior.laplace import (
+    HeavyTailed,
+    gaussian_of,
+    log_evidence_laplace,
+    physical,
+    sampled,
+)
 from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, Range
 from amibayes.posterior.sampler import draw_posterior
@@ -35,10 +41,7 @@ from amibayes.units import FloatArray
 MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
 
-MIN_DRAWS, MAX_DRAWS = 10_000, 200_000
-
-TAILS = 5.0
-"""Degrees of freedom of the t distributions that are drawn from."""
+MIN_DRAWS, MAX_DRAWS = 2_000, 200_000
 
 DEFENSIVE = 0.2
 """Share of the draws that comes from the prior."""
@@ -242,7 +245,7 @@ def log_evidence_importance(
     x = np.concatenate(drawn)
     log_prior = prior.log_density(x)
     x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
-    log_f = log_prior + _in_batches(likelihood, physical(x, likelihood.parameters))
+    log_f = log_prior + likelihood.log_prob_in_batches(physical(x, likelihood.parameters))
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)
@@ -251,36 +254,6 @@ def log_evidence_importance(
     # Draws outside the prior count, with weight 0.
     spread = np.sqrt(max((relative**2).sum() / n - 1.0, 0.0) / n)
     return log_z, float(spread)
-
-
-def _in_batches(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    pieces = np.array_split(theta, 1 + len(theta) * len(likelihood.samples) // 1_500_000)
-    return np.concatenate([likelihood.log_prob(piece) for piece in pieces])
-
-
-class _Heavy:
-    """A multivariate t distribution of `TAILS` degrees of freedom."""
-
-    def __init__(self, centre: FloatArray, scatter: FloatArray) -> None:
-        self.centre, self.scatter = centre, scatter
-        n = len(centre)
-        self._log_norm = (
-            gammaln(0.5 * (TAILS + n))
-            - gammaln(0.5 * TAILS)
-            - 0.5 * n * np.log(TAILS * np.pi)
-            - np.linalg.slogdet(scatter)[1]
-        )
-
-    def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
-        normal = rng.standard_normal((n, len(self.centre)))
-        stretch = np.sqrt(TAILS / rng.chisquare(TAILS, (n, 1)))
-        return np.asarray(self.centre + (normal * stretch) @ self.scatter.T)
-
-    def log_density(self, x: FloatArray) -> FloatArray:
-        z = np.linalg.solve(self.scatter, (x - self.centre).T)
-        square = (z * z).sum(axis=0)
-        power = 0.5 * (TAILS + len(self.centre))
-        return np.asarray(self._log_norm - power * np.log1p(square / TAILS))
 
 
 class _Gaussians:
@@ -305,7 +278,7 @@ class _Gaussians:
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
         self.weight = weight / weight.sum()
-        self.mixture = [_Heavy(*fit) for fit in fits]
+        self.mixture = [HeavyTailed(*fit) for fit in fits]
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         counts = rng.multinomial(n, self.weight)

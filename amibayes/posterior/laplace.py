@@ -7,7 +7,7 @@ from math import factorial
 
 import numpy as np
 from scipy import stats
-from scipy.special import logsumexp
+from scipy.special import gammaln, logsumexp
 
 from amibayes.companion_search.result import Mode
 from amibayes.likelihood.chi2 import LOG_TWO_PI
@@ -15,6 +15,9 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.priors import Prior
 from amibayes.units import FloatArray, IntArray
+
+TAILS = 5.0
+"""Degrees of freedom of the t distributions that are drawn from."""
 
 
 def log_evidence_laplace(likelihood: Likelihood, modes: Sequence[Mode], prior: Prior) -> float:
@@ -102,3 +105,30 @@ def sampled(theta: FloatArray, parameters: Parameters) -> FloatArray:
     x = theta.copy()
     x[..., parameters.contrasts] = np.log(x[..., parameters.contrasts])
     return x
+
+
+class HeavyTailed:
+    """A multivariate t distribution of `TAILS` degrees of freedom."""
+
+    def __init__(self, centre: FloatArray, scatter: FloatArray) -> None:
+        self.centre, self.scatter = centre, scatter
+        n = len(centre)
+        self._log_norm = (
+            gammaln(0.5 * (TAILS + n))
+            - gammaln(0.5 * TAILS)
+            - 0.5 * n * np.log(TAILS * np.pi)
+            - np.linalg.slogdet(scatter)[1]
+        )
+
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
+        """Draws (n, n_dim)."""
+        normal = rng.standard_normal((n, len(self.centre)))
+        stretch = np.sqrt(TAILS / rng.chisquare(TAILS, (n, 1)))
+        return np.asarray(self.centre + (normal * stretch) @ self.scatter.T)
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """ln of the density at x (n, n_dim), (n,)."""
+        z = np.linalg.solve(self.scatter, (x - self.centre).T)
+        square = (z * z).sum(axis=0)
+        power = 0.5 * (TAILS + len(self.centre))
+        return np.asarray(self._log_norm - power * np.log1p(square / TAILS))

@@ -12,7 +12,7 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.priors import Prior
 from amibayes.units import FloatArray
 
-NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.3
+NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.0
 """Errors to each side that nodes reach, and nodes in each."""
 
 
