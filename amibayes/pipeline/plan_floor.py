@@ -37,6 +37,7 @@ from amibayes.pipeline.migration_plan import envelope_fit, migration_change
 from amibayes.scene.orientation import Orientation
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import Plan, star_channels
+from amibayes.support.arguments import in_range
 from amibayes.support.options import ALPHA
 from amibayes.units import MAS, FloatArray, contrast_to_delta_mag
 
@@ -103,15 +104,10 @@ class Floor:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            value = getattr(self, entry.name)
-            if not 0.0 <= value < np.inf:
-                raise UsageError(
-                    f"{entry.name} of the floor is {value:g}", remedy="a number of at least 0"
-                )
-        if self.calibrators < 1 or self.calibrators != int(self.calibrators):
-            raise UsageError(
-                f"{self.calibrators:g} calibrators", remedy="a whole number of at least 1"
-            )
+            least = 1.0 if entry.name == "calibrators" else 0.0
+            in_range("floor", entry.name, getattr(self, entry.name), least)
+        if self.calibrators != int(self.calibrators):
+            raise UsageError(f"{self.calibrators:g} calibrators", remedy="give a whole number")
 
 
 @dataclass(frozen=True, eq=False)

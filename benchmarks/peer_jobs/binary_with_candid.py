@@ -6,11 +6,11 @@ diameters at which fits begin. Prints one line of JSON.
 
 import contextlib
 import io
-import json
 import sys
 import time
 
 from amical.externals import candid
+from fitted_binary import tell
 
 if __name__ == "__main__":
     path, (inner, outer, step, star, companion) = sys.argv[1], map(float, sys.argv[2:7])
@@ -28,18 +28,12 @@ if __name__ == "__main__":
             fratio=20.0,
             addParam={"diam*": star, "diamc": companion},
         )
-    fit = data.bestFit
     names = {
-        "east (mas)": "x",
-        "north (mas)": "y",
-        "flux ratio (%)": "f",
-        "diameter (mas)": "diam*",
-        "companion's diameter (mas)": "diamc",
+        "east (mas)": ("x", 1.0),
+        "north (mas)": ("y", 1.0),
+        "flux ratio (%)": ("f", 1.0),
+        "diameter (mas)": ("diam*", 0.0),
+        "companion's diameter (mas)": ("diamc", 0.0),
     }
-    found = {}
-    for label, name in names.items():
-        value, error = float(fit["best"][name]), float(fit["uncer"][name])
-        found[label] = [abs(value) if "diam" in name else value, error]
-    found["reduced χ²"] = [float(fit["chi2"]), 0.0]
     version = sys.modules[candid.Open.__module__].__version__.split()[0]
-    print(json.dumps({"found": found, "cpu_s": time.process_time() - begin, "version": version}))
+    tell(data.bestFit, names, begin, version=version)

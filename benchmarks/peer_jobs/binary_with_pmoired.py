@@ -6,11 +6,11 @@ diameters at which fits begin. Prints one line of JSON.
 
 import contextlib
 import io
-import json
 import sys
 import time
 
 import pmoired
+from fitted_binary import tell
 
 if __name__ == "__main__":
     path, (inner, outer, step, star, companion) = sys.argv[1], map(float, sys.argv[2:7])
@@ -30,18 +30,11 @@ if __name__ == "__main__":
                 ("np.sqrt(c,x**2+c,y**2)", "<=", outer),
             ],
         )
-    fit = oi.bestfit
     names = {
-        "east (mas)": "c,x",
-        "north (mas)": "c,y",
-        "flux ratio (%)": "c,f",
-        "diameter (mas)": "*,ud",
-        "companion's diameter (mas)": "c,ud",
+        "east (mas)": ("c,x", 1.0),
+        "north (mas)": ("c,y", 1.0),
+        "flux ratio (%)": ("c,f", 100.0),
+        "diameter (mas)": ("*,ud", 0.0),
+        "companion's diameter (mas)": ("c,ud", 0.0),
     }
-    found = {}
-    for label, name in names.items():
-        scale = 100.0 if name == "c,f" else 1.0
-        value, error = float(fit["best"][name]), float(fit["uncer"][name])
-        found[label] = [scale * (abs(value) if "ud" in name else value), scale * error]
-    found["reduced χ²"] = [float(fit["chi2"]), 0.0]
-    print(json.dumps({"found": found, "cpu_s": time.process_time() - begin}))
+    tell(oi.bestfit, names, begin)
