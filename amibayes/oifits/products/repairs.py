@@ -28,7 +28,7 @@ from amibayes.instrument import load_instrument
 from amibayes.oifits.products.mask_map import ProductMap, map_of, mapped_columns
 from amibayes.oifits.products.recognise import Product
 from amibayes.oifits.tables import OIFits, OITable, plain
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 NARROW = 0.944
 """EFF_BAND over the width at half height, measured for F480M: for filters that are not known."""
@@ -213,22 +213,41 @@ def _closure(product: Product, table: OITable, done: list[Repair]) -> dict[str, 
 def _from_amplitudes(product: Product, table: OITable) -> FloatArray | None:
     """Errors of closure phases, degrees, in the shape of T3PHIERR; None without OI_VIS.
 
-    Noise of a visibility is alike along it and across it, but for pistons, which closure phases
-    are free of: VISAMPERR/VISAMP, in which both stars have their part, is the error of a phase.
+    VISAMPERR/VISAMP, in which both stars have their part, is the error of a phase where noise is
+    alike along a visibility and across it. Jitter makes it more along: what is stated lies
+    between that error times the smaller and times the larger of both triple amplitudes, and
+    where these are alike tells how much less there is across.
     """
     rows, triangles = product.table("OI_VIS"), table.columns.get("STA_INDEX")
     if rows is None or triangles is None:
         return None
-    ratio = relative_amplitude_error(product, rows)
-    if ratio is None:
+    relative = relative_amplitude_error(product, rows)
+    if relative is None:
         return None
-    pairs = [frozenset(pair.tolist()) for pair in rows.columns["STA_INDEX"]]
-    variance = dict(zip(pairs, ratio[:, 0] ** 2, strict=True))
-    sides = [
-        [frozenset(t[[i, j]].tolist()) for i, j in ((0, 1), (1, 2), (0, 2))] for t in triangles
-    ]
-    total = [sum(variance.get(side, np.nan) for side in each) for each in sides]
-    return np.degrees(np.sqrt(total)).reshape(np.shape(table.columns["T3PHIERR"]))
+    legs = _legs(np.asarray(rows.columns["STA_INDEX"]), np.asarray(triangles))
+    if legs is None:
+        return None
+    amplitude = np.abs(np.asarray(rows.columns["VISAMP"], dtype=float)).reshape(len(rows), -1)
+    ours = np.abs(np.asarray(table.columns["T3AMP"], dtype=float)).ravel()
+    theirs = ours / amplitude[legs, 0].prod(axis=1)
+    stated = np.radians(np.asarray(table.columns["T3PHIERR"], dtype=float)).ravel()
+    variance = (relative[legs, 0] ** 2).sum(axis=1)
+    least, most = (
+        np.nansum(stated**2) / np.nansum(side(ours, theirs) ** 2 * variance)
+        for side in (np.maximum, np.minimum)
+    )
+    scale = np.clip(1.0, least, most) if np.isfinite(least + most) else 1.0
+    sigma = np.degrees(np.sqrt(scale * variance))
+    return np.asarray(sigma.reshape(np.shape(table.columns["T3PHIERR"])))
+
+
+def _legs(pairs: IntArray, triangles: IntArray) -> IntArray | None:
+    """Rows (n, 3) of the baselines of triangles; None where one is not there."""
+    place = {frozenset(pair.tolist()): k for k, pair in enumerate(pairs)}
+    sides = ((0, 1), (1, 2), (0, 2))
+    found = [[place.get(frozenset(t[[i, j]].tolist()), -1) for i, j in sides] for t in triangles]
+    legs = np.array(found)
+    return None if (legs < 0).any() else legs
 
 
 ERRORS = {
