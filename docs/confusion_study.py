@@ -1,14 +1,13 @@
 """How often companions, rings and crescents are confused, on simulated NIRISS data.
 
-    python docs/confusion_study.py [--minutes 45] [--nested 4]
+    python docs/confusion_study.py [--minutes 45]
 
 Every case draws a sky (a star alone, with a companion, a ring, a crescent, or a ring and a
 companion), simulates F480M data of 0.3 % in V² and 0.1° in closure phase, and goes through the
 search and the comparison as ``amibayes search --models`` does. Cases are added to
 ``docs/static/confusion_study.jsonl`` until so many minutes of CPU time are used up, each drawn
-from its own number; ``--nested`` adds to ``docs/static/confusion_nested.jsonl`` evidences of so
-many of their data sets by dynesty. The tables of `howto/companion_or_disc.md` are then written
-anew from all lines. Run again it goes on.
+from its own number, and the tables of `howto/companion_or_disc.md` are written anew from all
+lines. Run again it goes on.
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ from amibayes.pipeline.field import noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.posterior.priors import default_prior
 
-STATIC = Path(__file__).with_name("static")
-CASES, NESTED = STATIC / "confusion_study.jsonl", STATIC / "confusion_nested.jsonl"
+CASES = Path(__file__).with_name("static") / "confusion_study.jsonl"
 PAGE, SCRIPT = "howto/companion_or_disc.md", "docs/confusion_study.py"
 
 MODELS = ("star", "companion", "ring", "crescent", "ring+companion")
@@ -108,9 +106,7 @@ def simulated(truth: str, rng: np.random.Generator) -> tuple[Observables, dict[s
     ), theta
 
 
-def compared(
-    data: Observables, rng: np.random.Generator, draws: int, method: str = "direct"
-) -> ModelComparison:
+def compared(data: Observables, rng: np.random.Generator, draws: int) -> ModelComparison:
     """Compare as ``amibayes search --models`` does."""
     options = SearchOptions(separation_mas=(60.0, 400.0))
     found = search_field(data, options)
@@ -119,7 +115,7 @@ def compared(
     noise = NoiseSetting(found.noise, noise_prior(data, options))
     return compare_sky_models(
         found.result, prior, rng,
-        models=MODELS, stated=data, noise=noise, confusion_draws=draws, method=method,
+        models=MODELS, stated=data, noise=noise, confusion_draws=draws,
     )  # fmt: skip
 
 
@@ -172,20 +168,6 @@ def ranks(model: Compared, theta: dict[str, float]) -> dict[str, float]:
             values, true = ((x - mean + 0.5 * turn) % turn for x in (values, true))
         found[name] = round(float(weight @ (values < true[0])), 4)
     return found
-
-
-def nested(k: int) -> Answer:
-    """Evidences of a case's data by importance sampling and by dynesty."""
-    truth, data, _, rng = of_case(k)
-    answer: Answer = {"case": k, "truth": truth}
-    for method in ("direct", "nested"):
-        begin = time.process_time()
-        found = compared(data, rng, 0, method)
-        answer[method] = {
-            m.name: (round(m.log_z, 3), round(m.log_z_error, 3), m.method) for m in found.models
-        }
-        answer[f"{method}_cpu_s"] = round(time.process_time() - begin, 2)
-    return answer
 
 
 def measured_table(cases: Sequence[Answer]) -> list[str]:
@@ -256,36 +238,16 @@ def coverage_table(cases: Sequence[Answer]) -> list[str]:
     return lines
 
 
-def nested_table(answers: Sequence[Answer]) -> list[str]:
-    """Differences of ln Z, importance sampling minus dynesty, in numbers and errors."""
-    lines = [
-        "| model | data sets | mean difference | root mean square | in units of its error |",
-        "|---|---|---|---|---|",
-    ]
-    for model in MODELS[1:]:
-        pairs = [(a["direct"][model], a["nested"][model]) for a in answers]
-        # Where odds are below 1e-6 no sampler is run.
-        pairs = [(d, n) for d, n in pairs if n[2] == "nested"]
-        if not pairs:
-            continue
-        off = np.array([d[0] - n[0] for d, n in pairs])
-        error = np.array([np.hypot(d[1], n[1]) for d, n in pairs])
-        size, pull = np.sqrt(np.mean(off**2)), np.sqrt(np.mean((off / error) ** 2))
-        lines.append(f"| {model} | {len(off)} | {off.mean():+.2f} | {size:.2f} | {pull:.2f} |")
-    return lines
-
-
-def cost_table(cases: Sequence[Answer], answers: Sequence[Answer]) -> list[str]:
-    """CPU time of a comparison."""
+def cost_table(cases: Sequence[Answer]) -> list[str]:
+    """CPU time of a case: search, fits, evidences, and those of the simulated data sets."""
     each = np.array([c["cpu_s"] for c in cases])
-    lines = ["| | CPU, s |", "|---|---|"]
+    low, mid, high = np.quantile(each, [0.05, 0.5, 0.95])
     n = CONFUSION_DRAWS * len(MODELS)
-    lines.append(f"| search and comparison, {n} simulated data sets | {np.median(each):.1f} |")
-    for method in ("direct", "nested"):
-        what = "importance sampling" if method == "direct" else "dynesty"
-        took = np.median([a[f"{method}_cpu_s"] for a in answers]) if answers else np.nan
-        lines.append(f"| search and evidences by {what}, no simulated data | {took:.1f} |")
-    return lines
+    return [
+        "| five models, simulated data sets | median, s | 5 % to 95 %, s |",
+        "|---|---|---|",
+        f"| {n} | {mid:.1f} | {low:.1f} to {high:.1f} |",
+    ]
 
 
 def main() -> int:
@@ -293,28 +255,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=1000, help="no more than these")
     parser.add_argument("--minutes", type=float, default=0.0, help="CPU time for more cases")
-    parser.add_argument("--nested", type=int, default=0, help="data sets for dynesty")
     parser.add_argument("--no-tables", action="store_true", help="cases only")
     arguments = parser.parse_args()
     for k in range(len(known_answers(CASES)), arguments.cases):
         if time.process_time() > 60.0 * arguments.minutes:
             break
         keep_answer(CASES, case(k))
-    for k in range(len(known_answers(NESTED)), arguments.nested):
-        keep_answer(NESTED, nested(k))
     if not arguments.no_tables:
-        write_tables(known_answers(CASES), known_answers(NESTED))
+        write_tables(known_answers(CASES))
     return 0
 
 
-def write_tables(cases: Sequence[Answer], answers: Sequence[Answer]) -> None:
+def write_tables(cases: Sequence[Answer]) -> None:
     """Put all tables into the page."""
     tables = {
         "measured": measured_table(cases),
         "stated": stated_table(cases),
         "coverage": coverage_table(cases),
-        "nested": nested_table(answers),
-        "cost": cost_table(cases, answers),
+        "cost": cost_table(cases),
     }
     for name, lines in tables.items():
         put_table(PAGE, lines, f"{name}: {SCRIPT}")
