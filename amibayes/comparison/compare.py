@@ -304,9 +304,12 @@ def _averaged(
     """Average the likelihood over the amount of noise, the same way for all models."""
     if stated is None or setting.prior is None or setting.prior.vis2 <= 0.0:
         return fits
+    # Gains and coherent errors go with the fringes of a fit, as in the noise that was fitted.
+    best = min(fits, key=lambda fit: float(fit.chi2[0]))
+    clean = Likelihood(stated, best.model.likelihood.model)
     noise = averaged_noise(
         fits[0].model.likelihood.noise,
-        stated,
+        clean.expecting(best.theta).observables,
         [(fit.model.likelihood, fit.theta) for fit in fits],
         per_file=setting.per_file,
         channels=found.channels,

@@ -17,6 +17,7 @@ from amibayes.comparison.hypotheses import Hypothesis, hypotheses, prior_of
 from amibayes.comparison.integral import Effort, integrate, log_z_laplace
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.comparison.verdict import Confusion, choose
+from amibayes.data.systematics import Systematics
 from amibayes.errors import UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -268,3 +269,26 @@ def test_noise_is_that_of_the_most_likely_model_with_its_own(of_search: ExtraNoi
     assert (one.name, found.any) == ("companion", False)
     at = fits[1].theta[None]
     assert likelihood.log_prob(at) == pytest.approx(base.log_prob(at))
+
+
+def test_the_averaged_noise_has_the_errors_that_data_are_simulated_with() -> None:
+    """With coherent errors, which are largest in closure phases of faint fringes."""
+    model = BinaryModel(1, diameter_mas=210.0)
+    data = simulated(niriss(), [0.0, 0.0, 0.0], np.random.default_rng(1), model)
+    floor = Systematics(data.setups[0].source, 0.03, np.radians(0.5), 0.005)
+    prior = NoisePrior(0.05, np.radians(3.0), True, (floor,))
+    base = Likelihood(data, model)
+    found = compare_sky_models(
+        search(base, (60.0, 400.0)),
+        STAR,
+        np.random.default_rng(3),
+        models=["star", "companion"],
+        stated=data,
+        noise=NoiseSetting(prior=prior),
+        confusion_draws=0,
+    )
+    noise = found.models[0].fit.model.likelihood.noise
+    drawn = noise.draw(2000, np.random.default_rng(4))
+    for term in noise.terms:
+        size = ((term.whitening @ drawn) ** 2).sum(axis=0).mean() / term.n_independent
+        assert 0.5 < size < 2.0
