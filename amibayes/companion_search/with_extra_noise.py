@@ -113,7 +113,7 @@ def _same(a: ExtraNoise, b: ExtraNoise) -> bool:
         for x, y in zip(a.files, b.files, strict=True):
             pairs += [(x.vis2, y.vis2), (x.closure_phase_rad, y.closure_phase_rad)]
     near = all(abs(x - y) <= CONVERGED * max(x, y) for x, y in pairs)
-    return near and _same_shares(a, b)
+    return a.floors == b.floors and near and _same_shares(a, b)
 
 
 def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
@@ -175,13 +175,19 @@ def noise_averaged(
             per_file=per_file,
         )
     else:
-        expected = profile.observables.vis2.expected
-        stated = stated.unflagged()
-        stated = replace(stated, vis2=replace(stated.vis2, expected=expected))
         noise = averaged_noise(
-            profile.noise, stated, fits, per_file=per_file, channels=channels, prior=prior
-        )
+            profile.noise, _expected(stated.unflagged(), profile.observables), fits,
+            per_file=per_file, channels=channels, prior=prior,
+        )  # fmt: skip
     averaged = profile.with_noise(noise)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two
+
+
+def _expected(stated: Observables, fitted: Observables) -> Observables:
+    """Data with what the fit of the noise expected of them, on which floors of errors rest."""
+    v, c = fitted.vis2, fitted.closure_phase
+    vis2 = replace(stated.vis2, expected=v.expected, coherent_slope=v.coherent_slope)
+    closure = replace(stated.closure_phase, coherent_slope=c.coherent_slope)
+    return replace(stated, vis2=vis2, closure_phase=closure)
