@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-import secrets
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+
+from amibayes.support.atomic_files import atomic_path
 
 DIGEST = 32
 """Bytes of a SHA-256, which go before the pickle: files are not forced to the disk one by one,
@@ -64,9 +65,8 @@ class _OnlyOurs(pickle.Unpickler):
 def write_stage(path: Path, result: Any) -> None:
     """Keep what a stage made, whole or not at all."""
     content = pickle.dumps(result)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    temporary.write_bytes(hashlib.sha256(content).digest() + content)
-    temporary.replace(path)
+    with atomic_path(path, lasting=False) as temporary:
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
 
 
 def read_stage(path: Path) -> Any | None:

@@ -27,8 +27,14 @@ TEMPORARY = ".{}.{}{}"
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path, *, lasting: bool = True) -> Iterator[Path]:
     """Give a temporary path beside ``path`` that replaces it when the block succeeds.
+
+    Parameters
+    ----------
+    path : path
+    lasting : bool
+        Force it to the disk, so that a power cut leaves it whole.
 
     Raises
     ------
@@ -45,9 +51,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise cannot_write(final, error) from error
     try:
         yield temporary
-        _flush(temporary)
+        if lasting:
+            _flush(temporary)
         temporary.replace(final)
-        _flush(final.parent)
+        if lasting:
+            _flush(final.parent)
     except OSError as error:
         raise cannot_write(final, error) from error
     finally:

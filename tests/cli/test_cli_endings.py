@@ -121,9 +121,10 @@ def test_other_endings(error, said, monkeypatch, capsys) -> None:
 @pytest.mark.parametrize(
     ("limit", "more", "file"),
     [
-        (0, (), "posterior.h5"),
-        pytest.param(200_000, (), "posterior.h5", marks=pytest.mark.slow),
-        pytest.param(3_000, ("--no-posterior",), ".png", marks=pytest.mark.slow),
+        (0, (), "stage-data.pickle"),
+        pytest.param(200_000, (), "stage-integrate.pickle", marks=pytest.mark.slow),
+        pytest.param(700_000, (), "posterior.h5", marks=pytest.mark.slow),
+        pytest.param(100_000, ("--no-posterior",), ".png", marks=pytest.mark.slow),
         pytest.param(700_000, ("--no-posterior",), "report.html", marks=pytest.mark.slow),
     ],
 )
@@ -214,7 +215,8 @@ def test_a_run_that_is_stopped(number, workers, pause, target: Path, tmp_path: P
     os.killpg(process.pid, number)
     status, line = ended(process)
     assert status == 4
-    kept = r"(kept \d+ pieces? of the null searches|no stage that can be kept was begun)"
+    parts = r"(the stages? [a-z, ]+)?(, )?(\d+ pieces? of the null searches)?"
+    kept = rf"(kept (?=\S){parts}|no stage that can be kept was begun)"
     assert re.fullmatch(
         rf"amibayes: interrupted: {kept} \(run again with --resume to go on\)", line
     )
