@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +26,14 @@ def start(*words: object, **options: object) -> subprocess.Popen[bytes]:
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), *sys.path])
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, "-m", *map(str, words)]
+    if os.name == "posix":
+        options.setdefault("preexec_fn", heed_interruptions)
     return subprocess.Popen(command, env=environment, **options)  # type: ignore[call-overload]
+
+
+def heed_interruptions() -> None:
+    """What is started behind a shell's & ignores Ctrl-C, and so would its children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def alive(pid: int) -> bool:

@@ -17,6 +17,7 @@ from pathlib import Path
 import h5py
 import pytest
 from astropy.io import fits
+from commands import heed_interruptions
 
 from amibayes.cli import main
 from amibayes.errors import UsageError
@@ -33,8 +34,7 @@ def start(
     """Start the command in a process of its own, in which no file may become larger."""
 
     def prepared() -> None:
-        # What is started behind a shell's & ignores Ctrl-C, and so would its children.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        heed_interruptions()
         if largest is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (largest, largest))
 
