@@ -41,7 +41,7 @@ from amibayes.units import FloatArray
 MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
 
-MIN_DRAWS, MAX_DRAWS = 2_000, 200_000
+MIN_DRAWS, MAX_DRAWS = 10_000, 200_000
 
 DEFENSIVE = 0.2
 """Share of the draws that comes from the prior."""
