@@ -16,8 +16,6 @@ import numpy as np
 
 from amibayes.errors import DataError
 from amibayes.posterior.chain_file import load_chain, save_chain
-from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.independence import IndependenceProposal
 from amibayes.posterior.laplace import physical, sampled
 from amibayes.posterior.modes import Region
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
@@ -59,10 +57,8 @@ class EnsembleSampler:
         prior that the likelihood prefers.
     region : Region, optional
         Part of the field that is sampled; all of it unless given.
-    grid : GridPosterior, optional
-        Of the same likelihood and prior: gives the `IndependenceProposal`.
     leaps : callable, optional
-        Another such proposal, where there is no grid (`emcee.moves.MHMove`).
+        Proposals that do not start from where a walker is (`emcee.moves.MHMove`).
     path : path, optional
         HDF5 file of the chain, readable by `emcee.backends.HDFBackend`.
     resume : bool
@@ -75,7 +71,6 @@ class EnsembleSampler:
 
     start: FloatArray | None = None
     region: Region | None = None
-    grid: GridPosterior | None = None
     leaps: Leaps | None = None
     path: str | Path | None = None
     resume: bool = False
@@ -105,9 +100,9 @@ class EnsembleSampler:
         seed = int(rng.integers(2**32))
         posterior = self._log_posterior(log_prob, prior)
         # All of data, covariance, noise and model are in the values at the start.
-        places, with_grid = self._places(), self.grid is not None
+        places, with_leaps = self._places(), self.leaps is not None
         digest = request.digest(
-            start, posterior(start), prior.prior, seed, places, with_grid, emcee.__version__
+            start, posterior(start), prior.prior, seed, places, with_leaps, emcee.__version__
         )
         backend = load_chain(self.path, digest) if self.path and self.resume else None
         sampler = emcee.EnsembleSampler(
@@ -139,20 +134,11 @@ class EnsembleSampler:
 
     def _moves(self) -> list[tuple[emcee.moves.Move, float]]:
         """Moves and how often each is made."""
-        along, leaps = along_others(), self.leaps if self.grid is None else self._from_grid()
-        if leaps is None:
+        along = along_others()
+        if self.leaps is None:
             return along
-        return [*((move, 0.5 * share) for move, share in along), (emcee.moves.MHMove(leaps), 0.5)]
-
-    def _from_grid(self) -> Leaps | None:
-        assert self.grid is not None
-        grid, position = self.grid, self.grid.cells.position
-        inside = np.full(len(grid.probability), True)
-        if self.region is not None:
-            inside = self.region.holds(*position)
-        if not grid.probability[inside].any():  # too improbable for cells of its own
-            return None
-        return IndependenceProposal(grid.within(inside))
+        half = [(move, 0.5 * share) for move, share in along]
+        return [*half, (emcee.moves.MHMove(self.leaps), 0.5)]
 
     def _log_posterior(
         self, log_prob: LogProb, prior: ModelPrior

@@ -59,26 +59,29 @@ def _change(value: FloatArray) -> FloatArray:
     return np.abs(_between(value[:, ::2], new) - value[:, 1::2])
 
 
-def profile(at: At, low: FloatArray, high: FloatArray, boxes: FloatArray) -> FloatArray:
+def profile(
+    at: At, low: FloatArray, high: FloatArray, boxes: FloatArray, n_nodes: int
+) -> FloatArray:
     """ln L of cells and nodes of the nuisance parameters at boxes of the contrast.
 
     Parameters
     ----------
     at : callable
         Forms ln L; a row is a cell and a node, the nodes of a cell one after the other.
-    low, high : (n_cells, n_nodes) float array
+    low, high : (n_cells,) float array
         Range of contrast within which all boxes lie.
     boxes : (n_cells, n_boxes) float array
         Contrasts, from small to large.
+    n_nodes : int
 
     Returns
     -------
     (n_cells, n_nodes, n_boxes) float array
     """
-    n_cells, n_nodes = low.shape
-    boxes = np.repeat(boxes, n_nodes, axis=0)
-    out = np.full(boxes.shape, -np.inf)
-    low, high, rows, top = low.ravel(), high.ravel(), np.arange(low.size), np.full(n_cells, -np.inf)
+    n_cells = len(boxes)
+    low, high, boxes = (np.repeat(x, n_nodes, axis=0) for x in (low, high, boxes))
+    out, top = np.full(boxes.shape, -np.inf), np.full(n_cells, -np.inf)
+    rows = np.arange(len(boxes))
     for degree in DEGREES:
         if not len(rows):
             break
@@ -88,9 +91,10 @@ def profile(at: At, low: FloatArray, high: FloatArray, boxes: FloatArray) -> Flo
         inside = (place >= 0.0) & (place <= 1.0)
         out[rows] = np.where(inside, _between(value, np.clip(place, 0.0, 1.0)), out[rows])
         np.maximum.at(top, rows // n_nodes, value.max(axis=1))
-        left = _left(value, top[rows // n_nodes])
+        change = _change(value)
+        left = _left(change, value[:, 1::2] - top[rows // n_nodes, None])
         rows = rows[left]
-        best, slack = top[rows // n_nodes], 2.0 * _change(value[left]).max(axis=1, initial=0.0)
+        best, slack = top[rows // n_nodes], 2.0 * change[left].max(axis=1, initial=0.0)
         counts = out[rows] > (best - DEEP - slack)[:, None]
         rows, counts = rows[counts.any(axis=1)], counts[counts.any(axis=1)]
         low, high = _ends(boxes[rows], counts)
@@ -99,10 +103,12 @@ def profile(at: At, low: FloatArray, high: FloatArray, boxes: FloatArray) -> Flo
     return out.reshape(n_cells, n_nodes, -1)
 
 
-def _left(value: FloatArray, top: FloatArray) -> BoolArray:
-    """Rows of values (n, degree + 1) whose polynomial is not good enough, (n,)."""
-    change = _change(value)
-    weight = np.exp(0.5 * np.minimum(value[:, 1::2] - top[:, None], 0.0))
+def _left(change: FloatArray, below: FloatArray) -> BoolArray:
+    """Rows (n,) whose polynomial is not good enough, by the change of ln L at new points (n, k).
+
+    There ln L is ``below`` (n, k) the largest of the cell: 0 or less.
+    """
+    weight = np.exp(0.5 * np.minimum(below, 0.0))
     return np.asarray(((change * weight > TOLERANCE) | (change > RESOLVED)).any(axis=1))
 
 

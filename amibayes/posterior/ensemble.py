@@ -18,6 +18,7 @@ from amibayes.posterior.chain import (
     MAX_STEPS,
     N_WALKERS,
     EnsembleSampler,
+    Leaps,
     burn_in,
     long_enough,
     longest,
@@ -27,6 +28,7 @@ from amibayes.posterior.chain import (
 )
 from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.posterior.grid import GridPosterior
+from amibayes.posterior.independence import leaps_within
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.polynomial import PolynomialLogProb, polynomial_log_prob
@@ -232,10 +234,13 @@ def sample(
     """
     region, parameters = Region.of(result), result.likelihood.parameters
     start = _start(result, prior, region, rng)
-    everything = ModelPrior(prior, parameters)
-    quick = None if grid is not None else _quick(result, everything, rng)
-    leaps = None if quick is None else quick.leaps
-    walkers = EnsembleSampler(start, region, grid, leaps, path, resume, max_steps, progress)
+    everything, quick = ModelPrior(prior, parameters), None
+    leaps: Leaps | None = None
+    if grid is not None:
+        leaps = leaps_within(grid, region)
+    elif (quick := _quick(result, everything, rng)) is not None:
+        leaps = quick.leaps
+    walkers = EnsembleSampler(start, region, leaps, path, resume, max_steps, progress)
     chain = walkers.run(quick or result.likelihood.log_prob, everything, rng)
     return _posterior(chain, result, prior, grid)
 

@@ -10,6 +10,7 @@ from scipy.special import logsumexp
 
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import physical
+from amibayes.posterior.modes import Region
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
 from amibayes.units import FloatArray, IntArray
 
@@ -91,6 +92,14 @@ class IndependenceProposal:
     @cached_property
     def _nodes_cumulated(self) -> FloatArray:
         return _cumulated(self.grid.nuisance_probability)
+
+
+def leaps_within(grid: GridPosterior, region: Region) -> IndependenceProposal | None:
+    """Proposals inside a region; None where it is too improbable for cells of its own."""
+    inside = region.holds(*grid.cells.position)
+    if not grid.probability[inside].any():
+        return None
+    return IndependenceProposal(grid.within(inside))
 
 
 @dataclass(frozen=True, eq=False)

@@ -274,8 +274,8 @@ class Integrand:
 
         everywhere = np.arange(len(sites))
         faint = at(everywhere, np.repeat(contrast[:, :FAINT_BOXES], n_nodes, axis=0))
-        low, high = (np.tile(x[:, None], n_nodes) for x in (edges[:, FAINT_BOXES], edges[:, -1]))
-        fine = profile(at, low, high, contrast[:, FAINT_BOXES:])
+        low, high = edges[:, FAINT_BOXES], edges[:, -1]
+        fine = profile(at, low, high, contrast[:, FAINT_BOXES:], n_nodes)
         faint = faint.reshape(len(cells), n_nodes, FAINT_BOXES)
         return edges, np.concatenate([faint, fine], axis=2)
 

@@ -9,8 +9,9 @@ its first steps did.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
+from math import comb
 
 import numpy as np
 from scipy import stats
@@ -93,10 +94,12 @@ class PolynomialLogProb:
 
         For `emcee.moves.MHMove`: from a t distribution of the posterior's mean and covariance.
         """
-        scatter = np.asarray(np.linalg.inv(self.unit), dtype=float)
-        around = HeavyTailed(self.centre, scatter)
-        places = around.draw(random, len(walkers))
-        return places, around.log_density(walkers) - around.log_density(places)
+        places = self._around.draw(random, len(walkers))
+        return places, self._around.log_density(walkers) - self._around.log_density(places)
+
+    @cached_property
+    def _around(self) -> HeavyTailed:
+        return HeavyTailed(self.centre, np.asarray(np.linalg.inv(self.unit), dtype=float))
 
 
 def polynomial_log_prob(
@@ -135,7 +138,7 @@ def polynomial_log_prob(
     tests = work.drawn(centre, scatter, TESTED, N_TESTS, radius)
     fitted: tuple[FloatArray, FloatArray] = np.empty((0, n_dim)), np.empty(0)
     for degree in DEGREES:
-        n_terms = _n_terms(n_dim, degree)
+        n_terms = comb(n_dim + degree, degree)
         more = int(DRAWS_PER_TERM * n_terms) - len(fitted[0])
         new = work.drawn(centre, scatter, WIDER, more, radius)
         fitted = np.concatenate([fitted[0], new[0]]), np.concatenate([fitted[1], new[1]])
@@ -202,10 +205,6 @@ def _fitted(z: FloatArray, value: FloatArray, radius: float, n_terms: int) -> Fl
     weight = np.exp((value - value.max()) / 8.0)
     terms = _terms(z / radius, n_terms)
     return np.asarray(np.linalg.lstsq(weight[:, None] * terms, weight * value, rcond=None)[0])
-
-
-def _n_terms(n_dim: int, degree: int) -> int:
-    return 1 + sum(len(_products(n_dim, d)[0]) for d in range(1, degree + 1))
 
 
 @cache

@@ -26,9 +26,9 @@ def _both(name: str, sigma: float):
         sets += contrast.size
         return FUNCTIONS[name]((contrast - CENTRES.ravel()[rows, None]) / sigma)
 
-    low, high = np.zeros(CENTRES.shape), np.ones(CENTRES.shape)
+    low, high = np.zeros(len(CENTRES)), np.ones(len(CENTRES))
     boxes = np.tile(np.linspace(0.0, 1.0, 131)[1::2], (len(CENTRES), 1))
-    found = profile(at, low, high, boxes)
+    found = profile(at, low, high, boxes, CENTRES.shape[1])
     truth = FUNCTIONS[name]((boxes[:, None, :] - CENTRES[:, :, None]) / sigma)
     return found, truth, sets / CENTRES.size
 
