@@ -14,7 +14,8 @@ import numpy as np
 
 from amibayes.comparison.fit_models import ModelFit, embedded
 from amibayes.comparison.fitting import least_squares
-from amibayes.comparison.integral import PriorDraws, log_z_laplace
+from amibayes.comparison.integral import log_z_laplace
+from amibayes.comparison.mixture import PriorDraws
 from amibayes.comparison.pooled import PooledEffort, pooled_evidences
 from amibayes.comparison.verdict import Confusion
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn

@@ -114,9 +114,9 @@ class Journals:
         path = self.path / STAGE.format(stage)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            write_stage(path, result)
         except OSError as error:
             raise cannot_write(path, error) from error
+        write_stage(path, result)
 
     def under(self, part: str) -> Journals:
         """Open the journals of a part of the run."""

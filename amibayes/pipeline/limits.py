@@ -278,11 +278,7 @@ def _one_limit(
     run = run.under("-".join(search.observables))
     streams = [np.random.default_rng(k) for k in seed.spawn(2)]
 
-    def searched() -> FieldSearch:
-        with run.stage(f"search {name}"):
-            return search_field(data, search)
-
-    found = run.keep("search", searched)
+    found = run.keep_stage("search", lambda: search_field(data, search), f"search {name}")
     tested, search = None, _with_draws(found.result, search)
     if search.null_draws != 0:
         with run.stage(f"null searches {name}"):

@@ -74,6 +74,15 @@ class Run:
         self.seconds.update(kept[1])
         return kept[0]
 
+    def keep_stage(self, part: str, make: Callable[[], Made], name: str = "") -> Made:
+        """Do a stage, announced by its name or that of the part, unless it is kept."""
+
+        def timed() -> Made:
+            with self.stage(name or part):
+                return make()
+
+        return self.keep(part, timed)
+
     def journal(self, job: str) -> Journal | None:
         """Open the journal of a job, where finished pieces are kept."""
         return None if self.journals is None else self.journals.of(job)

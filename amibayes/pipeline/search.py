@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,7 @@ from amibayes.pipeline.models import (
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
-from amibayes.pipeline.run import Announce, Made, Run, silent
+from amibayes.pipeline.run import Announce, Run, silent
 from amibayes.pipeline.warnings import consistency_warnings, search_warnings
 from amibayes.posterior.bootstrap import Bootstrap, bootstrap
 from amibayes.posterior.ensemble import Posterior, sample
@@ -165,14 +164,14 @@ def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams,
     if first.detected is None:
         return Tests(first, second)
 
-    def stated() -> tuple[Verdict, tuple[Consistency, ...]]:
-        with run.stage("verdict"):
-            return verdict_of(
-                found.result, first, ready.observables, options, rng["verdict"], run.executor,
-                ready.exchangeable,
-            )  # fmt: skip
-
-    return Tests(first, second, *run.keep("verdict", stated))
+    verdict, splits = run.keep_stage(
+        "verdict",
+        lambda: verdict_of(
+            found.result, first, ready.observables, options, rng["verdict"], run.executor,
+            ready.exchangeable,
+        ),
+    )  # fmt: skip
+    return Tests(first, second, verdict, splits)
 
 
 def _significance(
@@ -242,30 +241,33 @@ def _inferred(
     prior, counts = _prior(result, options), _counts(options)
     grid = samples = evidence = resampled = None
     if (options.posterior or counts) and affordable(result.likelihood, prior):
-        grid = _stage(run, "integrate", lambda: grid_posterior(result.likelihood, prior))
+        grid = run.keep_stage("integrate", lambda: grid_posterior(result.likelihood, prior))
     if options.posterior:
         path, resume = chain
-        own = partial(sample, path=path, resume=resume, grid=grid, progress=run.progress)
-        samples = _stage(run, "posterior", lambda: own(result, prior, rng["posterior"]))
+        samples = run.keep_stage(
+            "posterior",
+            lambda: sample(
+                result, prior, rng["posterior"], path=path, resume=resume, grid=grid,
+                progress=run.progress,
+            ),
+        )  # fmt: skip
     if counts:
-        method = options.evidence_method
-        compared = partial(compare_models, companions=counts, grid=grid, two=two, method=method)
-        evidence = _stage(run, "evidence", lambda: compared(result, prior, rng["evidence"]))
+        evidence = run.keep_stage(
+            "evidence",
+            lambda: compare_models(
+                result, prior, rng["evidence"], companions=counts, grid=grid, two=two,
+                method=options.evidence_method,
+            ),
+        )  # fmt: skip
     if options.bootstrap:
-        fits = partial(bootstrap, found.result, found.noise, options.bootstrap)
-        again = partial(fits, rng["bootstrap"], progress=run.progress)
-        resampled = _stage(run, "bootstrap", again)
+        resampled = run.keep_stage(
+            "bootstrap",
+            lambda: bootstrap(
+                found.result, found.noise, options.bootstrap, rng["bootstrap"],
+                progress=run.progress,
+            ),
+        )  # fmt: skip
     return Inference(samples, grid, evidence, _noise_posterior(result, samples), resampled)
-
-
-def _stage(run: Run, name: str, make: Callable[[], Made]) -> Made:
-    """Do a stage, unless it is kept."""
-
-    def timed() -> Made:
-        with run.stage(name):
-            return make()
-
-    return run.keep(name, timed)
 
 
 def _noise_posterior(

@@ -32,7 +32,7 @@ from amibayes.posterior.laplace import (
 )
 from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, Range
-from amibayes.posterior.sampler import draw_posterior
+from amibayes.posterior.sampler import draw_posterior, log_mean
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import html_table
 from amibayes.support.options import SAMPLERS
@@ -249,11 +249,8 @@ def log_evidence_importance(
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)
-    log_z = float(logsumexp(log_w) - np.log(n))
-    relative = np.exp(log_w - log_z)
-    # Draws outside the prior count, with weight 0.
-    spread = np.sqrt(max((relative**2).sum() / n - 1.0, 0.0) / n)
-    return log_z, float(spread)
+    log_z, error = log_mean(log_w, n)
+    return float(log_z), float(error)
 
 
 class _Gaussians:

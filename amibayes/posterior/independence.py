@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from amibayes.posterior.grid import GridPosterior
 from amibayes.posterior.laplace import physical
 from amibayes.posterior.modes import Region
-from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
+from amibayes.posterior.sampler import Draws, LogProb, ModelPrior, log_mean
 from amibayes.units import FloatArray, IntArray
 
 N_DRAWS = 20_000
@@ -123,11 +122,9 @@ class GridSampler:
         samples = physical(x, prior.parameters)
         value = log_prob(samples)
         log_weight = value + prior.prior.log_density(x) - log_density
-        log_sum = float(logsumexp(log_weight))
-        weights = np.exp(log_weight - log_sum)
-        # Relative error of a mean of weights, which sum to 1 here.
-        error = float(np.sqrt(max((weights**2).sum() - 1.0 / self.n_draws, 0.0)))
-        evidence = {"log_z": log_sum - np.log(self.n_draws), "log_z_error": error}
+        log_z, error = log_mean(log_weight, self.n_draws)
+        weights = np.exp(log_weight - log_z) / self.n_draws
+        evidence = {"log_z": float(log_z), "log_z_error": float(error)}
         return Draws(samples, value, weights, evidence)
 
 

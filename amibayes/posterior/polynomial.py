@@ -18,7 +18,7 @@ from scipy import stats
 
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.laplace import HeavyTailed, physical, sampled
-from amibayes.posterior.sampler import LogProb, ModelPrior
+from amibayes.posterior.sampler import LogProb, ModelPrior, tempered
 from amibayes.units import FloatArray, IntArray
 
 DEGREES = (3, 4)
@@ -170,7 +170,7 @@ class _Around:
             z, value = self.drawn(centre, scatter, WIDER, FIRST_DRAWS * n_dim, np.inf)
             x = centre + z @ scatter.T
             log_weight = value + self.prior.prior.log_density(x) + 0.5 * (z * z).sum(1) / WIDER**2
-            weight, power = _tempered(log_weight - log_weight.max(), LEAST_EFFECTIVE * n_dim)
+            weight, power = tempered(log_weight, LEAST_EFFECTIVE * n_dim)
             centre = np.asarray(weight @ x)
             away = np.sqrt(weight)[:, None] * (x - centre)
             scatter = np.asarray(np.linalg.cholesky(away.T @ away), dtype=float)
@@ -187,17 +187,6 @@ class _Around:
         inside = np.isfinite(self.prior.prior.log_density(x)) & ((z * z).sum(axis=1) < radius**2)
         z, x = z[inside][:n], x[inside][:n]
         return z, self.log_prob(physical(x, self.prior.parameters))
-
-
-def _tempered(log_weight: FloatArray, least: float) -> tuple[FloatArray, float]:
-    """Weights to the largest power up to 1 that leaves an effective number of draws."""
-    power = 1.0
-    while True:
-        weight = np.exp(power * log_weight)
-        weight /= weight.sum()
-        if 1.0 / (weight**2).sum() >= least:
-            return weight, power
-        power *= 0.7
 
 
 def _fitted(z: FloatArray, value: FloatArray, radius: float, n_terms: int) -> FloatArray:

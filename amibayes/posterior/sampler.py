@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.quadrature import log_sum
 from amibayes.models.parameters import Parameters
 from amibayes.posterior.priors import Prior
 from amibayes.support.options import SAMPLERS, entry
@@ -88,6 +89,57 @@ class Draws:
         """Draw samples (n, n_dim) of equal weight."""
         share = self.weights / self.weights.sum()
         return self.samples[rng.choice(len(share), n, p=share)]
+
+
+def log_mean(log_weight: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
+    """Give ln of the mean of weights of draws, the evidence, and its error.
+
+    Parameters
+    ----------
+    log_weight : (k,) or (k, m) float array
+        Of draws inside the prior, for one data set or m.
+    n : int
+        All draws; those outside the prior count as 0.
+
+    Returns
+    -------
+    log_z, error : float array
+        () or (m,).
+    """
+    log_z = log_sum(log_weight) - np.log(n)
+    square = (np.exp(log_weight - log_z) ** 2).sum(axis=0) / n
+    return log_z, np.sqrt(np.maximum(square - 1.0, 0.0) / n)
+
+
+def tempered(
+    log_weight: FloatArray, least: float, least_power: float = 0.0
+) -> tuple[FloatArray, float]:
+    """Raise weights to the largest power up to 1 at which enough draws count for a fit.
+
+    Proposals that are too narrow give a few draws nearly all of the weight; fitted to these they
+    would become narrower still.
+
+    Parameters
+    ----------
+    log_weight : (n,) float array
+    least : float
+        Effective number of draws that is enough.
+    least_power : float
+        Where to stop in any case.
+
+    Returns
+    -------
+    weight : (n,) float array
+        They sum to 1.
+    power : float
+    """
+    power = 1.0
+    while True:
+        weight = np.exp(power * (log_weight - log_weight.max()))
+        weight /= weight.sum()
+        if 1.0 / (weight**2).sum() >= least or 0.7 * power <= least_power:
+            return weight, power
+        power *= 0.7
 
 
 class Sampler(Protocol):

@@ -12,7 +12,8 @@ from test_comparison import STAR, TRUTHS, base_of, cube_of, fitted
 from amibayes.comparison.fit_models import fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import prior_of
-from amibayes.comparison.integral import Effort, PriorDraws, integrate
+from amibayes.comparison.integral import Effort, integrate
+from amibayes.comparison.mixture import PriorDraws
 from amibayes.comparison.pooled import PooledEffort, pooled_evidences
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.posterior.nested import NestedSampler
