@@ -1,9 +1,11 @@
 """The jwst package beside amibayes on simulated visits: the tables of `jwst_pipeline.md`.
 
     python docs/jwst_pipeline.py --peers FOLDER [--minutes 10] [--only stars binaries routes]
+        [--keep VISITS [--again]]
     python docs/jwst_pipeline.py --data DATA_FOLDER
 
-FOLDER keeps the environment of jwst, which is installed from PyPI the first time. Visits are
+FOLDER keeps the environment of jwst, which is installed from PyPI the first time, and VISITS the
+files of every visit: with ``--again`` these are stated anew, without jwst. Visits are
 added to ``docs/static/jwst_trials.jsonl``, one line each, until so many minutes have passed; the
 tables are then made from all lines. DATA_FOLDER holds ``jwst/sima-*`` and ``cubes/niriss_f480m_*``:
 what is stated of these, by each route.
@@ -25,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from pages import put_table
-from trials import keep_answer, known_answers
+from trials import forget_answers, keep_answer, known_answers
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "oifits")]
@@ -33,7 +35,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "oifits")]
 from amibayes import calibrate  # noqa: E402
 from amibayes.extraction.reading import ImageOptions, of_one_visit, read_observations  # noqa: E402
 from amibayes.units import offset  # noqa: E402
-from benchmarks.jwst_pipeline import LIMIT_MAS, ROUTES, Visit, trial  # noqa: E402
+from benchmarks.jwst_pipeline import LIMIT_MAS, ROUTES, Visit, make, stated  # noqa: E402
 from benchmarks.statements import searched  # noqa: E402
 
 FILE = Path(__file__).with_name("static") / "jwst_trials.jsonl"
@@ -75,20 +77,24 @@ def trials(kind: str) -> list[dict[str, Any]]:
     return [t for t in known_answers(FILE) if t["kind"] == kind]
 
 
-def run(environments: Path, minutes: float, kinds: list[str], most: int) -> None:
-    """Add visits, the kinds in turn, while there is time."""
-    start, seed = time.monotonic(), 0
-    while seed < most:
+def run(
+    environments: Path, folder: Path, minutes: float, kinds: list[str], most: int, again: bool
+) -> None:
+    """Add visits, the kinds in turn, while there is time; ``again`` states all of them anew."""
+    start = time.monotonic()
+    for seed in range(most):
         for kind in kinds:
             if time.monotonic() - start > 60.0 * minutes:
                 return
-            if any(t["seed"] == seed for t in trials(kind)):
+            if not again and any(t["seed"] == seed for t in trials(kind)):
                 continue
-            with tempfile.TemporaryDirectory() as name:
-                done = trial(visit(kind, seed), Path(name), environments, KINDS[kind][2])
+            one, place = visit(kind, seed), folder / f"{kind}-{seed}"
+            seconds = make(one, place, environments, KINDS[kind][2])
+            ways, ours = stated(one, place)
+            forget_answers(FILE, lambda t, k=kind, s=seed: (t["kind"], t["seed"]) == (k, s))
+            done = {"seconds": {"amibayes": ours, **seconds}, "ways": ways}
             keep_answer(FILE, {"kind": kind, "seed": seed, **done})
             print(kind, seed, done["seconds"], flush=True)
-        seed += 1
 
 
 def measured(
@@ -258,6 +264,8 @@ def main() -> int:
     """Add visits, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peers", type=Path, metavar="FOLDER")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="of the visits' files")
+    parser.add_argument("--again", action="store_true", help="state visits that are kept anew")
     parser.add_argument("--minutes", type=float, default=0.0, help="time for more visits")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--most", type=int, default=50, help="visits of a kind")
@@ -265,7 +273,15 @@ def main() -> int:
     parser.add_argument("--draws", type=int, help="of repaired products, for their errors")
     arguments = parser.parse_args()
     if arguments.peers:
-        run(arguments.peers.resolve(), arguments.minutes, arguments.only, arguments.most)
+        with tempfile.TemporaryDirectory() as other:
+            run(
+                arguments.peers.resolve(),
+                arguments.keep or Path(other),
+                arguments.minutes,
+                arguments.only,
+                arguments.most,
+                arguments.again,
+            )
     for name, table in TABLES.items():
         put_table(PAGE, table(), f"{name}: docs/jwst_pipeline.py")
     if arguments.data:

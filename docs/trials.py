@@ -23,6 +23,12 @@ def keep_answer(path: Path, answer: Answer) -> None:
         stream.write(json.dumps(answer, default=float) + "\n")
 
 
+def forget_answers(path: Path, which: Callable[[Answer], bool]) -> None:
+    """Take answers out of a file."""
+    kept = [answer for answer in known_answers(path) if not which(answer)]
+    path.write_text("".join(json.dumps(answer) + "\n" for answer in kept), encoding="utf-8")
+
+
 def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
     """Give the answers of trials 0 to n − 1: those of the file, then new ones, put there at once.
 

@@ -43,6 +43,7 @@ FLOOR_NAMES = (
     "piston_nm",
     "drift_nm",
     "tilt_drift_mas",
+    "converter",
     "vis2",
     "closure_deg",
     "calibrators",
@@ -91,9 +92,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="default",
         metavar="NAME=VALUE,...",
         help="errors that photons do not average out, for the limit of a calibrated search: flat, "
-        "dither_mas, brightness (of calibrators), piston_nm, drift_nm, tilt_drift_mas, vis2, "
-        "closure_deg, calibrators; or none (default: flat=0.001,dither_mas=15,brightness=0.5,"
-        "piston_nm=30,drift_nm=5,calibrators=3)",
+        "dither_mas, brightness (of calibrators), piston_nm, drift_nm, tilt_drift_mas, "
+        "converter (left in, in units of JWST's), vis2, closure_deg, calibrators; or none "
+        "(default: flat=0.001,dither_mas=15,brightness=0.5,piston_nm=30,drift_nm=5,converter=1,"
+        "calibrators=3)",
     )
     add_output_options(parser, "plan")
 

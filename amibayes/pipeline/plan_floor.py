@@ -2,11 +2,12 @@
 
 Beside photon and read noise every exposure has errors of its own: the flat field, which target
 and calibrators sample at different places of the detector; holes that drift between pointings;
-charge that passes between pixels and that fainter calibrators do not share; and whatever else
-calibrators scatter by. Calibration learns of them from the scatter between the calibrators
-(`amibayes.calibration.hierarchical`), and so does the plan: calibrators are drawn, and what they
-leave of the target's response is its covariance. The limit is that of the search: a global
-false-alarm probability in its field, with the scale of the errors unknown.
+charge that passes between pixels and that fainter calibrators do not share; the converter, whose
+errors go with the counts; and whatever else calibrators scatter by. Calibration learns of them
+from the scatter between the calibrators (`amibayes.calibration.hierarchical`), and so does the
+plan: calibrators are drawn, and what they leave of the target's response is its covariance. The
+limit is that of the search: a global false-alarm probability in its field, with the scale of the
+errors unknown.
 """
 
 from __future__ import annotations
@@ -33,10 +34,12 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.completeness import COMPLETENESS, detection_limit
 from amibayes.models.binary import BinaryModel
 from amibayes.optics import Wavefront, fringe_basis, psf
+from amibayes.pipeline.converter_plan import converter_change
 from amibayes.pipeline.migration_plan import envelope_fit, migration_change
 from amibayes.scene.orientation import Orientation
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import Plan, star_channels
+from amibayes.simulation.detector import draw_maps
 from amibayes.support.arguments import in_range
 from amibayes.support.options import ALPHA
 from amibayes.units import MAS, FloatArray, contrast_to_delta_mag
@@ -81,6 +84,10 @@ class Floor:
         Path of the holes that all exposures share, and that each adds.
     tilt_drift_mas : float
         Displacement of the image of each hole that each exposure adds, per axis.
+    converter : float
+        Errors of the analogue-to-digital converter that are left in, in units of those of JWST's
+        readout: 1 in images, 0 in ramps whose superbias is at hand. Of instruments whose file
+        has charge migration; others are not read out like that.
     vis2, closure_deg : float
         Scatter between calibrators beside all that.
     calibrators : int
@@ -98,6 +105,7 @@ class Floor:
     piston_nm: float = 30.0
     drift_nm: float = 5.0
     tilt_drift_mas: float = 0.0
+    converter: float = 1.0
     vis2: float = 0.0
     closure_deg: float = 0.0
     calibrators: int = 3
@@ -117,7 +125,8 @@ class FloorExpectation:
     Parameters
     ----------
     vis2, closure_phase_rad : dict of str to float
-        Rms error of one exposure by each cause: ``flat``, ``drift``, ``migration``, ``scatter``.
+        Rms error of one exposure by each cause: ``flat``, ``drift``, ``migration``,
+        ``converter``, ``scatter``.
     calibrated_vis2, calibrated_closure_phase_rad : float
         Median error after calibration, photon noise of all stars included.
     separation_mas, delta_mag : (n,) float arrays
@@ -162,9 +171,12 @@ def expect_floor(
         "flat": flat_error(plan, floor),
         "drift": drift_error(plan.instrument, floor, rng),
         "migration": _rms(migration, n),
+        "converter": converter_error(plan, detector, floor, rng),
         "scatter": (floor.vis2, float(np.radians(floor.closure_deg))),
     }
-    own = np.array([*(causes[c] for c in ("flat", "drift", "scatter")), _rms(between, n)])
+    own = np.array(
+        [*(causes[c] for c in ("flat", "drift", "converter", "scatter")), _rms(between, n)]
+    )
     tau = np.sqrt((own**2).sum(axis=0))
     total = calibrated_covariance(photons, tau, floor.calibrators, rng)
     # Of migration the calibrators know little, but its error moves all data together.
@@ -283,6 +295,29 @@ def migration_error(
     error = 0.0 if known is None else known.error
     own = error * floor.brightness * changes[1:]
     return error * changes[0] - own.mean(axis=0), own.std(axis=0)
+
+
+def converter_error(
+    plan: Plan, detector: Detector, floor: Floor, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Error of V² and closure phase (rad) of an exposure by the converter, what all share out.
+
+    Of what is left of the target after its calibrators the share of one exposure, as if all
+    differed from each other by as much: calibrators of one brightness differ by a little less.
+    """
+    if floor.converter == 0.0 or plan.instrument.charge_migration is None:
+        return 0.0, 0.0
+    pixel = floor.dither_mas * MAS / plan.instrument.pixel_scale_rad
+    shape = (N_PIXELS, N_PIXELS)
+    bias = np.stack([draw_maps(detector, shape, rng).bias_dn for _ in range(REALISATIONS)])
+    target, *others = (
+        converter_change(plan, detector, bias, (x, y), floor.brightness if k else 1.0)
+        for k, (x, y) in enumerate(pixel * rng.standard_normal((1 + floor.calibrators, 2)))
+    )
+    left = target - np.mean(others, axis=0)
+    one = floor.converter / np.sqrt(1.0 + 1.0 / floor.calibrators)
+    vis2, closure = _rms(one * left.T, plan.instrument.mask.n_baselines)
+    return vis2, closure
 
 
 def response_of(instrument: Instrument) -> OffAxisResponse | None:

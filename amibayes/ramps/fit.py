@@ -156,7 +156,7 @@ def _with_pixels(fit: MigrationFit) -> MigrationFit:
         return fit
     gain = [_refined(e, migration.of_pixels)[KINDS.index(LINEARITY)] for e in exposures]
     systems = [_system(e, _columns(e, migration)) for e in exposures]
-    left = [e.change - fit.predicted(e) - _drift(e, fit) for e in exposures]
+    left = [_undrifted(e, e.change - fit.predicted(e)) for e in exposures]
     own = own_response(left, gain, [e.sigma for e in exposures])
     fit = replace(fit, own=own)
     pulled = np.zeros((len(migration.kinds), *exposures[0].current.shape))
@@ -170,13 +170,12 @@ def _with_pixels(fit: MigrationFit) -> MigrationFit:
     return replace(fit, migration=replace(migration, covariance=more))
 
 
-def _drift(exposure: Curvature, fit: MigrationFit) -> FloatArray:
-    """Change (ny, nx) that is the exposure's alone: flux and pointing that drift."""
+def _undrifted(exposure: Curvature, change: FloatArray) -> FloatArray:
+    """A change (ny, nx) without what is the exposure's alone: flux and pointing that drift."""
     own, used = _drifts(exposure), exposure.used
     weight = 1.0 / exposure.sigma[used]
-    data = (exposure.change - fit.predicted(exposure))[used] * weight
-    found = np.linalg.lstsq((own[:, used] * weight).T, data, rcond=None)[0]
-    return np.tensordot(found, own, axes=1)
+    found = np.linalg.lstsq((own[:, used] * weight).T, change[used] * weight, rcond=None)[0]
+    return np.asarray(change - np.tensordot(found, own, axes=1))
 
 
 def _drifts(exposure: Curvature) -> FloatArray:

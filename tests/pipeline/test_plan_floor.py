@@ -22,11 +22,15 @@ from amibayes.pipeline.plan_floor import (
     Floor,
     _observed,
     calibrated_covariance,
+    converter_error,
     flat_error,
 )
 from amibayes.pipeline.planning import Plan, expected_observables, make_plan
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import star_channels
+from amibayes.simulation.detector import draw_maps
+from amibayes.simulation.ramps import read_ramps
+from amibayes.simulation.slopes import electron_variance, slope_weights
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +61,49 @@ def test_flat_error_is_that_of_drawn_flat_fields(plan: Plan, rng) -> None:
     assert max(np.array(near) / expected) < 0.1
 
 
+def test_converter_error_is_that_of_ramps_that_are_read_out(plan: Plan, rng) -> None:
+    """Three detectors, target and calibrators drawn read by read, slopes by the simulator."""
+    floor, n = Floor(dither_mas=65.6), 40
+    detector = Detector(frame_time_s=plan.options.frame_time_s, adc_nonlinearity=1.0)
+    found = []
+    for _ in range(3):
+        bias = draw_maps(detector, (n, n), rng).bias_dn
+        changes = []
+        for k, (x, y) in enumerate(rng.standard_normal((4, 2))):
+            basis = fringe_basis(
+                plan.instrument, star_channels(plan.instrument), n, centre_px=(x, y)
+            )
+            image = np.asarray(basis.image()).reshape(n, n)
+            rate = plan.count_rate_e_s * (0.5 if k else 1.0)
+            light = np.broadcast_to(rate * image, (3, n, n))
+            pair = [
+                slopes_of(light, replace(detector, adc_nonlinearity=on), plan.n_groups, bias, k)
+                for on in (1.0, 0.0)
+            ]
+            fit = envelope_fit(basis) / rate
+            one, other = (_observed(plan.instrument, fit @ s.ravel()) for s in pair)
+            changes.append(one - other)
+        found.append(changes[0] - np.mean(changes[1:], axis=0))
+    left = np.array(found) / np.sqrt(4.0 / 3.0)
+    expected = np.sqrt((left[:, :21] ** 2).mean()), np.sqrt((left[:, 21:] ** 2).mean())
+    got = converter_error(plan, Detector(), floor, rng)
+    # Numbers of three detectors, and of four: their ratio is known to 15 %.
+    np.testing.assert_allclose(got, expected, rtol=0.6)
+    assert converter_error(plan, Detector(), replace(floor, converter=0.0), rng) == (0.0, 0.0)
+    same = converter_error(plan, Detector(), replace(floor, dither_mas=0.0, brightness=1.0), rng)
+    assert max(same) < 1e-12
+
+
+def slopes_of(light, detector: Detector, n_groups: int, bias, seed: int) -> np.ndarray:
+    """Mean slope image of ramps with the same noise whatever the converter does."""
+    rng = np.random.default_rng(seed)
+    ramps = read_ramps(light, detector, n_groups, rng, bias)
+    weight = slope_weights(
+        electron_variance(light[0], detector), len(ramps.reads) - 1, detector
+    ).reads
+    return np.einsum("rnyx,ryx->yx", ramps.reads, weight) / len(light)
+
+
 def test_calibration_learns_the_scatter_of_drawn_calibrators(photons: Observables, rng) -> None:
     """Without scatter a third of the noise and what cannot be excluded; with much, its share."""
     sigma = np.median(np.sqrt(np.diag(photons.covariance.dense()))[:21])
@@ -75,9 +122,10 @@ def test_plan_json_has_the_floor(tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(plan_floor, "TRIALS", 10)
     words = ["plan", "--filter", "F480M", "--photons", "1e9", "--mag", "6", "--out", str(tmp_path)]
     floor = "flat=0,drift_nm=0,brightness=1,dither_mas=0,vis2=0.002,calibrators=2"
+    # Calibrators of the same brightness at the same place share what the converter does.
     assert main([*words, "--separation", "150:160", "--floor", floor]) == 0
     found = json.loads((tmp_path / "plan.json").read_text(encoding="utf-8"))
-    causes = {"flat": 0.0, "drift": 0.0, "migration": 0.0, "scatter": 0.002}
+    causes = {"flat": 0.0, "drift": 0.0, "migration": 0.0, "converter": 0.0, "scatter": 0.002}
     assert found["floor"]["vis2"] == pytest.approx(causes, abs=1e-12)
     assert found["floor"]["calibrated_sigma_vis2"] == pytest.approx(0.002 * 1.5**0.5, rel=0.1)
     assert found["floor"]["delta_mag"][0] < found["contrast_curve"]["delta_mag_3sigma"][0]

@@ -23,12 +23,13 @@ from typing import Any
 
 import numpy as np
 
+from amibayes.data.closure import closure_matrix
 from amibayes.errors import DataError, UsageError
 from amibayes.instrument import load_instrument
 from amibayes.oifits.products.mask_map import ProductMap, map_of, mapped_columns
 from amibayes.oifits.products.recognise import Product
 from amibayes.oifits.tables import OIFits, OITable, plain
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import FloatArray
 
 NARROW = 0.944
 """EFF_BAND over the width at half height, measured for F480M: for filters that are not known."""
@@ -224,14 +225,18 @@ def _from_amplitudes(product: Product, table: OITable) -> FloatArray | None:
     relative = relative_amplitude_error(product, rows)
     if relative is None:
         return None
-    legs = _legs(np.asarray(rows.columns["STA_INDEX"]), np.asarray(triangles))
-    if legs is None:
+    matrix, baselines = closure_matrix(np.asarray(triangles))
+    sides = np.abs(matrix)
+    pairs = np.sort(rows.columns["STA_INDEX"], axis=1)
+    same = (baselines[:, None] == pairs).all(axis=2)
+    if not same.any(axis=1).all():
         return None
+    row = same.argmax(axis=1)
     amplitude = np.abs(np.asarray(rows.columns["VISAMP"], dtype=float)).reshape(len(rows), -1)
     ours = np.abs(np.asarray(table.columns["T3AMP"], dtype=float)).ravel()
-    theirs = ours / amplitude[legs, 0].prod(axis=1)
+    theirs = ours / np.exp(sides @ np.log(amplitude[row, 0]))
     stated = np.radians(np.asarray(table.columns["T3PHIERR"], dtype=float)).ravel()
-    variance = (relative[legs, 0] ** 2).sum(axis=1)
+    variance = sides @ relative[row, 0] ** 2
     least, most = (
         np.nansum(stated**2) / np.nansum(side(ours, theirs) ** 2 * variance)
         for side in (np.maximum, np.minimum)
@@ -239,15 +244,6 @@ def _from_amplitudes(product: Product, table: OITable) -> FloatArray | None:
     scale = np.clip(1.0, least, most) if np.isfinite(least + most) else 1.0
     sigma = np.degrees(np.sqrt(scale * variance))
     return np.asarray(sigma.reshape(np.shape(table.columns["T3PHIERR"])))
-
-
-def _legs(pairs: IntArray, triangles: IntArray) -> IntArray | None:
-    """Rows (n, 3) of the baselines of triangles; None where one is not there."""
-    place = {frozenset(pair.tolist()): k for k, pair in enumerate(pairs)}
-    sides = ((0, 1), (1, 2), (0, 2))
-    found = [[place.get(frozenset(t[[i, j]].tolist()), -1) for i, j in sides] for t in triangles]
-    legs = np.array(found)
-    return None if (legs < 0).any() else legs
 
 
 ERRORS = {
