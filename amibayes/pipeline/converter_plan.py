@@ -11,13 +11,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from amibayes.cube.ramps import GAIN_E_DN
 from amibayes.data.closure import closure_matrix
 from amibayes.optics import fringe_basis
 from amibayes.pipeline.migration_plan import envelope_fit
 from amibayes.ramps.converter import HARMONICS, PERIOD_DN, waves
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import Plan, star_channels
-from amibayes.simulation.ramps import ADC_WAVES, GAIN_E_DN
+from amibayes.simulation.ramps import ADC_WAVES
 from amibayes.simulation.slopes import electron_variance, slope_weights
 from amibayes.units import FloatArray
 
