@@ -1,7 +1,10 @@
-"""What charge migration will do to an exposure: bias of V², and the groups that cost least.
+"""What migration and the converter will do to an exposure: bias, and the groups that cost least.
 
-The bias that matters is what calibrators do not share: it is stated for calibrators of half the
-target's brightness, read with the same groups.
+The bias that matters is what calibrators do not share: that of migration is stated for calibrators
+of half the target's brightness, read with the same groups. Errors of the analogue-to-digital
+converter look drawn by chance: the pixels' counts go through dozens of periods of its waves, each
+from its own bias, and what a pixel is off by is the same in all integrations but changes with
+the flux and with the place of the star. Calibrators share little of it.
 """
 
 from __future__ import annotations
@@ -10,15 +13,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amibayes.cube.ramps import GAIN_E_DN
 from amibayes.data.closure import closure_matrix
 from amibayes.extraction.preparation import SMOOTH_FLOOR
 from amibayes.instrument import ChargeMigration
 from amibayes.optics import FringeBasis, fringe_basis
+from amibayes.ramps.converter import HARMONICS, PERIOD_DN, waves
 from amibayes.ramps.curvature import expected_curvature
 from amibayes.ramps.fit import fit_migration
 from amibayes.ramps.transfer import SIDES, gains
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import Plan, star_channels
+from amibayes.simulation.ramps import ADC_WAVES
+from amibayes.simulation.slopes import electron_variance, slope_weights
 from amibayes.units import FloatArray
 
 CALIBRATOR = 0.5
@@ -26,6 +33,15 @@ CALIBRATOR = 0.5
 
 MAX_TRIED = 12
 """Numbers of groups that are compared."""
+
+
+AMPLITUDES = np.array([wave[1:] for wave in ADC_WAVES]).ravel()
+"""Of `amibayes.ramps.converter.WAVES`, of JWST's readout."""
+
+
+MAX_READS = 128
+"""Of longer ramps every so many reads: a pixel at the usual 30 000 electrons has gone through 18
+periods."""
 
 
 @dataclass(frozen=True)
@@ -155,3 +171,56 @@ def best_groups(plan: Plan, known: ChargeMigration, per_e: float, noise: float) 
     share = (tried / (tried + 1.0)) / (n / (n + 1.0))
     cost = noise**2 / share + (known.error * per_e * tried / n) ** 2
     return int(tried[cost.argmin()])
+
+
+def converter_change(
+    plan: Plan,
+    detector: Detector,
+    bias_dn: FloatArray,
+    centre_px: tuple[float, float] = (0.0, 0.0),
+    brightness: float = 1.0,
+) -> FloatArray:
+    """Change of V² and closure phases (rad), (k, n_data), that the converter makes of a point.
+
+    Parameters
+    ----------
+    plan : Plan
+    detector : Detector
+    bias_dn : (k, n, n) array
+        Counts of every pixel after the reset, of k detectors.
+    centre_px : (x, y)
+        Place of the star from the middle of the image.
+    brightness : float
+        Of the star, in units of the target's; read with the same groups.
+    """
+    n = bias_dn.shape[-1]
+    basis = fringe_basis(plan.instrument, star_channels(plan.instrument), n, centre_px=centre_px)
+    rate = brightness * plan.count_rate_e_s
+    light = rate * np.asarray(basis.image()).reshape(n, n)
+    off = np.stack([_slope_error(plan, detector, light, bias).ravel() for bias in bias_dn])
+    found = off @ envelope_fit(basis).T / rate
+    m = plan.instrument.mask.n_baselines
+    closures = closure_matrix(plan.instrument.mask.triangles)[0]
+    vis2 = 2.0 * (found[:, 1 : 1 + m] - found[:, :1])
+    return np.concatenate([vis2, found[:, 1 + m :] @ closures.T], axis=1)
+
+
+def _slope_error(
+    plan: Plan, detector: Detector, light: FloatArray, bias_dn: FloatArray
+) -> FloatArray:
+    """Electrons per second (ny, nx) too many, the mean of many integrations."""
+    together = -(-plan.n_groups // MAX_READS)
+    frame = together * plan.options.frame_time_s
+    timed = replace(detector, frame_time_s=frame)
+    reads = max(timed.n_reads(plan.n_groups // together), 2)
+    weight = slope_weights(electron_variance(light, timed), reads - 1, timed).reads
+    turn = 2.0 * np.pi / PERIOD_DN * np.repeat(HARMONICS, 2)[:, None, None]
+    total = np.zeros_like(light)
+    # One read after the other: bright stars of many groups would fill the memory otherwise.
+    for number in range(reads):
+        charge = (number + 1 - detector.zero_read) * frame * light
+        noise = (charge + detector.single_read_noise_e**2) / GAIN_E_DN**2
+        # Photons and read noise move the counts by a part of the period: that blurs the waves.
+        blurred = np.exp(-0.5 * turn**2 * noise) * waves(bias_dn + charge / GAIN_E_DN)
+        total += weight[number] * np.tensordot(AMPLITUDES, blurred, axes=1)
+    return np.asarray(GAIN_E_DN * total)

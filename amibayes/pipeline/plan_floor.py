@@ -34,8 +34,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.completeness import COMPLETENESS, detection_limit
 from amibayes.models.binary import BinaryModel
 from amibayes.optics import Wavefront, fringe_basis, psf
-from amibayes.pipeline.converter_plan import converter_change
-from amibayes.pipeline.migration_plan import envelope_fit, migration_change
+from amibayes.pipeline.migration_plan import converter_change, envelope_fit, migration_change
 from amibayes.scene.orientation import Orientation
 from amibayes.simulation import Detector
 from amibayes.simulation.budget import Plan, star_channels
