@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from amibayes.cube.container import DO_NOT_USE, JUMP_DET, SATURATED, Cube
+from amibayes.cube.reference_files import Linearity, as_read
 from amibayes.cube.timing import GroupTiming
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import BoolArray, FloatArray, IntArray, SingleArray
@@ -62,6 +63,8 @@ class RampFile:
     timing : GroupTiming
     bias_dn : (ny, nx) array, optional
         Counts that were taken off (the superbias), where that file is at hand.
+    linearity : Linearity, optional
+        What made the signal linear, where that file is at hand.
     excess_dn : (65536,) array, optional
         Counts too many for every number of counts, bias included: taken off what is read.
     """
@@ -72,6 +75,7 @@ class RampFile:
     mjd: FloatArray | None
     timing: GroupTiming
     bias_dn: FloatArray | None = None
+    linearity: Linearity | None = None
     excess_dn: FloatArray | None = field(default=None, repr=False)
 
     def read(self, start: int = 0, stop: int | None = None) -> Cube:
@@ -127,9 +131,9 @@ class RampFile:
         if self.excess_dn is None or self.bias_dn is None:
             return groups
         unit = np.float32(GAIN_E_DN / self.gain_e)
-        counts = np.nan_to_num(groups) / unit + self.bias_dn
-        number = np.clip(np.rint(counts), 0, len(self.excess_dn) - 1).astype(np.intp)
-        return np.asarray(groups - unit * self.excess_dn.astype(np.float32)[number])
+        signal, slope = as_read(np.nan_to_num(groups) / unit, self.linearity)
+        number = np.clip(np.rint(signal + self.bias_dn), 0, len(self.excess_dn) - 1).astype(np.intp)
+        return np.asarray(groups - unit * slope * self.excess_dn.astype(np.float32)[number])
 
     @cached_property
     def pixel_flags(self) -> Any:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amibayes.cube import header as keys
 from amibayes.cube.container import NEVER_USED, Cube
 from amibayes.cube.ramps import RampFile
-from amibayes.cube.superbias import bias_of
+from amibayes.cube.reference_files import bias_of, linearity_of
 from amibayes.cube.timing import timing_of
 from amibayes.errors import DataError
 from amibayes.instrument import (
@@ -189,8 +189,9 @@ def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> R
     unit = "electron/s" if "electron" in template.unit.lower() else "DN/s"
     template = replace(template, unit=unit, notes=template.notes + _cut_ramps(header, source))
     timing = timing_of(header, groups, step)
-    bias = bias_of(header, source, (shape[0], shape[1]))
-    return RampFile(template, n, parts, _mid_times(hdus, n, header, source), timing, bias)
+    mjd, pixels = _mid_times(hdus, n, header, source), (shape[0], shape[1])
+    bias, linearity = (found(header, source, pixels) for found in (bias_of, linearity_of))
+    return RampFile(template, n, parts, mjd, timing, bias, linearity)
 
 
 def _cut_ramps(header: dict[str, Any], source: str) -> tuple[str, ...]:

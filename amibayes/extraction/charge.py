@@ -11,8 +11,8 @@ import numpy as np
 
 from amibayes.cube import Cube
 from amibayes.cube.ramps import RampFile
+from amibayes.cube.reference_files import BIAS_KEYWORD, LINEARITY_KEYWORD
 from amibayes.cube.source import Source, opened
-from amibayes.cube.superbias import KEYWORD
 from amibayes.cube.write import SHIFT_KEYWORDS
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
@@ -33,6 +33,13 @@ TOO_FEW_GROUPS = "ramps of fewer than 4 groups cannot tell charge migration from
 BIAS_UNKNOWN = (
     "errors of the analogue-to-digital converter left in: the superbias that the ramps name "
     "(R_SUPERB) is neither beside them nor below CRDS_PATH, or has other pixels"
+)
+
+
+LINEARITY_UNKNOWN = (
+    "errors of the analogue-to-digital converter fitted at counts as they were made linear: the "
+    "coefficients that the ramps name (R_LINEAR) are neither beside them nor below CRDS_PATH, "
+    "or are of other pixels"
 )
 
 
@@ -91,6 +98,7 @@ class _Known:
     is_ramp: bool
     curvature: Curvature | None
     stated: ChargeMigration | None
+    lacks_linearity: bool = False
 
 
 def visit_migration(
@@ -123,7 +131,8 @@ def _known(cube: Cube | str | Path, options: ExtractOptions, header: Mapping[str
         is_ramp = isinstance(file, RampFile)
         wanted = options.charge_migration == "fit" and isinstance(file, RampFile)
         curvature = curvature_of(file) if wanted and isinstance(file, RampFile) else None
-        return _Known(file.template, is_ramp, curvature, _stated(file.template))
+        lacks = is_ramp and file.linearity is None and LINEARITY_KEYWORD in file.template.header
+        return _Known(file.template, is_ramp, curvature, _stated(file.template), lacks)
 
 
 def _stated(template: Cube) -> ChargeMigration | None:
@@ -147,8 +156,10 @@ def _decided(known: _Known, fit: MigrationFit | None, options: ExtractOptions) -
     if migration is None:
         return CubeMigration(None, fit, notes)
     waves = None if known.curvature is None else known.curvature.waves
-    if waves is None and known.curvature is not None and known.template.header.get(KEYWORD):
+    if waves is None and known.curvature is not None and known.template.header.get(BIAS_KEYWORD):
         notes = (*notes, BIAS_UNKNOWN)
+    if waves is not None and known.lacks_linearity:
+        notes = (*notes, LINEARITY_UNKNOWN)
     if not known.is_ramp:
         missing = _missing(known.template)
         if missing:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.cube.reference_files import Linearity, as_read
 from amibayes.cube.timing import GroupTiming
 from amibayes.units import FloatArray, IntArray, read_only
 
@@ -83,6 +84,8 @@ class Predictor:
     Parameters
     ----------
     bias_dn : (ny, nx) array
+    linearity : Linearity, optional
+        What made the signal linear after it was read; the counts are those before.
     gain_e : float
         Electrons per count.
     timing : GroupTiming
@@ -93,6 +96,7 @@ class Predictor:
     """
 
     bias_dn: FloatArray
+    linearity: Linearity | None
     gain_e: float
     timing: GroupTiming
     kept: IntArray
@@ -106,7 +110,8 @@ class Predictor:
         for one in light:
             for group, frames in enumerate(times):
                 for t in frames:
-                    total[:, group] += waves(self.bias_dn + one * (t / self.gain_e))
+                    signal, slope = as_read(one * (t / self.gain_e), self.linearity)
+                    total[:, group] += slope * waves(self.bias_dn + signal)
         total *= self._left
         steps = np.diff(total, axis=1)[:, self.kept]
         return np.asarray(steps * (self.gain_e / (self.timing.group_s * times.shape[1])))

@@ -280,7 +280,9 @@ def _predictor(
     light = photons.ravel() / file.timing.group_s
     spread = spread_of(file.timing, weights.kept, weights.matrix[0], light, read) / GAIN_E_DN**2
     shape = (-1, *photons.shape)
-    return Predictor(file.bias_dn, GAIN_E_DN, file.timing, weights.kept, spread.reshape(shape))
+    return Predictor(
+        file.bias_dn, file.linearity, GAIN_E_DN, file.timing, weights.kept, spread.reshape(shape)
+    )
 
 
 def _wave_columns(

@@ -12,7 +12,7 @@ import numpy as np
 from astropy.io import fits
 
 from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, headers_of
-from amibayes.cube.superbias import KEYWORD
+from amibayes.cube.reference_files import BIAS_KEYWORD, LINEARITY_KEYWORD
 from amibayes.errors import DataError
 from amibayes.instrument import Instrument, instrument_names, load_instrument
 from amibayes.optics import Wavefront, scene_image
@@ -29,6 +29,7 @@ from amibayes.simulation.exposure import (
     make_recorder,
     record,
 )
+from amibayes.simulation.ramps import linearity_coefficients
 from amibayes.simulation.truth import exposure_header, instrument_keyword, truth_tables
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import Shown
@@ -319,8 +320,7 @@ def _files(
         if observation.exposure.keep_ramps:
             hdus = _ramp_hdus(shutter)
             if observation.detector.adc_nonlinearity > 0.0:
-                _write_superbias(superbias_path(path), shutter.recorder.maps.bias_dn)
-                hdus[0].header[KEYWORD] = superbias_path(path).name
+                _write_references(path, shutter, hdus[0].header)
             ramps = stack.enter_context(FitsStream.create(ramp_path(path), hdus))
         yield cube, ramps
 
@@ -330,16 +330,19 @@ def ramp_path(path: Path) -> Path:
     return path.with_name(path.name.replace("_calints", "_ramp"))
 
 
-def superbias_path(path: Path) -> Path:
-    """Name of the file of the pixels' bias beside a ``calints`` file."""
-    return path.with_name(path.name.replace("_calints", "_superbias"))
-
-
-def _write_superbias(path: Path, bias_dn: FloatArray) -> None:
-    """Write counts as the reference file of JWST that was taken off the reads has them."""
-    image = fits.ImageHDU(bias_dn.astype(np.float32), name="SCI")
-    with FitsStream.create(path, [fits.PrimaryHDU(), image]):
-        pass
+def _write_references(path: Path, shutter: PreparedExposure, header: fits.Header) -> None:
+    """Write what the ramps went through as JWST's reference files have it, and name them."""
+    bias = shutter.recorder.maps.bias_dn
+    linear = linearity_coefficients(shutter.observation.detector, bias.shape)
+    for keyword, kind, name, values in (
+        (BIAS_KEYWORD, "superbias", "SCI", bias),
+        (LINEARITY_KEYWORD, "linearity", "COEFFS", linear),
+    ):
+        file = path.with_name(path.name.replace("_calints", f"_{kind}"))
+        image = fits.ImageHDU(values.astype(np.float32), name=name)
+        with FitsStream.create(file, [fits.PrimaryHDU(), image]):
+            pass
+        header[keyword] = file.name
 
 
 def _ramp_hdus(shutter: PreparedExposure) -> list[Any]:

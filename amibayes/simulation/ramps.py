@@ -178,6 +178,16 @@ def linearised(reads: FloatArray, detector: Detector) -> FloatArray:
     return np.asarray(2.0 * reads / (1.0 + np.sqrt(np.maximum(1.0 - 4.0 * bend * reads, 0.0))))
 
 
+def linearity_coefficients(detector: Detector, shape: tuple[int, int]) -> FloatArray:
+    """Coefficients (7, ny, nx) of the powers of counts with which `linearised` undoes it.
+
+    A power series, whose numbers are Catalan's: of a pixel that lacks 6 % it leaves 5e-7.
+    """
+    bend = detector.nonlinearity * (1.0 + detector.linearity_error) / detector.full_well_e
+    series = (0.0, *(c * (bend * GAIN_E_DN) ** k for k, c in enumerate((1, 1, 2, 5, 14, 42))))
+    return np.asarray(np.broadcast_to(np.array(series)[:, None, None], (len(series), *shape)))
+
+
 def to_neighbours(charge: FloatArray, fraction: float) -> FloatArray:
     """What each pixel (…, ny, nx) receives when each gives ``fraction`` to its four neighbours.
 

@@ -11,9 +11,10 @@ from astropy.io import fits
 
 from amibayes.cube import Cube
 from amibayes.cube.ramps import GAIN_E_DN, RampFile
+from amibayes.cube.reference_files import Linearity
 from amibayes.cube.source import opened
 from amibayes.cube.timing import GroupTiming
-from amibayes.extraction.charge import BIAS_UNKNOWN, visit_migration
+from amibayes.extraction.charge import BIAS_UNKNOWN, LINEARITY_UNKNOWN, visit_migration
 from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import load_instrument
 from amibayes.optics import scene_image
@@ -43,9 +44,18 @@ def edges(amplitudes: FloatArray) -> FloatArray:
 
 
 def counted(
-    seed: int, n_int: int, amplitudes: FloatArray, scale: float = 1.0, n_groups: int = GROUPS
+    seed: int,
+    n_int: int,
+    amplitudes: FloatArray,
+    scale: float = 1.0,
+    n_groups: int = GROUPS,
+    missing: float = 0.0,
 ) -> tuple[RampFile, FloatArray]:
-    """Ramps of whole counts, and what they would be in electrons without the converter."""
+    """Ramps of whole counts, and what they would be in electrons without the converter.
+
+    ``missing`` is the part of the signal that is not there at 30 000 electrons; what is given
+    has been made linear, by a polynomial of fifth order that is fitted to the response.
+    """
     rng = np.random.default_rng(seed)
     channels = INSTRUMENT.bandpass.channels()
     light = scene_image(Scene(), INSTRUMENT, channels, N, centre_px=(0.2, -0.3)).centred
@@ -54,11 +64,25 @@ def counted(
     charge = np.cumsum(rng.poisson(np.broadcast_to(light, (n_int, n_groups, N, N))), axis=1)
     reads = charge + READ_E * rng.standard_normal(charge.shape)
     bias = 12000.0 + 300.0 * np.random.default_rng(99).standard_normal((N, N))
-    numbers = np.searchsorted(edges(amplitudes), reads / GAIN_E_DN + bias) - 1
+    bend = missing * GAIN_E_DN / 30e3
+    true = reads / GAIN_E_DN
+    numbers = np.searchsorted(edges(amplitudes), true - bend * true**2 + bias) - 1
     template = Cube(np.empty((0, N, N)), 3e-7, "NIRISS", "F480M", unit="DN/s")
     timing = GroupTiming(n_groups, FRAME_S, FRAME_S, first_s=FRAME_S)
-    given = (numbers - bias).astype(np.float32)
-    return RampFile(template, n_int, {"SCI": _Held(given)}, None, timing, bias), reads
+    coefficients = polynomial_of(bend)
+    linear = np.polynomial.polynomial.polyval(numbers - bias, coefficients)
+    known = Linearity(np.broadcast_to(coefficients[:, None, None], (6, N, N)))
+    hdus = {"SCI": _Held(linear.astype(np.float32))}
+    return RampFile(template, n_int, hdus, None, timing, bias, known), reads
+
+
+def polynomial_of(bend: float) -> FloatArray:
+    """Coefficients (6,) that make x − bend x² linear again, by least squares."""
+    x = np.linspace(0.0, 30e3, 300)
+    powers = np.stack([(x - bend * x**2) ** k for k in range(1, 6)], axis=1)
+    scale = powers.max(axis=0)
+    found = np.linalg.lstsq(powers / scale, x, rcond=None)[0] / scale
+    return np.concatenate([[0.0], found])
 
 
 class _Held:
@@ -105,6 +129,41 @@ def test_amplitudes_come_back_within_their_errors() -> None:
     sides = np.array([f.migration.value[:2] / f.migration.error[:2] for f in fits_])
     assert np.sqrt((sides**2).mean()) == pytest.approx(1.0, abs=0.9)
     assert all(f.explained for f in fits_)
+
+
+def test_counts_are_those_before_the_signal_was_made_linear() -> None:
+    """3 % is missing at 30 000 electrons: amplitudes come back all the same."""
+    files = [counted(k, 20, TRUE, missing=0.03)[0] for k in range(4)]
+    found = [curvature_of(f) for f in files]
+    off = np.array([pulls(fit_migration([f]))[:2] for f in found if f is not None])
+    assert np.abs(off).max() < 4.5
+    assert np.sqrt((off**2).mean()) < 2.0
+
+
+def test_slopes_without_the_converter_of_a_response_that_is_not_linear() -> None:
+    file, reads = counted(3, 20, TRUE, missing=0.03)
+    true = replace(file, hdus={"SCI": _Held(reads / GAIN_E_DN)}).read().images.mean(axis=0)
+    before = file.read().images.mean(axis=0) - true
+    mended = replace(file, excess_dn=table(TRUE))
+    after = mended.read().images.mean(axis=0) - true
+    assert np.sqrt((after**2).mean()) < 0.1 * np.sqrt((before**2).mean())
+    # Counts of the brightest pixels are half a period off where they are taken as they are.
+    blind = replace(mended, linearity=None).read().images.mean(axis=0) - true
+    bright = true > 0.5 * true.max()
+    assert np.abs(after[bright]).max() < 0.3 * np.abs(blind[bright]).max()
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.03, 0.06])
+def test_what_made_a_signal_linear_is_undone(missing: float, rng: np.random.Generator) -> None:
+    coefficients = polynomial_of(missing * GAIN_E_DN / 30e3)
+    read = rng.uniform(0.0, 18e3, (3, 2, 2))
+    linear = np.polynomial.polynomial.polyval(read, coefficients)
+    known = Linearity(np.broadcast_to(coefficients[:, None, None], (6, 2, 2)))
+    back, slope = known.undone(linear)
+    np.testing.assert_allclose(back, read, atol=0.01)
+    derivative = np.polynomial.polynomial.polyder(coefficients)
+    expected = np.polynomial.polynomial.polyval(read, derivative)
+    np.testing.assert_allclose(slope, expected, rtol=1e-4)
 
 
 @pytest.mark.slow
@@ -222,3 +281,31 @@ def test_the_superbias_is_found_where_the_package_keeps_it(
     fits.setval(kept / "jwst_niriss_superbias_0182.fits", "SUBSTRT1", value=2000)
     (other,) = visit_migration([path], ExtractOptions(), {})
     assert BIAS_UNKNOWN in other.notes
+
+
+def test_the_linearity_is_found_of_a_part_of_the_detector(tmp_path: Path) -> None:
+    path = written(tmp_path, "a_ramp.fits", 1, R_LINEAR="crds://jwst_niriss_linearity_0017.fits")
+    whole = np.zeros((3, 60, 1100), np.float32)
+    whole[1], whole[2, :N, 1044 : 1044 + N] = 1.0, 1e-6
+    whole[2, 3, 1044 + 5] = np.nan
+    flags = np.zeros((60, 1100), np.uint32)
+    flags[7, 1044 + 9] = 1 << 20
+    images = [fits.ImageHDU(whole, name="COEFFS"), fits.ImageHDU(flags, name="DQ")]
+    fits.HDUList([fits.PrimaryHDU(), *images]).writeto(tmp_path / "jwst_niriss_linearity_0017.fits")
+    bias = np.zeros((60, 1100), np.float32)
+    bias[:N, 1044 : 1044 + N] = counted(1, 1, TRUE)[0].bias_dn
+    superbias = tmp_path / "jwst_niriss_superbias_0182.fits"
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(bias, name="SCI")]).writeto(superbias)
+    with opened(path) as file:
+        assert isinstance(file, RampFile)
+        assert file.linearity is not None
+        known = file.linearity.coefficients
+    expected = np.full((N, N), 1e-6)
+    expected[3, 5] = expected[7, 9] = 0.0  # left as they are
+    np.testing.assert_allclose(known[2], expected, atol=1e-12)
+    assert (known[1] == 1.0).all()
+    (found,) = visit_migration([path], ExtractOptions(), {})
+    assert LINEARITY_UNKNOWN not in found.notes
+    (tmp_path / "jwst_niriss_linearity_0017.fits").unlink()
+    (without,) = visit_migration([path], ExtractOptions(), {})
+    assert LINEARITY_UNKNOWN in without.notes

@@ -18,6 +18,7 @@ from amibayes.simulation.ramps import (
     Ramps,
     converted,
     linearised,
+    linearity_coefficients,
     measured_signal,
     read_ramps,
     to_neighbours,
@@ -269,6 +270,15 @@ def test_the_converter_errs_by_its_waves() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-3)
     assert 3.0 < np.abs(found - reads).max() < 12.0
     assert converted(reads, QUIET) is reads
+
+
+def test_coefficients_of_linearity_do_what_the_detector_does() -> None:
+    detector = replace(QUIET, nonlinearity=0.06, linearity_error=0.01)
+    counts = np.linspace(0.0, 40e3, 12).reshape(3, 4)
+    expected = linearised(counts * GAIN_E_DN, detector) / GAIN_E_DN
+    coefficients = linearity_coefficients(detector, (3, 4))
+    found = (coefficients * counts ** np.arange(len(coefficients))[:, None, None]).sum(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=2e-6)
 
 
 def test_light_without_photon_noise_has_no_variance() -> None:
