@@ -190,7 +190,7 @@ def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> R
     template = replace(template, unit=unit, notes=template.notes + _cut_ramps(header, source))
     timing = timing_of(header, groups, step)
     mjd, pixels = _mid_times(hdus, n, header, source), (shape[0], shape[1])
-    bias, linearity = (found(header, source, pixels) for found in (bias_of, linearity_of))
+    bias, linearity = bias_of(header, source, pixels), linearity_of(header, source, pixels)
     return RampFile(template, n, parts, mjd, timing, bias, linearity)
 
 

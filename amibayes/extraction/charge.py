@@ -131,7 +131,8 @@ def _known(cube: Cube | str | Path, options: ExtractOptions, header: Mapping[str
         is_ramp = isinstance(file, RampFile)
         wanted = options.charge_migration == "fit" and isinstance(file, RampFile)
         curvature = curvature_of(file) if wanted and isinstance(file, RampFile) else None
-        lacks = is_ramp and file.linearity is None and LINEARITY_KEYWORD in file.template.header
+        named = LINEARITY_KEYWORD in file.template.header
+        lacks = isinstance(file, RampFile) and named and file.linearity is None
         return _Known(file.template, is_ramp, curvature, _stated(file.template), lacks)
 
 
