@@ -181,7 +181,7 @@ def linearised(reads: FloatArray, detector: Detector) -> FloatArray:
 def linearity_coefficients(detector: Detector, shape: tuple[int, int]) -> FloatArray:
     """Coefficients (7, ny, nx) of the powers of counts with which `linearised` undoes it.
 
-    A power series, whose numbers are Catalan's: of a pixel that lacks 6 % it leaves 5e-7.
+    A power series, whose numbers are those of Catalan: of a pixel that lacks 5 % it leaves 4e-6.
     """
     bend = detector.nonlinearity * (1.0 + detector.linearity_error) / detector.full_well_e
     series = (0.0, *(c * (bend * GAIN_E_DN) ** k for k, c in enumerate((1, 1, 2, 5, 14, 42))))

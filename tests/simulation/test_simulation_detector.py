@@ -278,7 +278,7 @@ def test_coefficients_of_linearity_do_what_the_detector_does() -> None:
     expected = linearised(counts * GAIN_E_DN, detector) / GAIN_E_DN
     coefficients = linearity_coefficients(detector, (3, 4))
     found = (coefficients * counts ** np.arange(len(coefficients))[:, None, None]).sum(axis=0)
-    np.testing.assert_allclose(found, expected, rtol=2e-6)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_light_without_photon_noise_has_no_variance() -> None:
