@@ -226,7 +226,7 @@ def compare(
     each = own or [_selected(data, model, mask) for mask in masks]
     made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
     ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
-    above = 0
+    above = made_draws = 0
     for n in pieces_of(simulations, len(data.data)):
         noise = likelihood.noise.draw(n, rng)
         for one, mask in zip(own or (), masks, strict=False):
@@ -235,7 +235,10 @@ def compare(
         # What a part cannot explain by itself is no excuse for going apart, once its noise is
         # known.
         above += int(((by_noise >= gain[0]) if own else (drawn >= ratio[0])).sum())
-    return Consistency(split, tuple(parts), float(gain[0]), (1 + above) / (1 + simulations))
+        made_draws += n
+        if above >= ENOUGH:
+            break
+    return Consistency(split, tuple(parts), float(gain[0]), (1 + above) / (1 + made_draws))
 
 
 OTHERS = "the other calibrators"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import corner
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -72,6 +71,9 @@ def corner_plot(
     ValueError
         Where samples are not finite, fewer than dimensions, or do not match the labels.
     """
+    # corner loads ArviZ, where that is installed: half a second that most runs need not spend.
+    import corner
+
     draws = np.array(samples, dtype=float)
     if draws.ndim != 2 or draws.shape[1] != len(labels) or len(draws) <= draws.shape[1]:
         raise ValueError(f"samples of shape {draws.shape} for {len(labels)} labels")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -97,14 +98,21 @@ def save(figure: Figure, path: str | Path) -> None:
     RunError
         Where the file cannot be written.
     """
-    # The second pass makes room for the ticks that the first one has chosen. Every drawing
-    # would lay out anew and move the axes a little further: the figure keeps this layout.
+    # Every drawing would lay out anew and move the axes a little further: the figure keeps this.
     if (engine := figure.get_layout_engine()) is not None:
-        for _ in range(2):
+        ticks = _ticks(figure)
+        engine.execute(figure)
+        if _ticks(figure) != ticks:  # room for those that the first pass has chosen
             engine.execute(figure)
         figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+
+
+def _ticks(figure: Figure) -> list[list[float]]:
+    """Where the ticks of every axis are."""
+    axes = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
+    return [np.asarray(axis.get_majorticklocs(), dtype=float).tolist() for axis in axes]
 
 
 def marker_of(index: int) -> tuple[str, str]:
