@@ -125,7 +125,10 @@ def companions_beside(
         rest = np.broadcast_to(nuisance, (len(companions), len(nuisance)))
         return model.visibility(samples, np.hstack([model.at_rest(companions), rest]))
     response, contrast = model.linear_response(samples, nuisance), companions[:, 2]
-    light = point_visibility(samples, companions[:, 0], companions[:, 1], model.smearing)
+    # Limits ask for many contrasts, and draws of noise, at each place.
+    places, at = np.unique(companions[:, :2], axis=0, return_inverse=True)
+    light = point_visibility(samples, places[:, 0], places[:, 1], model.smearing)
+    light = np.take(light, at.ravel(), axis=1)
     light *= np.outer(response.scale * response.disc, contrast)
     light += (response.star + 1j * response.across)[:, None]
     light /= 1.0 + np.outer(response.scale, contrast)

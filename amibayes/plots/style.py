@@ -102,7 +102,9 @@ def save(figure: Figure, path: str | Path) -> None:
     if (engine := figure.get_layout_engine()) is not None:
         ticks = _ticks(figure)
         engine.execute(figure)
-        if _ticks(figure) != ticks:  # room for those that the first pass has chosen
+        # Room for ticks that the first pass has chosen, and for labels of axes that it shortened.
+        square = any(axes.get_aspect() != "auto" for axes in figure.axes)
+        if square or _ticks(figure) != ticks:
             engine.execute(figure)
         figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
