@@ -160,6 +160,10 @@ class GroupWeights:
         """Weighted sums (n, m) over the data of values (n_data, m)."""
         return self.of_sums(self.groups.sums(values))
 
+    def of(self, part: slice) -> GroupWeights:
+        """Weights of some of the data sets."""
+        return GroupWeights(self.groups, self.weight[:, part])
+
     def of_sums(self, sums: NDArray[np.floating]) -> FloatArray:
         """Weighted sums (n, m) of the sums over the groups, (n_groups, m)."""
         return np.asarray(self.weight.T @ sums.astype(self.weight.dtype))
@@ -202,14 +206,11 @@ class RunningMaximum:
     def __init__(self, n: int) -> None:
         self.score = np.zeros(n, dtype=np.float32)
         self.position = np.zeros(n, dtype=np.intp)
-        self._each = np.arange(n)
 
-    def update(self, index: IntArray, score: NDArray[np.floating]) -> None:
-        """Take scores (n, m) of positions (m,) into account."""
-        top = score.argmax(axis=1)
-        value = score[self._each, top]
-        better = value > self.score
-        self.score[better], self.position[better] = value[better], index[top[better]]
+    def update(self, score: NDArray[np.floating], position: IntArray) -> None:
+        """Take the largest scores (n,) of some positions, and where they are, into account."""
+        better = score > self.score
+        self.score[better], self.position[better] = score[better], position[better]
 
 
 @dataclass(frozen=True, eq=False)

@@ -224,12 +224,8 @@ class TemplateBank:
         """
         highest, rows = RunningMaximum(data.shape[1]), self._rows(data)
         for index, _, templates in self.pieces():
-            match = templates.match(rows)
-            if weights is None:
-                _, gain = templates.best(match)
-            else:
-                gain = templates.weighted_gain(weights, match)
-            highest.update(index, gain)
+            gain, top = templates.highest(rows, weights)
+            highest.update(gain, index[top])
         return np.asarray(highest.score, dtype=float), highest.position
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:

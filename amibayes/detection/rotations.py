@@ -15,6 +15,7 @@ import numpy as np
 
 from amibayes.companion_search.scan import RunningMaximum, best_positive
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.companion_search.templates import highest_of
 from amibayes.detection.treatments import ErrorTreatment, KnownErrors, Searched
 from amibayes.likelihood.rotation_null import RotationNull
 from amibayes.units import FloatArray, SingleArray
@@ -69,7 +70,8 @@ class Rotations(ErrorTreatment):
         rows = weighted.T.astype(np.float32)
         highest = RunningMaximum(len(rows))
         for index, templates in bank.by_band():
-            highest.update(index, inverse.scores(templates.astype(np.float32), rows))
+            score, top = highest_of(inverse.scores(templates.astype(np.float32), rows))
+            highest.update(score, index[top])
         return Searched(np.asarray(highest.score, dtype=float) ** 2, highest.position, chi2)
 
     def with_noise_of(self, bank: TemplateBank, residuals: FloatArray) -> Rotations:

@@ -37,8 +37,9 @@ def _told_apart(model: BinaryModel) -> tuple[object, ...]:
     return model.bands, model.moves, model.coloured
 
 
-BATCH = 1_500_000
-"""Model values (samples × parameter sets) held at once by `Likelihood.log_prob_in_batches`."""
+VALUES_AT_ONCE, LEAST_SETS = 25_000, 64
+"""Model values (samples × parameter sets) that `Likelihood.log_prob` works on at once, whose arrays
+fit a processor's cache and need no new memory; not fewer sets than repay the calls."""
 
 FAINTEST = 0.005
 """Visibility below which that of a fit is not taken for the size of a fringe: calibration errors
@@ -175,12 +176,10 @@ class Likelihood(Shown):
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
-        return self.noise.log_prob(self.difference(theta))
-
-    def log_prob_in_batches(self, theta: FloatArray) -> FloatArray:
-        """Log-likelihood of parameter sets (n, n_dim), (n,), in batches that fit in memory."""
-        pieces = np.array_split(theta, 1 + len(theta) * len(self.samples) // BATCH)
-        return np.concatenate([self.log_prob(piece) for piece in pieces])
+        sets, n_samples = self._sets(theta), max(len(self.samples), 1)
+        at_once = max(LEAST_SETS, VALUES_AT_ONCE // n_samples)
+        parts = np.split(sets, range(at_once, len(sets), at_once))
+        return np.concatenate([self.noise.log_prob(self.difference(part)) for part in parts])
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""
@@ -255,10 +254,16 @@ class Likelihood(Shown):
 
     def observe(self, visibility: ComplexArray) -> FloatArray:
         """Data (n_data, n) of complex visibilities (n_samples, n) of any model."""
-        power = self.samples.squares @ (visibility.real**2 + visibility.imag**2)
-        if not self.samples.legs.shape[0]:
+        # Every second number of a complex array takes twice the time of a row of numbers.
+        real, imaginary = np.array(visibility.real), np.array(visibility.imag)
+        phase = np.arctan2(imaginary, real) if self.samples.legs.shape[0] else None
+        real *= real
+        imaginary *= imaginary
+        real += imaginary
+        power = self.samples.squares @ real
+        if phase is None:
             return np.asarray(power)
-        return np.concatenate([power, self.samples.legs @ np.angle(visibility)])
+        return np.concatenate([power, self.samples.legs @ phase])
 
     def _difference(self, model: FloatArray) -> FloatArray:
         return self.wrapped(self.observables.data[:, None] - model)
@@ -270,7 +275,10 @@ class Likelihood(Shown):
         """
         closure = change[self._n2 :]
         turn = self._turn if closure.ndim > 1 else self._turn[:, 0]
-        closure -= turn * np.rint(closure / (2.0 * np.pi))
+        turns = closure * (0.5 / np.pi)
+        np.rint(turns, out=turns)
+        turns *= turn
+        closure -= turns
         return change
 
 

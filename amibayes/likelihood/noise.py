@@ -184,8 +184,8 @@ class GaussianNoise:
 
     def log_prob(self, residual: FloatArray) -> FloatArray:
         """Log-likelihood (n,) of residuals (n_data, n)."""
-        chi2 = np.asarray((self.whiten(residual) ** 2).sum(axis=0))
-        return self.log_norm - 0.5 * self.deviance(chi2)
+        white = self.whiten(residual)
+        return self.log_norm - 0.5 * self.deviance(np.einsum("dn,dn->n", white, white))
 
     def deviance(self, chi2: FloatArray) -> FloatArray:
         """χ² itself."""

@@ -8,7 +8,9 @@ plane down the rows, parameter sets across the columns.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -169,7 +171,8 @@ class BinaryModel:
         light, total = _mixed(samples, sources, _start(samples))
         if samples.off_axis is not None:
             light, total = _mixed(samples, sources, samples.off_axis.centre(light))
-        return np.asarray(light / total)
+        # numpy divides complex numbers by real ones as if these were complex.
+        return np.asarray(light * (1.0 / total))
 
     def gradient(self, samples: UVPoints, theta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Visibilities (n_samples, n) and their derivatives (n_dim, n_samples, n)."""
@@ -262,8 +265,13 @@ def _mixed(
 ) -> tuple[ComplexArray, FloatArray]:
     """Light (n_samples, n) and flux of all sources seen from a centre."""
     lit = [_lit(s, _through(samples, s.place, centre, slopes=False)) for s in sources]
-    light, total = (sum(x) for x in zip(*lit, strict=True))
+    light, total = (_sum(x) for x in zip(*lit, strict=True))
     return light, total
+
+
+def _sum(parts: Iterable[Any]) -> Any:
+    """Add numbers and arrays; a plain 0 is left out, which costs a pass over a large array."""
+    return functools.reduce(operator.add, [p for p in parts if np.ndim(p) or p] or [0.0])
 
 
 Through = tuple[Any, Any]
@@ -276,7 +284,12 @@ OPEN: Through = ((1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 def _lit(source: Source, through: Through) -> tuple[Any, Any]:
     """Light and flux of a source, as the extraction lets them through."""
     fringe, flux = through
-    return source.flux * (source.wave * fringe[0]), source.flux * (source.share * flux[0])
+    wave, share = source.wave, source.share
+    if through is not OPEN:
+        wave, share = wave * fringe[0], share * flux[0]
+    # The star's flux, 1, costs a pass over a large array as well.
+    one = isinstance(source.flux, float) and source.flux == 1.0
+    return wave if one else source.flux * wave, source.flux * share
 
 
 def _by_place(source: Source, through: Through) -> list[tuple[Any, Any]]:

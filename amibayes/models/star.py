@@ -51,7 +51,7 @@ class Star:
         )
         if self.diameter_mas == 0.0:
             still = (Slope(),) * len(values)
-            return Source(1.0, np.ones((len(samples), n), dtype=complex), slopes=still)
+            return Source(1.0, np.broadcast_to(1.0 + 0.0j, (len(samples), n)), slopes=still)
         frequency = samples.frequency[:, None]
         if not slopes and self.limb_darkening == 0.0:
             return Source(1.0, disc_visibility(frequency, diameter).astype(complex))

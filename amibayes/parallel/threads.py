@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
+
+
+@lru_cache(maxsize=1)
+def _pools(n_modules: int) -> ThreadpoolController:
+    """Libraries with threads. To look for them takes milliseconds; new ones come with a module."""
+    return ThreadpoolController()
 
 
 def run_here(function: Callable[[Any], Any], piece: Any) -> Any:
     """Compute a piece in this process, and give its threads back afterwards."""
-    with threadpool_limits(limits=1):
+    with _pools(len(sys.modules)).limit(limits=1):
         return function(piece)
 
 
@@ -21,5 +29,5 @@ def run_in_worker(function: Callable[[Any], Any], piece: Any) -> Any:
     finishes first must not give the other its threads back. It is set anew for every
     piece since libraries that were loaded in between have pools of their own.
     """
-    threadpool_limits(limits=1)
+    _pools(len(sys.modules)).limit(limits=1)
     return function(piece)

@@ -257,7 +257,7 @@ def _quick(
     if len(likelihood.samples) < MANY_SAMPLES or len(modes) > 1:
         return None
     centre, scatter = gaussian_of(likelihood, np.array(modes[0].theta), prior.prior, START_WIDTH)
-    return polynomial_log_prob(likelihood.log_prob_in_batches, prior, centre, scatter, rng)
+    return polynomial_log_prob(likelihood.log_prob, prior, centre, scatter, rng)
 
 
 def _start(

@@ -245,7 +245,7 @@ def log_evidence_importance(
     x = np.concatenate(drawn)
     log_prior = prior.log_density(x)
     x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
-    log_f = log_prior + likelihood.log_prob_in_batches(physical(x, likelihood.parameters))
+    log_f = log_prior + likelihood.log_prob(physical(x, likelihood.parameters))
     terms = [log_prior + np.log(DEFENSIVE)]
     terms += [s.log_density(x) + np.log(share) for s in sources]
     log_w = log_f - logsumexp(terms, axis=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -9,7 +11,9 @@ from scipy import stats
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.scan import GroupWeights, ScaleGroups
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.data.covariance import dense_covariance
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
@@ -72,6 +76,29 @@ def test_largest_gain_of_many_data_sets_is_the_scan_of_each(rng) -> None:
         contrast, sigma = bank.scan(one)
         each = np.maximum(contrast / sigma, 0.0) ** 2
         np.testing.assert_allclose([largest, each[where]], each.max(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_largest_gain_is_that_of_templates_laid_out(mixed: bool, weighted: bool, rng) -> None:
+    # Errors that V² and closure phases share make templates of mirror images unequally long.
+    data = simulated(niriss(), [0.0, 0.0, 0.0], rng)
+    if mixed:
+        root = rng.standard_normal((56, 56)) * 2e-3
+        data = replace(data, covariance=dense_covariance(root @ root.T + 1e-5 * np.eye(56)))
+    bank = TemplateBank(Likelihood(data), make_grid(50.0, 300.0, 30.0), np.empty(0))
+    sets = rng.standard_normal((bank.n_data, 90))
+    groups = ScaleGroups(np.arange(bank.n_data) % 2, 1.0)
+    amount = rng.uniform(0.3, 3.0, (2, 90)) if weighted else np.ones((2, 90))
+    weight = amount[groups.label]
+    rows = (weight * sets).astype(np.float32)
+    gain, position = bank.largest_gain(rows, GroupWeights(groups, amount) if weighted else None)
+    every = np.zeros((90, len(bank)))
+    for index, units in bank.by_band():
+        match = np.maximum((weight * sets).T @ units[0], 0.0)
+        every[:, index] = match**2 / (weight.T @ units[0] ** 2)
+    np.testing.assert_allclose(gain, every.max(axis=1), rtol=1e-4)
+    np.testing.assert_allclose(every[np.arange(90), position], gain, rtol=1e-4)
 
 
 def test_grid_fills_the_annulus_and_mirrors_itself() -> None:
