@@ -22,7 +22,7 @@ from amibayes import BinaryModel, Likelihood, Observables, calibrate, read_oifit
 from amibayes.calibration import bin_channels
 from amibayes.companion_search.optimise import fit_single, single_likelihood
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.covariance import DiagonalCovariance
+from amibayes.data.covariance import diagonal_covariance
 from amibayes.data.observables import Measurements, join
 from amibayes.extraction.reading import read_observations
 from amibayes.pipeline.options import SearchOptions
@@ -219,7 +219,7 @@ def floored(data: Observables, vis2: float, closure_deg: float) -> Observables:
             np.full(data.n_closure_phases, np.radians(closure_deg)),
         ]
     )
-    return replace(data, covariance=DiagonalCovariance(np.maximum(sigma, floor) ** 2))
+    return replace(data, covariance=diagonal_covariance(np.maximum(sigma, floor) ** 2))
 
 
 def alpha_cen(folder: Path) -> Observables:

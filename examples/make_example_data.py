@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.data.closure import closure_matrix, kernel_basis
-from amibayes.data.covariance import Block, BlockCovariance, DiagonalCovariance, stack_covariances
+from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance, stack_covariances
 from amibayes.data.observables import Observables
 from amibayes.data.point_source import point_source
 from amibayes.instrument import load_instrument
@@ -70,7 +70,7 @@ def blank(name: str, mjd: float) -> Observables:
     )
     covariance = stack_covariances(
         [
-            DiagonalCovariance(np.full(len(sheet.vis2), VIS2_ERROR**2)),
+            diagonal_covariance(np.full(len(sheet.vis2), VIS2_ERROR**2)),
             BlockCovariance(len(matrix), [closures]),
         ]
     )

@@ -15,7 +15,7 @@ from amibayes.data.covariance import (
     Block,
     BlockCovariance,
     Covariance,
-    DiagonalCovariance,
+    diagonal_covariance,
     stack_covariances,
 )
 from amibayes.data.observables import Measurements, Observables, Setup
@@ -351,7 +351,7 @@ def diagonal(observables: Observables) -> Observables:
 
     return replace(
         observables,
-        covariance=DiagonalCovariance(observables.covariance.variance),
+        covariance=diagonal_covariance(observables.covariance.variance),
         covariance_kind="diagonal",
         n_integrations=None,
     )

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array, csr_array, diags_array, triu
 
 from amibayes.calibration.freedom import calibrated_freedom
 from amibayes.calibration.matching import Keys
-from amibayes.calibration.transfer import sparse_covariance, wrapped
+from amibayes.calibration.transfer import wrapped
 from amibayes.calibration.weighted import TransferFunction
 from amibayes.data.observables import CovarianceKind, Observables
 from amibayes.data.shared_errors import SharedErrors
@@ -63,7 +63,7 @@ def apply_response(
     spread = coo_array((response_slope, (np.arange(len(key)), key)), shape=(len(key), len(keys)))
     own = diags_array(target_slope)
     shared = _shared(sharing.shared, target_slope, response.shared, key, response_slope)
-    by_target = csr_array(own @ sparse_covariance(used.covariance) @ own)
+    by_target = csr_array(own @ used.covariance.sparse @ own)
     by_response = csr_array(spread @ response.covariance @ spread.T)
     kind = _kind(target, calibrators, keys)
     made = _rebuilt(target, keep, value, csr_array(by_target + by_response), kind, keys, notes)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import block_diag, coo_array, csr_array, triu
 
-from amibayes.calibration.transfer import sparse_covariance, wrapped
+from amibayes.calibration.transfer import wrapped
 from amibayes.data.closure import canonical, canonical_uv
 from amibayes.data.observables import (
     DAY_S,
@@ -162,7 +162,7 @@ def _averaged(
     ]
     made = [new for new, _ in averages]
     combine = _stacked([matrix for _, matrix in averages])
-    covariance = combine @ sparse_covariance(observables.covariance) @ combine.T
+    covariance = combine @ observables.covariance.sparse @ combine.T
     scatter, shared = observables.scatter, observables.shared
     upper = triu(covariance, 1).tocoo()
     pairs = Pairs(upper.row.astype(np.intp), upper.col.astype(np.intp), upper.data)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.calibration.transfer import Diameter
-from amibayes.data.covariance import scaled
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError, UsageError
 from amibayes.scene.disc import uniform_disc
@@ -132,7 +131,7 @@ def without_disc(calibrator: Observables, diameter_mas: float) -> Observables:
     return replace(
         calibrator,
         vis2=replace(m, value=np.where(m.flag, m.value, m.value * factor)),
-        covariance=scaled(calibrator.covariance, every),
+        covariance=calibrator.covariance.scaled(every),
         scatter=None if scatter is None else (scatter * every[:, None] * every[None]).tocsr(),
         shared=None if calibrator.shared is None else calibrator.shared.scaled(every),
     )

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.calibration.transfer import Transfer
-from amibayes.data.covariance import Covariance
+from amibayes.data.covariance import BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom, squared_share, welch_satterthwaite
 from amibayes.data.observables import Observables
 
@@ -31,7 +31,7 @@ def response_freedom(
 
 
 def calibrated_freedom(
-    whole: Covariance,
+    whole: BlockCovariance,
     by_target: csr_array,
     target: Freedom | None,
     by_response: csr_array,

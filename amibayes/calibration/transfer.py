@@ -10,7 +10,6 @@ from scipy.sparse import block_array, coo_array, csr_array, diags_array
 
 from amibayes.calibration.matching import Keys, Match, match
 from amibayes.data.closure import closure_matrix, kernel_basis
-from amibayes.data.covariance import sparse_covariance
 from amibayes.data.observables import Observables
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.scene.disc import uniform_disc
@@ -69,7 +68,7 @@ def transfer_of(calibrator: Observables, keys: Keys, diameter: Diameter) -> Tran
         shape=(len(keys), calibrator.covariance.size),
     ).tocsr()
     scatter = calibrator.scatter
-    covariance = combine @ sparse_covariance(calibrator.covariance) @ combine.T
+    covariance = combine @ calibrator.covariance.sparse @ combine.T
     scatter = None if scatter is None else combine @ scatter @ combine.T
     if diameter[1] > 0:
         by_disc = np.bincount(found.key, weight * value * slope, len(keys)) * diameter[1]
@@ -177,7 +176,6 @@ __all__ = [
     "closure_sets",
     "kernel_projector",
     "on_one_branch",
-    "sparse_covariance",
     "transfer_of",
     "wrapped",
 ]

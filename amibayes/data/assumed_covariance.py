@@ -8,8 +8,7 @@ from amibayes.data.closure import assumed_covariance, closure_matrix, kernel_bas
 from amibayes.data.covariance import (
     Block,
     BlockCovariance,
-    Covariance,
-    DiagonalCovariance,
+    diagonal_covariance,
     stack_covariances,
 )
 from amibayes.data.observables import CovarianceKind, Measurements, closure_sets
@@ -45,7 +44,7 @@ def covariance_of_errors(
     closure_phase: Measurements,
     closure_error: FloatArray,
     kind: CovarianceKind,
-) -> Covariance:
+) -> BlockCovariance:
     """Covariance of data whose file gives errors only.
 
     Parameters
@@ -59,6 +58,6 @@ def covariance_of_errors(
         Closures of independent baseline phases, or (the field's habit) independent.
     """
     if kind == "diagonal" or not len(closure_phase):
-        return DiagonalCovariance(np.concatenate([vis2_error, closure_error]) ** 2)
+        return diagonal_covariance(np.concatenate([vis2_error, closure_error]) ** 2)
     closures = BlockCovariance(len(closure_error), kernel_blocks(closure_phase, closure_error))
-    return stack_covariances([DiagonalCovariance(vis2_error**2), closures])
+    return stack_covariances([diagonal_covariance(vis2_error**2), closures])

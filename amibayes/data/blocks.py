@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array, csr_array
 
 from amibayes.errors import DataError
 from amibayes.units import FloatArray, IntArray
@@ -149,6 +149,13 @@ class Stack:
             Where a block is not positive definite on its basis.
         """
         m, _ = self.shape
+        if m == 1:
+            if not (np.isfinite(self.matrix).all() and (self.matrix > 0).all()):
+                raise DataError(
+                    "an error that is zero, negative or not finite", remedy="flag such data"
+                )
+            sigma = np.sqrt(self.matrix)
+            return 1.0 / sigma, sigma
         basis = np.eye(m)[None] if self.basis is None else self.basis
         inner = basis.swapaxes(1, 2) @ self.matrix @ basis
         try:
@@ -267,6 +274,28 @@ class BlockCovariance:
         values, where = self.entries
         matrix[where] = values
         return matrix
+
+    @property
+    def independent(self) -> bool:
+        """Whether no two entries are correlated."""
+        return all(s.shape[0] == 1 for s in self.stacks)
+
+    @property
+    def sparse(self) -> csr_array:
+        """The matrix, (size, size)."""
+        return coo_array(self.entries, shape=(self.size, self.size)).tocsr()
+
+    def stretched(self, factors: FloatArray) -> BlockCovariance:
+        """Covariance of errors (size,) that are multiplied by numbers, the data as they are."""
+        stacks = []
+        for s in self.stacks:
+            f = factors[s.index]
+            stacks.append(Stack(s.index, f[:, :, None] * s.matrix * f[:, None], s.basis))
+        return BlockCovariance(self.size, stacks)
+
+    def scaled(self, factors: FloatArray) -> BlockCovariance:
+        """Covariance of data that are multiplied by numbers (size,), none of them zero."""
+        return BlockCovariance(self.size, [s.scaled(factors) for s in self.stacks])
 
     def select(self, keep: IntArray) -> BlockCovariance:
         """Covariance of the entries ``keep``, in that order."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from scipy.sparse import block_diag, csr_array
 
-from amibayes.data.covariance import Covariance, sparse_covariance
+from amibayes.data.covariance import BlockCovariance
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def welch_satterthwaite(parts: Iterable[tuple[float, Freedom | None]]) -> Freedo
     )
 
 
-def squared_share(part: csr_array, whole: Covariance) -> float:
+def squared_share(part: csr_array, whole: BlockCovariance) -> float:
     """Squared share of one term in a sum of covariances.
 
     In coordinates in which the whole is the unit matrix of rank p, a term E has the share
@@ -79,12 +79,12 @@ def stacked_freedom(parts: Iterable[tuple[int, Freedom | None]]) -> Freedom | No
     return welch_satterthwaite(((n + n**2) / (p + p**2), f) for n, f in given)
 
 
-def stacked_scatter(parts: Iterable[tuple[Covariance, csr_array | None]]) -> csr_array | None:
+def stacked_scatter(parts: Iterable[tuple[BlockCovariance, csr_array | None]]) -> csr_array | None:
     """Covariance by scatter alone of independent data sets laid side by side.
 
     Parameters
     ----------
-    parts : iterable of (Covariance, sparse array or None)
+    parts : iterable of (BlockCovariance, sparse array or None)
         Each part's covariance, and that by its scatter alone (None: as the first).
 
     Returns
@@ -95,4 +95,4 @@ def stacked_scatter(parts: Iterable[tuple[Covariance, csr_array | None]]) -> csr
     given = list(parts)
     if all(scatter is None for _, scatter in given):
         return None
-    return csr_array(block_diag([sparse_covariance(c) if s is None else s for c, s in given]))
+    return csr_array(block_diag([c.sparse if s is None else s for c, s in given]))

@@ -12,7 +12,7 @@ from astropy.table import QTable
 from scipy.sparse import csr_array
 
 from amibayes.data.closure import closure_matrix
-from amibayes.data.covariance import Covariance, stack_covariances
+from amibayes.data.covariance import BlockCovariance, stack_covariances
 from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.data.kernel_model import stands_alone
 from amibayes.data.setup import Setup
@@ -119,7 +119,7 @@ class Observables:
     Parameters
     ----------
     vis2, closure_phase : Measurements
-    covariance : Covariance
+    covariance : BlockCovariance
         Of the unflagged data, V² first, then closure phases in radians.
     covariance_kind : {"diagonal", "assumed", "given", "estimated"}
         Independent errors; errors only, closures correlated through shared baselines;
@@ -144,7 +144,7 @@ class Observables:
 
     vis2: Measurements
     closure_phase: Measurements
-    covariance: Covariance
+    covariance: BlockCovariance
     covariance_kind: CovarianceKind
     setups: tuple[Setup, ...]
     n_integrations: int | None = None

@@ -17,7 +17,6 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from amibayes.data.blocks import Block, BlockCovariance
-from amibayes.data.covariance import Covariance, as_blocks
 from amibayes.units import BoolArray, FloatArray, IntArray, read_only
 
 
@@ -81,8 +80,8 @@ def vis2_first(counts: Sequence[tuple[int, int]]) -> IntArray:
 
 
 def with_shared(
-    covariance: Covariance, shared: SharedErrors | None, sign: float = 1.0
-) -> Covariance:
+    covariance: BlockCovariance, shared: SharedErrors | None, sign: float = 1.0
+) -> BlockCovariance:
     """Covariance with shared errors put in, or taken out (``sign`` −1).
 
     Groups of data that have an error in common become one.
@@ -90,7 +89,7 @@ def with_shared(
     if shared is None or not np.any(shared.changes):
         return covariance
     g = shared.changes
-    blocks = as_blocks(covariance)
+    blocks = covariance.blocks
     touched = [bool(np.any(g[b.index])) for b in blocks]
     ours = [b for b, hit in zip(blocks, touched, strict=True) if hit]
     others = [b for b, hit in zip(blocks, touched, strict=True) if not hit]

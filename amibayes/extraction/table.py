@@ -151,11 +151,8 @@ def integrations(extraction: Extraction) -> Observables:
     vis2, closure = series(extraction)
     mean = extraction.observables.without_shared_errors()
     shared = extraction.observables.shared
-    covariance = mean.covariance
-    assert isinstance(covariance, BlockCovariance)
     n = len(used)
-    blocks = [replace(b, matrix=b.matrix * n) for b in covariance.blocks]
-    whole = BlockCovariance(covariance.size, blocks)
+    whole = mean.covariance.stretched(np.full(mean.covariance.size, np.sqrt(n)))
     # The scatter is that of these very data: what it does not tell of the covariance they do
     # not tell again, and a t likelihood of all of them would be too narrow.
     alone = replace(mean, covariance=whole, covariance_kind="given", freedom=None, scatter=None)

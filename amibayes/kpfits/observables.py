@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import block_diag, csr_array
 
 from amibayes.data.closure import kernel_basis
-from amibayes.data.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
+from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import stacked_freedom
 from amibayes.data.kernel_model import KernelModel
 from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup, join
@@ -156,11 +156,11 @@ def _covariance(file: KernelFile, frames: IntArray, channel: int, basis: FloatAr
 
 def _whole(
     matrices: Sequence[FloatArray], basis: FloatArray, independent: bool, path: str
-) -> Covariance:
+) -> BlockCovariance:
     """Covariance of all wavelengths, those of one after those of the other."""
     n = len(basis)
     if independent:
-        return DiagonalCovariance(np.concatenate([np.diag(m) for m in matrices]))
+        return diagonal_covariance(np.concatenate([np.diag(m) for m in matrices]))
     full = None if basis.shape[1] == n else basis
     blocks = [Block(k * n + np.arange(n), m, full) for k, m in enumerate(matrices)]
     return BlockCovariance(n * len(matrices), blocks)

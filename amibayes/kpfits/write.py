@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from amibayes.data.covariance import sparse_covariance
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits import write_oifits
@@ -94,7 +93,7 @@ def _hdus(observables: Observables) -> fits.HDUList:
         )
     place = (table.setup * n_channels + table.channel) * n + table.stations[:, 0]
     order = np.argsort(place)
-    whole = sparse_covariance(observables.covariance)[order][:, order]
+    whole = observables.covariance.sparse[order][:, order]
     blocks = [whole[k : k + n, k : k + n].toarray() for k in range(0, n_frames * n_channels * n, n)]
     covariance = np.array(blocks).reshape(n_frames, n_channels, n, n)
     value = table.value[order].reshape(n_frames, n_channels, n)

@@ -19,7 +19,7 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
-from amibayes.data.covariance import Covariance, DiagonalCovariance, as_blocks
+from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_noise import (
     ChannelCovariance,
@@ -179,12 +179,11 @@ def differences_of(fits: Sequence[tuple[Likelihood, FloatArray]]) -> list[FloatA
 def files_share_errors(stated: Observables) -> bool:
     """Whether errors of different files are correlated, as shared calibrators make them."""
     data = stated.unflagged()
-    if isinstance(data.covariance, DiagonalCovariance):
-        return False
     number = np.empty(data.covariance.size, dtype=np.intp)
     for k, file in enumerate(files_of(data)):
         number[file.of_kind("vis2") | file.of_kind("cp")] = k
-    return any(len(np.unique(number[b.index])) > 1 for b in as_blocks(data.covariance))
+    files = [number[stack.index] for stack in data.covariance.stacks]
+    return any((of != of[:, :1]).any() for of in files)
 
 
 def _term(
@@ -199,15 +198,10 @@ def _term(
     """Whiten some of the data and make their extra noise diagonal, block by block."""
     n = stated.n_vis2
     part = stated.select(which[:n], which[n:])
-    blocks = as_blocks(part.covariance)
-    noisy = as_blocks(add_noise(part, _amount(typical)).covariance)
-    pairs = [(a.index, b.matrix - a.matrix) for a, b in zip(blocks, noisy, strict=True)]
-    extra, covariance = (
-        _sparse(pairs, part.covariance.size),
-        noise_with_channels(
-            part, channels, [f for f in prior.floors if f.source in {s.source for s in part.setups}]
-        ),
-    )
+    extra = csr_array(add_noise(part, _amount(typical)).covariance.sparse - part.covariance.sparse)
+    sources = {s.source for s in part.setups}
+    floors = [f for f in prior.floors if f.source in sources]
+    covariance = noise_with_channels(part, channels, floors)
     whitening, share = _together(covariance.covariance, extra)
     columns = np.flatnonzero(which)
     place = csr_array(

@@ -29,7 +29,6 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.blocks import Block, BlockCovariance, orthonormal
-from amibayes.data.covariance import Covariance, DiagonalCovariance
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
@@ -78,13 +77,13 @@ class ChannelCovariance:
 
     Parameters
     ----------
-    base : Covariance
+    base : BlockCovariance
         Of channels that are independent.
     rows : ChannelRows
         Of ``base``.
     """
 
-    def __init__(self, base: Covariance, rows: ChannelRows) -> None:
+    def __init__(self, base: BlockCovariance, rows: ChannelRows) -> None:
         self.base, self.rows = base, rows
 
     @property
@@ -110,7 +109,7 @@ class ChannelCovariance:
     @cached_property
     def _colouring(self) -> Any:
         turned = self.rows.rotation.T @ diags_array(self.rows.sigma)
-        return _colouring(self.base) @ turned
+        return self.base.colouring @ turned
 
     @property
     def variance(self) -> FloatArray:
@@ -138,7 +137,7 @@ class ChannelCovariance:
         colour = csr_array(self._colouring)
         return np.asarray((colour @ colour.T).toarray())
 
-    def select(self, keep: IntArray) -> Covariance:
+    def select(self, keep: IntArray) -> BlockCovariance:
         """Covariance of the entries ``keep``, in that order."""
         colour = csr_array(csr_array(self._colouring)[keep])
         shared = csr_array(abs(colour) @ abs(colour).T)
@@ -153,15 +152,6 @@ def _block(colouring: csr_array, at: IntArray) -> Block:
     rows = csr_array(colouring[at])
     dense = csr_array(rows[:, np.unique(rows.indices)]).toarray()
     return Block(at, dense @ dense.T, orthonormal(dense))
-
-
-def _colouring(covariance: Covariance) -> Any:
-    """A with C = A Aᵀ and W A = 1, (size, rank), of a covariance of small blocks."""
-    if isinstance(covariance, DiagonalCovariance):
-        return diags_array(np.sqrt(covariance.variance))
-    if isinstance(covariance, BlockCovariance):
-        return covariance.colouring
-    return np.linalg.pinv(covariance.whitening.toarray())
 
 
 def channel_rows(

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from amibayes.data.covariance import Block, Covariance, DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -283,37 +282,21 @@ def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArr
     shape = np.ones(len(sigma))
     shape[:n_vis2] = np.maximum(_pattern(data), sigma[:n_vis2])
     vis2, strength = np.arange(len(sigma)) < n_vis2, np.log(shape / sigma)
-    if isinstance(data.covariance, DiagonalCovariance):
-        keys = np.stack([~vis2, setup, row])
-        group = np.unique(keys, axis=1, return_inverse=True)[1].ravel()
-        return group, channel, np.exp(strength), np.arange(len(sigma))
-    number, blocks = _rows_of_blocks(data.covariance)
-    first = np.array([b.index[0] for b in blocks], dtype=np.intp)
-    weight = np.array([np.exp(strength[b.index].mean()) for b in blocks])
-    group = np.empty(len(number), dtype=np.intp)
-    label: dict[object, int] = {}
-    for block, at in zip(blocks, _rows_by_block(number), strict=True):
-        inside = block.index
-        mixed = (channel[inside] != channel[inside[0]]).any() or np.any(
-            vis2[inside] != vis2[inside[0]]
-        )
-        who = tuple(zip(setup[inside].tolist(), row[inside].tolist(), strict=True))
-        for k, place in enumerate(at.tolist()):
-            key = place if mixed else (bool(vis2[inside[0]]), who, k)
-            group[place] = label.setdefault(key, len(label))
-    return group, channel[first][number], weight[number], first[number]
-
-
-def _rows_of_blocks(covariance: Covariance) -> tuple[IntArray, list[Block]]:
-    """Number of the block that each whitened row belongs to, and the blocks."""
-    blocks, whitening = as_blocks(covariance), covariance.whitening
-    home = np.empty(covariance.size, dtype=np.intp)
-    for number, block in enumerate(blocks):
-        home[block.index] = number
-    return home[whitening.indices[whitening.indptr[:-1]]], blocks
-
-
-def _rows_by_block(number: IntArray) -> list[IntArray]:
-    """Rows of each block, in their order, from the block of each row."""
-    order = np.argsort(number, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
+    kinds = vis2.astype(np.intp)
+    groups, firsts, weights = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
+    used = 0
+    for stack in data.covariance.stacks:
+        inside, rank = stack.index, stack.shape[1]
+        key = np.concatenate([kinds[inside[:, :1]], setup[inside], row[inside]], axis=1)
+        same = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1, 1)
+        alike = (channel[inside] == channel[inside[:, :1]]) & (vis2[inside] == vis2[inside[:, :1]])
+        # Rows of one exposure and kind, one of each channel; of a block of several, each alone.
+        own = np.arange(len(inside) * rank).reshape(-1, rank)
+        shared = same * rank + np.arange(rank)
+        label = np.where(alike.all(axis=1)[:, None], shared, own + own.size)
+        groups.append(used + label.ravel())
+        used += 2 * own.size
+        firsts.append(np.repeat(inside[:, 0], rank))
+        weights.append(np.repeat(np.exp(strength[inside].mean(axis=1)), rank))
+    first = np.concatenate(firsts)
+    return np.concatenate(groups), channel[first], np.concatenate(weights), first

@@ -15,13 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import block_diag, csr_array, diags_array
 
-from amibayes.data.covariance import (
-    BlockCovariance,
-    Covariance,
-    DiagonalCovariance,
-    as_blocks,
-    sparse_covariance,
-)
 from amibayes.data.degrees_of_freedom import squared_share, welch_satterthwaite
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
@@ -161,7 +154,7 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
     noisy = _with_noise(data, extra)
     if data.freedom is None:
         return noisy
-    stated, whole = sparse_covariance(data.covariance), sparse_covariance(noisy.covariance)
+    stated, whole = data.covariance.sparse, noisy.covariance.sparse
     freedom = welch_satterthwaite([(squared_share(stated, noisy.covariance), data.freedom)])
     scatter = None if data.scatter is None else csr_array(data.scatter + whole - stated)
     return replace(noisy, freedom=freedom, scatter=scatter)
@@ -176,21 +169,9 @@ def with_noise(likelihood: Likelihood, extra: ExtraNoise) -> Likelihood:
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
-    n_vis2, (vis2, closure) = data.n_vis2, extra.of(data)
-    diagonal = np.concatenate([vis2, np.zeros(len(closure))])
-    if isinstance(data.covariance, DiagonalCovariance):
-        diagonal[n_vis2:] = closure
-        return replace(data, covariance=DiagonalCovariance(data.covariance.variance + diagonal))
-    noise = block_diag([diags_array(diagonal[:n_vis2]), _shared_noise(data, closure)])
-    noisy = _in_blocks(data.covariance).plus(csr_array(noise))
-    return replace(data, covariance=noisy)
-
-
-def _in_blocks(covariance: Covariance) -> BlockCovariance:
-    """Any covariance as blocks."""
-    if isinstance(covariance, BlockCovariance):
-        return covariance
-    return BlockCovariance(covariance.size, as_blocks(covariance))
+    vis2, closure = extra.of(data)
+    noise = block_diag([diags_array(vis2), _shared_noise(data, closure)])
+    return replace(data, covariance=data.covariance.plus(csr_array(noise)))
 
 
 def _shared_noise(data: Observables, closure: FloatArray) -> csr_array:

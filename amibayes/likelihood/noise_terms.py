@@ -9,7 +9,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
-from amibayes.data.covariance import DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.likelihood.chi2 import deviance, log_peak
 from amibayes.likelihood.extra_noise import BOUND
@@ -138,10 +137,8 @@ def kinds_of(
 
 
 def _separate(stated: Observables, n_vis2: int) -> bool:
-    if isinstance(stated.covariance, DiagonalCovariance):
-        return True
-    sides = [b.index < n_vis2 for b in as_blocks(stated.covariance)]
-    return not any(s.any() and not s.all() for s in sides)
+    sides = [stack.index < n_vis2 for stack in stated.covariance.stacks]
+    return all((side == side[:, :1]).all() for side in sides)
 
 
 def with_nodes(term: NoiseTerm, differences: Sequence[FloatArray]) -> NoiseTerm:

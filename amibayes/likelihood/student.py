@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array
 
-from amibayes.data.blocks import Block, BlockCovariance, Stack
-from amibayes.data.covariance import Covariance, DiagonalCovariance, as_blocks
+from amibayes.data.blocks import Stack
+from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.likelihood.noise import FittedNoise, GaussianNoise
 from amibayes.units import BoolArray, FloatArray
@@ -101,11 +101,6 @@ def symmetric_whitening(observables: Observables) -> SymmetricWhitening:
     """Make the directions of unflagged data."""
     covariance = observables.covariance
     vis2 = np.arange(covariance.size) < observables.n_vis2
-    if isinstance(covariance, DiagonalCovariance):
-        return SymmetricWhitening(
-            csr_array(eye_array(covariance.size)), np.ones(covariance.size), vis2
-        )
-    assert isinstance(covariance, BlockCovariance)
     frame = csr_array(covariance.laid_out([_symmetric(s) for s in covariance.stacks]).T)
     return SymmetricWhitening(frame, np.asarray((frame**2).sum(axis=1)).ravel(), vis2)
 
@@ -180,18 +175,7 @@ def scores(frame: SymmetricWhitening, white: FloatArray) -> FloatArray:
 def reweighted(observables: Observables, stretch: FloatArray) -> Observables:
     """Unflagged data whose errors (n_data,) are stretched, correlations as they are."""
     data = observables.unflagged()
-    covariance: Covariance
-    if isinstance(data.covariance, DiagonalCovariance):
-        covariance = DiagonalCovariance(data.covariance.variance * stretch**2)
-    else:
-        covariance = BlockCovariance(
-            data.covariance.size,
-            [
-                Block(b.index, b.matrix * np.outer(stretch[b.index], stretch[b.index]), b.basis)
-                for b in as_blocks(data.covariance)
-            ],
-        )
-    return replace(data, covariance=covariance)
+    return replace(data, covariance=data.covariance.stretched(stretch))
 
 
 @dataclass(frozen=True)

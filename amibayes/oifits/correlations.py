@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.assumed_covariance import kernel_blocks
 from amibayes.data.closure import closure_matrix, kernel_basis
-from amibayes.data.covariance import Block, BlockCovariance, Covariance, DiagonalCovariance
+from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance
 from amibayes.data.observables import Measurements, closure_sets, exposure_labels
 from amibayes.errors import DataError
 from amibayes.oifits.columns import integers, numbers, placed, rest_of, same
@@ -272,7 +272,7 @@ def given_covariance(
     *,
     covered: BoolArray,
     independent: BoolArray,
-) -> Covariance:
+) -> BlockCovariance:
     """Covariance of unflagged data, some of whose correlations are given.
 
     Parameters
@@ -305,7 +305,7 @@ def given_covariance(
     single[[i for s in assumed for i in s]] = False
     blocks += _given_blocks(variance, pairs, closure_phase, given, single)
     if not pairs.first.size and not sets:
-        return DiagonalCovariance(variance)
+        return diagonal_covariance(variance)
     return BlockCovariance(n, blocks)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 
 from amibayes.data.closure import canonical
-from amibayes.data.covariance import DiagonalCovariance
+from amibayes.data.covariance import diagonal_covariance
 from amibayes.data.observables import Measurements, Observables, Setup, join
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits.columns import same
@@ -158,9 +158,9 @@ def _one_object(parts: Sequence[Observables]) -> tuple[Observables, tuple[str, .
     dropped = sum(int((~mask).sum()) for mask in masks)
     notes += [f"{dropped} flagged value(s) left out"] if dropped else []
     whole = whole.select(masks[0], masks[1])
-    correlated = not isinstance(whole.covariance, DiagonalCovariance)
-    notes += ["correlations left out: the program cannot use them"] if correlated else []
-    errors = DiagonalCovariance(whole.covariance.variance)
+    if not whole.covariance.independent:
+        notes.append("correlations left out: the program cannot use them")
+    errors = diagonal_covariance(whole.covariance.variance)
     plain = replace(
         whole,
         covariance=errors,

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 from scipy.sparse import csr_array
 
-from amibayes.data.covariance import Covariance, DiagonalCovariance
+from amibayes.data.covariance import BlockCovariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import CovarianceKind, Measurements
 from amibayes.data.shared_errors import SharedErrors
@@ -72,7 +72,7 @@ class Content:
 class FileCovariance:
     """A covariance, its kind, what it rests on, notes, and what of it other files share."""
 
-    covariance: Covariance
+    covariance: BlockCovariance
     kind: CovarianceKind
     n_integrations: int | None
     freedom: Freedom | None
@@ -94,7 +94,7 @@ def stated_covariance(
     if closure_covariance == "diagonal":
         set_aside = ("correlations of the file set aside",) if tables or notes else ()
         return FileCovariance(
-            DiagonalCovariance(variance[~flag]), "diagonal", None, None, set_aside
+            diagonal_covariance(variance[~flag]), "diagonal", None, None, set_aside
         )
     pairs = _unflagged(joined([images, *_table_pairs(oifits, content, tables, variance)]), flag)
     pairs, note = consistent_pairs(pairs, variance[~flag], closure)

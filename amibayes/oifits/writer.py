@@ -18,7 +18,6 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from amibayes import __version__
-from amibayes.data.covariance import DiagonalCovariance, as_blocks
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits.correlations import pair_covariance
@@ -310,11 +309,10 @@ def _independent_closures(observables: Observables) -> BoolArray:
     """Closure phases that stand alone, without kernel basis; flagged ones go with the rest."""
     out = np.ones(len(observables.closure_phase), dtype=bool)
     used = np.flatnonzero(~observables.closure_phase.flag)
-    if not isinstance(observables.covariance, DiagonalCovariance):
-        for block in as_blocks(observables.covariance):
-            if len(block.index) > 1 or block.basis is not None:
-                closures = block.index[block.index >= observables.n_vis2] - observables.n_vis2
-                out[used[closures]] = False
+    for stack in observables.covariance.stacks:
+        if stack.shape[0] > 1 or stack.basis is not None:
+            closures = stack.index[stack.index >= observables.n_vis2] - observables.n_vis2
+            out[used[closures]] = False
     return out
 
 
@@ -324,7 +322,7 @@ def _needs_correlations(observables: Observables) -> bool:
         observables.covariance_kind == "diagonal"
         and observables.n_integrations is None
         and observables.freedom is None
-        and isinstance(observables.covariance, DiagonalCovariance)
+        and observables.covariance.independent
     )
 
 
@@ -356,7 +354,7 @@ def _correlation_table(observables: Observables, grids: list[Grid]) -> Any:
 def _pairs(observables: Observables) -> tuple[IntArray, IntArray, FloatArray]:
     """Every covariance that is not zero: places in the data vector, value."""
     firsts, seconds, values = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
-    for block in as_blocks(observables.covariance):
+    for block in observables.covariance.blocks:
         if len(block.index) > 1:
             i, j = np.triu_indices(len(block.index), 1)
             used = block.matrix[i, j] != 0

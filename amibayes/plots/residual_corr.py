@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from amibayes.data.covariance import BlockCovariance
 from amibayes.data.observables import Observables
 from amibayes.plots.style import BLACK, BLUE, DIVERGING, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray, IntArray
@@ -49,8 +48,8 @@ def correlation_plot(observables: Observables) -> Figure:
 def _chosen(data: Observables) -> tuple[IntArray, IntArray]:
     """Places of the V² and of the closure phases that are drawn."""
     order = np.arange(len(data.data))
-    if len(order) > MAX_DATA and isinstance(data.covariance, BlockCovariance):
-        order = np.concatenate([block.index for block in data.covariance.blocks])
+    if len(order) > MAX_DATA:
+        order = np.concatenate([stack.index.ravel() for stack in data.covariance.stacks])
     vis2, closure = order[order < data.n_vis2], order[order >= data.n_vis2]
     half = max(MAX_DATA // 2, MAX_DATA - len(closure))
     return vis2[:half], closure[: MAX_DATA - min(half, len(vis2))]

@@ -18,7 +18,7 @@ from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.transfer import Transfer, transfer_of, uniform_disc, wrapped
 from amibayes.calibration.weighted import clipped, weighted_response
 from amibayes.data.closure import canonical, closure_matrix, kernel_basis
-from amibayes.data.covariance import Block, BlockCovariance, as_blocks
+from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
@@ -197,7 +197,7 @@ def shuffled(star: Observables, rng: np.random.Generator) -> Observables:
             b.matrix * np.outer(signs[b.index], signs[b.index]),
             None if b.basis is None else b.basis * signs[b.index, None],
         )
-        for b in as_blocks(star.covariance)
+        for b in star.covariance.blocks
     ]
     covariance = BlockCovariance(len(signs), blocks)
     return replace(

@@ -14,9 +14,7 @@ from amibayes.cube import Cube
 from amibayes.data.covariance import (
     Block,
     BlockCovariance,
-    DiagonalCovariance,
-    as_blocks,
-    sparse_covariance,
+    diagonal_covariance,
     stack_covariances,
 )
 from amibayes.data.joining import different_targets
@@ -79,7 +77,7 @@ def test_observables_refuse_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="has another length than value"):
         replace(good.vis2, wavelength_m=good.vis2.wavelength_m[:-1])
     with pytest.raises(DataError, match="a covariance of size 3 for 56 data"):
-        replace(good, covariance=DiagonalCovariance(np.ones(3)))
+        replace(good, covariance=diagonal_covariance(np.ones(3)))
     spoilt = good.vis2.value.copy()
     spoilt[4] = np.nan
     with pytest.raises(DataError, match=r"not finite \(flag it\)"):
@@ -113,19 +111,19 @@ def test_a_matrix_that_is_no_covariance(matrix, fault: str) -> None:
         BlockCovariance(2, [Block(np.arange(2), matrix)])
 
 
-def test_covariances_of_any_kind_as_blocks_and_laid_end_to_end() -> None:
-    diagonal = DiagonalCovariance(np.array([1.0, 4.0]))
+def test_covariances_laid_end_to_end() -> None:
+    diagonal = diagonal_covariance(np.array([1.0, 4.0]))
     full = BlockCovariance(2, [Block(np.arange(2), np.array([[2.0, 1.0], [1.0, 2.0]]))])
     both = stack_covariances([diagonal, full])
     expected = np.zeros((4, 4))
     expected[:2, :2], expected[2:, 2:] = np.diag([1.0, 4.0]), full.dense()
     np.testing.assert_array_equal(both.dense(), expected)
-    np.testing.assert_array_equal(sparse_covariance(both).toarray(), expected)
+    np.testing.assert_array_equal(both.sparse.toarray(), expected)
     plain = stack_covariances([diagonal, diagonal])
-    assert isinstance(plain, DiagonalCovariance)
+    assert plain.independent
     np.testing.assert_array_equal(plain.variance, [1.0, 4.0, 1.0, 4.0])
-    assert [b.index.tolist() for b in as_blocks(diagonal, 3)] == [[3], [4]]
-    assert sparse_covariance(DiagonalCovariance(np.empty(0))).shape == (0, 0)
+    assert [b.index.tolist() for b in plain.blocks] == [[0], [1], [2], [3]]
+    assert diagonal_covariance(np.empty(0)).sparse.shape == (0, 0)
 
 
 @pytest.mark.parametrize(

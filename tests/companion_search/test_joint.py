@@ -20,7 +20,7 @@ from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.companion_search.with_extra_noise import search_with_noise
-from amibayes.data.covariance import DiagonalCovariance, dense_covariance
+from amibayes.data.covariance import dense_covariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
@@ -394,7 +394,7 @@ def test_unknown_noise_of_files_is_averaged_file_by_file(rng) -> None:
     """The joint likelihood is the product of those of the files, each with its own noise."""
     truth = [120.0, -90.0, 0.05]
     parts = [noisy(epoch(mjd=60000.0 + k, source=f"{k}"), truth, rng) for k in range(2)]
-    parts[1] = replace(parts[1], covariance=DiagonalCovariance(parts[1].covariance.variance / 9.0))
+    parts[1] = replace(parts[1], covariance=diagonal_covariance(parts[1].covariance.variance / 9.0))
     thetas = np.array([truth, [110.0, -95.0, 0.04]])
     fits = [thetas[0], thetas[1]]
     joint = Likelihood(join(parts))

@@ -18,9 +18,9 @@ from amibayes.data.covariance import (
     Block,
     BlockCovariance,
     Covariance,
-    DiagonalCovariance,
     covariance_from_matrix,
     dense_covariance,
+    diagonal_covariance,
     stack_covariances,
 )
 from amibayes.errors import DataError
@@ -86,7 +86,7 @@ def some_covariances(rng: np.random.Generator) -> list[Covariance]:
     blocks = [Block(np.array([0, 2]), random_matrix(rng, 2)), Block(np.array([1]), np.eye(1))]
     blocks += [Block(np.array([3, 5]), random_matrix(rng, 2)), Block(np.array([4]), 2 * np.eye(1))]
     dense = dense_covariance(random_matrix(rng, 5))
-    diagonal = DiagonalCovariance(rng.uniform(1, 2, 4))
+    diagonal = diagonal_covariance(rng.uniform(1, 2, 4))
     return [diagonal, BlockCovariance(6, blocks), dense, stack_covariances([diagonal, dense])]
 
 
@@ -133,7 +133,7 @@ def test_kernel_basis_makes_a_singular_covariance_usable(rng: np.random.Generato
 
 def test_bad_covariances_are_refused() -> None:
     with pytest.raises(DataError, match="zero, negative or not finite"):
-        DiagonalCovariance(np.array([1.0, 0.0]))
+        diagonal_covariance(np.array([1.0, 0.0]))
     with pytest.raises(DataError, match="positive definite"):
         dense_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]))
     with pytest.raises(ValueError, match="tile"):

@@ -17,7 +17,7 @@ from amibayes.calibration import calibrate
 from amibayes.calibration.flagging import flag_by_rule
 from amibayes.companion_search.search import search
 from amibayes.data.closure import closure_matrix, kernel_basis
-from amibayes.data.covariance import dense_covariance, sparse_covariance
+from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import (
     Freedom,
     squared_share,
@@ -183,7 +183,7 @@ def test_one_datum_is_the_rule_of_welch(rng) -> None:
     a, b = rng.normal(0.0, 1.0, 12), rng.normal(0.0, 3.0, 30)
     parts = [a.var(ddof=1) / 12, b.var(ddof=1) / 30]
     whole = dense_covariance(np.array([[sum(parts)]]))
-    shares = [squared_share(sparse_covariance(dense_covariance([[p]])), whole) for p in parts]
+    shares = [squared_share(dense_covariance([[p]]).sparse, whole) for p in parts]
     found = welch_satterthwaite(
         zip(shares, [Freedom(11.0, 11.0), Freedom(29.0, 29.0)], strict=True)
     )
@@ -199,7 +199,7 @@ def test_data_sets_laid_side_by_side_share_what_they_know() -> None:
     whole = join([one] * 10)
     assert whole.degrees_of_freedom == pytest.approx(400.0 * (1 + 360) / (10 * 37), rel=1e-12)
     assert join([niriss(), niriss()]).freedom is None
-    part = sparse_covariance(whole.covariance).tolil()
+    part = whole.covariance.sparse.tolil()
     mask = np.arange(whole.covariance.size)
     first = np.flatnonzero((mask < 21) | ((mask >= 210) & (mask < 245)))
     alone = np.zeros((560, 560))

@@ -16,7 +16,7 @@ from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.closure import closure_matrix, kernel_basis
-from amibayes.data.covariance import dense_covariance, sparse_covariance
+from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.shrinkage import shrunk_covariance
@@ -260,7 +260,7 @@ def test_simulated_data_have_the_distribution_of_the_likelihood(freedom: Freedom
     nu, p = freedom.degrees, sheet.n_independent
     if freedom.scatter == nu + p - 1.0:
         share = (nu - 2.0) / freedom.scatter
-        sheet = replace(sheet, scatter=share * sparse_covariance(sheet.covariance))
+        sheet = replace(sheet, scatter=share * sheet.covariance.sparse)
     test = made(sheet, 60.0)
     assert isinstance(test.treatment, Rotations)
     normals = rng.standard_normal((p, 4000))

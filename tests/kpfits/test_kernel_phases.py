@@ -16,7 +16,6 @@ import amibayes as ab
 from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.companion_search.grid import make_grid
-from amibayes.data.covariance import sparse_covariance
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
@@ -164,7 +163,7 @@ def test_calibrators_take_the_pupil_out_with_their_errors(tmp_path: Path) -> Non
     target, *calibrators = [kernel_observables(p) for p in (star, *paths)]
     found = calibrate(target, calibrators, method="weighted", clip=None).observables
     assert found.data == pytest.approx(target.data - np.mean(values, axis=0), abs=1e-9)
-    dense = sparse_covariance(found.covariance).toarray()
+    dense = found.covariance.sparse.toarray()
     assert (np.diag(dense) >= 1.499 * np.diag(covariance())).all()
     best = ab.search(ab.Likelihood(found), (60.0, 400.0)).theta
     assert np.hypot(best[0] - EAST, best[1] - NORTH) < 10.0

@@ -10,7 +10,6 @@ from helpers import niriss, simulated
 from scipy import stats
 
 from amibayes.companion_search.search import search
-from amibayes.data.covariance import sparse_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import statistic_of
@@ -257,7 +256,7 @@ def test_limits_of_an_estimated_covariance_do_not_feel_the_companion_that_is_the
     limits = {}
     for contrast in (0.0, 0.05):
         sheet = replace(niriss(), freedom=Freedom(3000.0, 78.0), covariance_kind="estimated")
-        sheet = replace(sheet, scatter=sparse_covariance(sheet.covariance))
+        sheet = replace(sheet, scatter=sheet.covariance.sparse)
         data = simulated(sheet, [150.0, 90.0, contrast], np.random.default_rng(6))
         result = search(Likelihood(data), (50.0, 400.0))
         weight = false_alarm(

@@ -102,11 +102,9 @@ def test_no_alarm_on_several_exposures(rng: np.random.Generator, tmp_path: Path)
 
 
 def scaled(observables: Observables, factor: float) -> Any:
-    from amibayes.data.covariance import Block, BlockCovariance, as_blocks
+    from amibayes.data.covariance import Block, BlockCovariance
 
-    blocks = [
-        Block(b.index, b.matrix * factor**2, b.basis) for b in as_blocks(observables.covariance)
-    ]
+    blocks = [Block(b.index, b.matrix * factor**2, b.basis) for b in observables.covariance.blocks]
     return BlockCovariance(observables.covariance.size, blocks)
 
 

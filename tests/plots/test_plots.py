@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.search import search
-from amibayes.data.covariance import DiagonalCovariance
+from amibayes.data.covariance import diagonal_covariance
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.statistic import statistic_of
@@ -306,7 +306,7 @@ def test_a_map_of_another_size_is_refused(found: SearchResult, tmp_path: Path) -
 
 def test_residuals_are_those_of_the_likelihood_and_wrap(found: SearchResult) -> None:
     data = found.likelihood.observables
-    alone = replace(data, covariance=DiagonalCovariance(data.covariance.variance))
+    alone = replace(data, covariance=diagonal_covariance(data.covariance.variance))
     turned = replace(
         alone,
         closure_phase=replace(alone.closure_phase, value=alone.closure_phase.value + 2.0 * np.pi),
