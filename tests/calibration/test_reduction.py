@@ -21,7 +21,6 @@ from amibayes.calibration import (
 )
 from amibayes.cli.main import build_parser
 from amibayes.cli.options import data_options
-from amibayes.data.covariance import scaled
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits import read_oifits
 from amibayes.pipeline.options import SearchOptions
@@ -44,7 +43,7 @@ def test_scaled_covariance_is_that_of_scaled_data(rng: np.random.Generator, kind
     factors = rng.uniform(0.5, 2.0, covariance.size)
     if kind != "diagonal":
         factors[21:] = 1.0  # closure phases keep their kernel space
-    found = scaled(covariance, factors)
+    found = covariance.scaled(factors)
     expected = factors[:, None] * covariance.dense() * factors
     np.testing.assert_allclose(found.dense(), expected, atol=1e-18)
     assert found.rank == covariance.rank
