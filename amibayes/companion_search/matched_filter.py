@@ -38,7 +38,7 @@ def dense_filter(
     offset: FloatArray,
     basis: FloatArray,
     data: FloatArray,
-    waves_into: Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None],
+    fill: Callable[[FloatArray, FloatArray], None],
 ) -> MatchedFilter:
     """Make the filter of companions at rest, alike in every band.
 
@@ -50,8 +50,8 @@ def dense_filter(
         Nuisance directions, orthonormal.
     data : (n_rows,) float array
         Whitened residuals without their nuisance part.
-    waves_into : callable
-        Puts cosine and sine (n_samples, 1) of east and north (1,) into its first arguments.
+    fill : callable
+        Puts cosines, then sines (2 n_samples,) of a place (2,) into its first argument.
     """
     n = even.matrix.shape[1]
     whole = np.zeros((len(data), 2 * n + 1))
@@ -61,15 +61,17 @@ def dense_filter(
     whole[even.rows, 2 * n] -= offset
     along = basis.T @ whole
     left = np.linalg.qr(whole - basis @ along, mode="r")
-    factor, n_left, with_data = np.vstack([left, along]), len(left), whole.T @ data
+    # One product gives all: with the data, what is left of the template, what was taken out.
+    factor, last = np.vstack([whole.T @ data, left, along]), 1 + len(left)
     waves = np.ones(2 * n + 1)
-    cosine, sine = waves[:n, None], waves[n : 2 * n, None]
+    fringes = waves[: 2 * n]
 
     def best(place: FloatArray) -> tuple[FloatArray, float]:
-        waves_into(cosine, sine, place[:1], place[1:])
-        square = (factor @ waves) ** 2
-        kept = square[:n_left].sum()
-        sigma = float(floored(kept, kept + square[n_left:].sum())) ** -0.5
-        return positive(float(with_data @ waves) * sigma, sigma)
+        fill(fringes, place)
+        product = factor @ waves
+        kept, taken = product[1:last], product[last:]
+        square = float(kept @ kept)
+        sigma = float(floored(square, square + float(taken @ taken))) ** -0.5
+        return positive(float(product[0]) * sigma, sigma)
 
     return best

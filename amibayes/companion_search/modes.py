@@ -18,7 +18,8 @@ AS_GOOD = 1.0
 def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]:
     """Modes within `MODE_LIMIT` of the best, each at least λ/4B from a better one."""
     kept: list[Mode] = []
-    for mode in sorted(modes, key=lambda m: -m.delta_chi2):
+    # Of fits that ended at one place, better by rounding alone, the first stands.
+    for mode in sorted(modes, key=lambda m: -round(m.delta_chi2, 6)):
         near = [np.hypot(*np.subtract(mode.place, k.place)) < 0.25 * fringe_mas for k in kept]
         if not any(near) and (not kept or mode.delta_chi2 > kept[0].delta_chi2 - MODE_LIMIT):
             kept.append(mode)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import nlopt
 import numpy as np
@@ -25,27 +25,9 @@ EVALUATIONS_PER_FRINGE, MIN_EVALUATIONS, MAX_EVALUATIONS = 40, 400, 3000
 """Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
 
 
-@dataclass(frozen=True)
-class Stop:
-    """When a local fit ends.
-
-    Parameters
-    ----------
-    rounds : int
-        How often it is taken up again with new scales.
-    tolerance : float
-        Relative change of χ².
-    evaluations : int
-        Of each round.
-    """
-
-    rounds: int
-    tolerance: float
-    evaluations: int
-
-
-FULL, ROUGH = Stop(3, 1e-9, 200), Stop(1, 1e-3, 30)
-"""Fits that are reported, and fits that only have to tell seeds apart."""
+ROUNDS, TOLERANCE, EVALUATIONS = 3, 1e-9, 200
+"""How often a local fit is taken up again with new scales, the relative change of χ² with which a
+round ends, and its evaluations."""
 
 CONVERGED = 1e-3
 """A fit is taken up again, with new scales, until a round gains less than this in χ²."""
@@ -214,26 +196,20 @@ def refine(
     seed: FloatArray,
     box: Box,
     deviance_single: float,
-    *,
-    rough: bool = False,
 ) -> Mode:
-    """Fit all free parameters from a seed (n_dim,), staying near it and inside the field.
-
-    A ``rough`` fit stops early: enough to tell seeds apart.
-    """
+    """Fit all free parameters from a seed (n_dim,), staying near it and inside the field."""
     parameters = likelihood.parameters
     bounds = np.array(parameters.bounds(parameters.columns()))
     places = parameters.columns("position")
     bounds[places] = seed[places, None] + box.fringe_mas * np.array([-1.0, 1.0])
     theta, deviance = seed, np.inf
-    stop = ROUGH if rough else FULL
-    for _ in range(stop.rounds):
+    for _ in range(ROUNDS):
         scale = _natural_scale(likelihood, theta, box)
         each = [parameters.place(k + 1) for k in range(parameters.companions)]
         limits = [x for place in each for x in _field_limits(seed, box, scale, place)]
         before = deviance
         objective = _objective(likelihood, scale)
-        theta, deviance = _minimise(objective, theta, scale, bounds, limits, stop)
+        theta, deviance = _minimise(objective, theta, scale, bounds, limits)
         if deviance > before - CONVERGED:
             break
     return mode_of(parameters, theta, deviance_single - deviance)
@@ -242,14 +218,19 @@ def refine(
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:
     """Step of each parameter that moves the data by 1σ: makes χ² round, whatever its size."""
     length = np.linalg.norm(likelihood.jacobian(theta), axis=0)
+    return np.asarray(1.0 / np.maximum(length, 1.0 / widest_steps(likelihood, box)))
+
+
+def widest_steps(likelihood: Likelihood, box: Box) -> FloatArray:
+    """Steps (n_dim,) of parameters that the data hardly know."""
     parameters = likelihood.parameters
-    widest = np.full(len(theta), 1.0)
+    widest = np.full(len(parameters), 1.0)
     widest[parameters.columns("position")] = 0.3 * box.fringe_mas
     widest[parameters.contrasts] = 0.3
     widest[parameters.rates] = 0.5 * likelihood.model.fastest_mas_yr
     discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
     widest[discs] = 0.3 * box.fringe_mas
-    return np.asarray(1.0 / np.maximum(length, 1.0 / widest))
+    return widest
 
 
 def global_check(
@@ -270,7 +251,7 @@ def global_check(
     best_at = bank.matched_filter(residuals)
 
     def inside(position: FloatArray) -> bool:
-        return box.inner_mas <= float(np.hypot(*position)) <= box.outer_mas
+        return box.inner_mas <= math.hypot(*position) <= box.outer_mas
 
     def loss(position: FloatArray, _: FloatArray) -> float:
         return -best_at(position)[1] if inside(position) else 0.0
@@ -354,7 +335,6 @@ def _minimise(
     scale: FloatArray,
     bounds: FloatArray,
     limits: Sequence[Objective] = (),
-    stop: Stop = FULL,
 ) -> tuple[FloatArray, float]:
     """Minimise inside bounds (n, 2); what counts is the best allowed point seen.
 
@@ -378,8 +358,8 @@ def _minimise(
         optimiser.set_min_objective(watched)
         for limit in limits:
             optimiser.add_inequality_constraint(limit, CONSTRAINT_SLACK)
-        optimiser.set_ftol_rel(stop.tolerance)
-        optimiser.set_maxeval(stop.evaluations)
+        optimiser.set_ftol_rel(TOLERANCE)
+        optimiser.set_maxeval(EVALUATIONS)
         try:
             optimiser.optimize(best)
         except nlopt.RoundoffLimited:

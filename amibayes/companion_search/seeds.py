@@ -8,10 +8,11 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from amibayes.calibration.binning import bin_channels
+from amibayes.companion_search.descent import descend
 from amibayes.companion_search.exact_map import LADDER, exact_map
 from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import refine, starting_points, with_large_discs
-from amibayes.companion_search.result import Mode
+from amibayes.companion_search.result import Mode, mode_of
 from amibayes.companion_search.scan import ScanResult
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import Box
@@ -51,9 +52,12 @@ per cent, and a free disc of a companion makes up for much of what is left."""
 MAX_COARSE_DATA = 2000
 """Data above which local fits begin with channels averaged."""
 
+FITTED_ALONE = 3
+"""Modes that are fitted to the end with NLopt: Δχ² of the others is right to some 0.1."""
+
 ROUGHNESS, COARSENESS = 0.1, 0.02
 """Part of the best gain by which fits may stand in another order than complete ones: fits that
-stop early, and fits with channels averaged."""
+may not have arrived, and fits with channels averaged."""
 
 
 def linear_seeds(
@@ -119,15 +123,15 @@ def bright_seeds(likelihood: Likelihood, nuisance: FloatArray, box: Box) -> Floa
 def refine_all(
     likelihood: Likelihood, seeds: FloatArray, box: Box, deviance_single: float
 ) -> list[Mode]:
-    """Local fits from seeds (n, n_dim): all of them roughly, the best to the end.
+    """Local fits from seeds (n, n_dim): all of them together, the best to the end.
 
-    Large data are fitted roughly with their channels averaged.
+    Large data are first fitted with their channels averaged.
     """
     if not len(seeds):
         return []
     coarse = coarse_likelihood(likelihood, box)
     base = float(coarse.deviance(coarse.chi2(_without(coarse, seeds[:1])))[0])
-    tried = [refine(coarse, seed, box, base, rough=True) for seed in seeds]
+    tried = _descended(coarse, seeds, box, base)
     kept = _best_distinct(tried, box.fringe_mas, MIN_SEEDS, ROUGHNESS)
     starts = np.array([m.theta for m in kept])
     starts = np.vstack([starts, with_large_discs(likelihood, starts[:MIN_SEEDS], box)])
@@ -135,7 +139,21 @@ def refine_all(
         fitted = [refine(coarse, start, box, base) for start in starts]
         kept = _best_distinct(fitted, box.fringe_mas, 1, COARSENESS)
         starts = np.array([m.theta for m in kept])
-    return [refine(likelihood, start, box, deviance_single) for start in starts]
+        return [refine(likelihood, start, box, deviance_single) for start in starts]
+    found = _descended(likelihood, starts, box, deviance_single)
+    found.sort(key=lambda m: -m.delta_chi2)
+    first = [np.array(m.theta) for m in found[:FITTED_ALONE]]
+    best = [refine(likelihood, theta, box, deviance_single) for theta in first]
+    return best + found[FITTED_ALONE:]
+
+
+def _descended(
+    likelihood: Likelihood, seeds: FloatArray, box: Box, deviance_single: float
+) -> list[Mode]:
+    """Fits from all seeds (n, n_dim) at once."""
+    found, chi2 = descend(likelihood, seeds, box)
+    gain = deviance_single - likelihood.deviance(chi2)
+    return [mode_of(likelihood.parameters, *fit) for fit in zip(found, gain.tolist(), strict=True)]
 
 
 def _without(likelihood: Likelihood, theta: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ field span are few numbers (`amibayes.companion_search.reduction`).
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Self
 
 import numpy as np
@@ -39,7 +39,7 @@ from amibayes.companion_search.templates import (
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response, nuisance_directions
-from amibayes.models.companion import fringes_into
+from amibayes.models.companion import fringes_into, fringes_of_one
 from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
@@ -236,7 +236,7 @@ class TemplateBank:
         data = self.project(residuals)
         if not self.joint and few(self.n_rows, len(self._samples)):
             response = self._even, self._odd, self._offset
-            return dense_filter(*response, self.nuisance_basis, data, self._waves_into)
+            return dense_filter(*response, self.nuisance_basis, data, self._one_wave())
         rows = self._rows(data[:, None])
 
         def best(position: FloatArray) -> tuple[FloatArray, float]:
@@ -327,6 +327,17 @@ class TemplateBank:
         cosine, sine = np.empty((2, len(self._samples), np.shape(east_mas)[-1]))
         self._waves_into(cosine, sine, east_mas, north_mas)
         return cosine, sine
+
+    def _one_wave(self) -> Callable[[FloatArray, FloatArray], None]:
+        """What `_waves_into` does, for one place (2,) and cosines and sines in one array."""
+        if self._disc is None and self._samples.off_axis is None:
+            return fringes_of_one(self._samples, self._smearing)
+        n = len(self._samples)
+
+        def fill(out: FloatArray, place: FloatArray) -> None:
+            self._waves_into(out[:n, None], out[n:, None], place[:1], place[1:])
+
+        return fill
 
     def _waves_into(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray

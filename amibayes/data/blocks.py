@@ -123,6 +123,12 @@ class Stack:
             basis = basis * np.sign(np.einsum("grr->gr", upper))[:, None]
         return Stack(self.index, f[:, :, None] * self.matrix * f[:, None], basis)
 
+    def part_of(self, matrix: csr_array) -> FloatArray:
+        """What a matrix (size, size) has in these blocks, (g, m, m)."""
+        rows = np.broadcast_to(self.index[:, :, None], self.matrix.shape)
+        columns = np.broadcast_to(self.index[:, None], self.matrix.shape)
+        return np.asarray(matrix[rows.ravel(), columns.ravel()]).reshape(self.matrix.shape)
+
     def select(self, place: IntArray) -> list[Stack]:
         """Entries that have a place (size,) of 0 or more, there."""
         new = place[self.index]
@@ -305,13 +311,22 @@ class BlockCovariance:
 
     def plus(self, addition: csr_array) -> BlockCovariance:
         """The sum with a covariance (size, size), of which what lies in the blocks counts."""
-        stacks = []
-        for s in self.stacks:
-            rows = np.broadcast_to(s.index[:, :, None], s.matrix.shape)
-            columns = np.broadcast_to(s.index[:, None], s.matrix.shape)
-            more = np.asarray(addition[rows.ravel(), columns.ravel()]).reshape(s.matrix.shape)
-            stacks.append(Stack(s.index, s.matrix + more, s.basis))
+        stacks = [Stack(s.index, s.matrix + s.part_of(addition), s.basis) for s in self.stacks]
         return BlockCovariance(self.size, stacks)
+
+    def against(self, addition: csr_array, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Eigenvalues (rank,) of an addition in units of this, and data (size,) along each.
+
+        With ``amount`` times the addition, χ² is Σ along²/(1 + amount·eigenvalue), and ln of the
+        determinant grows by Σ ln(1 + amount·eigenvalue).
+        """
+        values, along = [np.empty(0)], [np.empty(0)]
+        for s in self.stacks:
+            white, _ = s.factors()
+            own, axes = np.linalg.eigh(white @ s.part_of(addition) @ white.swapaxes(1, 2))
+            values.append(own.ravel())
+            along.append((axes.swapaxes(1, 2) @ (white @ x[s.index][:, :, None])).ravel())
+        return np.concatenate(values), np.concatenate(along)
 
 
 def _stacked(blocks: Sequence[Block | Stack]) -> tuple[Stack, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -24,7 +25,7 @@ from amibayes.extraction.response import pipeline_response
 from amibayes.extraction.visits import visit_maps
 from amibayes.instrument import load_instrument
 from amibayes.kpfits import is_kpfits, kernel_observables
-from amibayes.oifits import OIFits, observables_of, open_oifits
+from amibayes.oifits import observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
 from amibayes.oifits.products import (
     FITS_MODEL,
@@ -39,6 +40,7 @@ from amibayes.oifits.products import (
     uncalibrated,
 )
 from amibayes.support.fits_errors import UNREADABLE
+from amibayes.support.shared_results import shared_of_file
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,12 @@ def contents_of(path: str | Path) -> Contents:
 
     The reader that is then chosen, that of OIFITS, says what is wrong with it.
     """
+    header, *rest = shared_of_file(partial(_headers, path), path, "headers")
+    return Contents(str(path), MappingProxyType(header), *rest)
+
+
+def _headers(path: str | Path) -> tuple[Any, ...]:
+    """Header of the first unit, names and shapes of all, columns of tables."""
     try:
         with fits.open(path, memmap=False, lazy_load_hdus=False) as hdus:
             names = tuple(hdu.name.upper() for hdu in hdus)
@@ -78,10 +86,9 @@ def contents_of(path: str | Path) -> Contents:
                 for key, value in hdu.header.items()
                 if key.startswith("TTYPE")
             )
-            header = MappingProxyType(dict(hdus[0].header))
-            return Contents(str(path), header, names, shapes, columns)
+            return dict(hdus[0].header), names, shapes, columns
     except UNREADABLE:
-        return Contents(str(path), MappingProxyType({}), (), ())
+        return {}, (), (), frozenset[str]()
 
 
 @dataclass(frozen=True)
@@ -125,11 +132,16 @@ def _extracted(
 def _oifits(
     paths: Sequence[str], images: ImageOptions, one_star: bool, **options: Any
 ) -> list[Observables]:
-    return [_with_errors(open_oifits(path), **options) for path in paths]
+    asked = tuple(sorted(options.items()))
+    return [
+        shared_of_file(partial(_with_errors, path, **options), path, "OIFITS", asked)
+        for path in paths
+    ]
 
 
-def _with_errors(oifits: OIFits, **options: Any) -> Observables:
+def _with_errors(path: str, **options: Any) -> Observables:
     """Read a file; what an audit calls an error stands in the notes."""
+    oifits = open_oifits(path)
     found = observables_of(oifits, **options)
     return replace(found, notes=(*found.notes, *errors_in(oifits, found)))
 

@@ -169,9 +169,13 @@ def with_noise(likelihood: Likelihood, extra: ExtraNoise) -> Likelihood:
 
 
 def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
+    return replace(data, covariance=data.covariance.plus(covariance_of(data, extra)))
+
+
+def covariance_of(data: Observables, extra: ExtraNoise) -> csr_array:
+    """Covariance (n_data, n_data) of extra noise of unflagged data."""
     vis2, closure = extra.of(data)
-    noise = block_diag([diags_array(vis2), _shared_noise(data, closure)])
-    return replace(data, covariance=data.covariance.plus(csr_array(noise)))
+    return csr_array(block_diag([diags_array(vis2), _shared_noise(data, closure)]))
 
 
 def _shared_noise(data: Observables, closure: FloatArray) -> csr_array:

@@ -196,10 +196,27 @@ class Likelihood(Shown):
 
     def slopes(self, theta: ArrayLike) -> FloatArray:
         """Derivatives of the model of the data at one parameter set, (n_data, n_dim)."""
+        return self._slopes(*self.model.gradient(self.samples, self._sets(theta)))[:, :, 0]
+
+    def _slopes(self, value: ComplexArray, slopes: ComplexArray) -> FloatArray:
+        """Derivatives of the data, (n_data, n_dim, n), from those of visibilities."""
+        n_dim, n_samples, n = slopes.shape
+        by_phase = (slopes / (value + NEVER_ZERO)).imag
+        by_vis2 = 2.0 * (slopes * value.conj()).real
+        flat = [x.transpose(1, 0, 2).reshape(n_samples, -1) for x in (by_vis2, by_phase)]
+        data = np.concatenate([self.samples.squares @ flat[0], self.samples.legs @ flat[1]])
+        return np.asarray(data.reshape(len(data), n_dim, n))
+
+    def residuals_and_slopes(self, theta: ArrayLike) -> FloatArray:
+        """Whitened residuals of parameter sets (n, n_dim), and derivatives of the whitened model.
+
+        (n_independent, 1 + n_dim, n), residuals first.
+        """
         value, slopes = self.model.gradient(self.samples, self._sets(theta))
-        by_phase = (slopes[:, :, 0] / (value[:, 0] + NEVER_ZERO)).imag.T
-        by_vis2 = 2.0 * (slopes[:, :, 0] * value[:, 0].conj()).real.T
-        return np.concatenate([self.samples.squares @ by_vis2, self.samples.legs @ by_phase])
+        left = self._difference(self.observe(value))[:, None]
+        both = np.concatenate([left, self._slopes(value, slopes)], axis=1)
+        white = self.noise.whiten(both.reshape(len(both), -1))
+        return np.asarray(white.reshape(-1, *both.shape[1:]))
 
     def jacobian(self, theta: ArrayLike) -> FloatArray:
         """Whitened derivatives of the model at one parameter set, (n_independent, n_dim)."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy import optimize
@@ -28,6 +29,7 @@ from amibayes.likelihood.extra_noise import (
     FileNoise,
     NoisePrior,
     _with_noise,
+    covariance_of,
     mean_of_files,
 )
 from amibayes.likelihood.likelihood import Likelihood
@@ -137,10 +139,12 @@ class _Kind:
         """The data with an amount of extra noise, channels independent."""
         if amount <= 0.0:
             return self.data
-        extra = (
-            ExtraNoise(vis2=amount) if self.kind == "vis2" else ExtraNoise(closure_phase_rad=amount)
-        )
-        return _with_noise(self.data, extra)
+        return _with_noise(self.data, self._extra(amount))
+
+    def _extra(self, amount: float) -> ExtraNoise:
+        if self.kind == "vis2":
+            return ExtraNoise(vis2=amount)
+        return ExtraNoise(closure_phase_rad=amount)
 
     @property
     def _own_floors(self) -> list[Systematics]:
@@ -172,11 +176,11 @@ class _Kind:
         typical = float(np.sqrt(np.median(self.data.covariance.variance)))
         largest = typical * np.sqrt(chi2 / dof)
 
+        fit = self._misfit(shared)
+
         def loss(log_sigma: float) -> float:
             sigma = float(np.exp(log_sigma))
-            noisy = self.covariance(sigma, shared)
-            fit = _chi2(noisy, self.residual) + self.share * noisy.logdet()
-            return fit + (sigma / width) ** 2
+            return fit(sigma) + (sigma / width) ** 2
 
         low, high = 1e-2 * typical, min(10.0 * largest, BOUND * width)
         if high <= low:  # the stated errors are beyond what the prior allows already
@@ -186,6 +190,27 @@ class _Kind:
             loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}
         )
         return float(np.exp(best.x))
+
+    def _misfit(self, shared: Correlation) -> Callable[[float], float]:
+        """−2 ln of the restricted likelihood of an amount of extra noise, but for a constant."""
+        if shared.value == 0.0 and not self.floors:
+            return self._misfit_of_independent
+        return partial(self._misfit_of_shared, shared)
+
+    def _misfit_of_shared(self, shared: Correlation, amount: float) -> float:
+        noisy = self.covariance(amount, shared)
+        return _chi2(noisy, self.residual) + self.share * noisy.logdet()
+
+    def _misfit_of_independent(self, amount: float) -> float:
+        size, along = self._spectrum
+        grown = 1.0 + amount**2 * size
+        return float((along**2 / grown).sum() + self.share * np.log(grown).sum())
+
+    @cached_property
+    def _spectrum(self) -> tuple[FloatArray, FloatArray]:
+        """Extra noise of unit amount against the stated errors: eigenvalues, residuals along."""
+        added = covariance_of(self.data, self._extra(1.0))
+        return self.data.covariance.against(added, self.residual)
 
     def correlation(self, amount: float) -> Correlation:
         """What channels share, given an amount of extra noise."""

@@ -8,6 +8,7 @@ place may move linearly.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -209,6 +210,28 @@ def fringes_into(
             c *= damping
             s *= damping
         cosine[rows], sine[rows] = c, s
+
+
+def fringes_of_one(samples: UVPoints, smearing: bool) -> Callable[[FloatArray, FloatArray], None]:
+    """Make what puts the fringes of one place (2,), mas, into an array (2 n_samples,).
+
+    Cosines, then sines, as `fringes_into` does for many: of one, with few samples, the time goes
+    into calls, of which here are a third as many.
+    """
+    turns = 2.0 * np.pi * MAS * np.column_stack([samples.u, samples.v])
+    half, n = 0.5 * samples.relative_band, len(samples)
+
+    def fill(out: FloatArray, place: FloatArray) -> None:
+        angle = turns @ place
+        np.cos(angle, out=out[:n])
+        np.sin(angle, out=out[n:])
+        if smearing:
+            size = np.maximum(np.abs(angle * half), 1e-8)  # where it is 1 to rounding
+            damping = np.sin(size) / size
+            out[:n] *= damping
+            out[n:] *= damping
+
+    return fill
 
 
 def _cosine_and_sine(half: FloatArray) -> tuple[FloatArray, FloatArray]:

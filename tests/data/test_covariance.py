@@ -161,6 +161,11 @@ def test_sum_with_a_sparse_covariance_and_selection_are_those_of_the_matrices(
     found = covariance.plus(csr_array(0.5 * added))
     np.testing.assert_allclose(found.dense(), dense + 0.5 * added, atol=1e-14)
     assert found.rank == covariance.rank == 3 * 3 + 8
+    y = rng.normal(size=20)
+    size, along = covariance.against(csr_array(added), y)
+    grown = 1.0 + 0.5 * size
+    assert (along**2 / grown).sum() == pytest.approx((found.whiten(y) ** 2).sum(), rel=1e-9)
+    assert np.log(grown).sum() == pytest.approx(found.logdet() - covariance.logdet(), rel=1e-9)
     keep = rng.permutation(20)[:13]
     chosen = covariance.select(keep)
     np.testing.assert_allclose(chosen.dense(), dense[np.ix_(keep, keep)], atol=1e-14)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 
-from amibayes.support.shared_results import SharedResults, shared, sharing
+from amibayes.support.shared_results import SharedResults, shared, shared_of_file, sharing
 
 
 class Maker:
@@ -71,6 +72,22 @@ def test_nothing_is_shared_outside_of_the_block() -> None:
     with sharing(SharedResults()):
         shared(make, 1)
     assert make.calls == 3
+
+
+def test_what_is_read_of_a_file_is_shared_by_its_bytes(tmp_path: Path) -> None:
+    file, other, make = tmp_path / "a.txt", tmp_path / "b.txt", Maker()
+    file.write_text("one")
+    other.write_text("one")
+    with sharing(SharedResults()):
+        for path in (file, file, other):  # messages name the file
+            shared_of_file(make, path, "reading")
+        assert make.calls == 2
+        file.write_text("two")
+        shared_of_file(make, file, "reading")
+        assert make.calls == 3
+        shared_of_file(make, tmp_path / "none", "reading")  # it has its own error to give
+        shared_of_file(make, tmp_path / "none", "reading")
+    assert make.calls == 5
 
 
 def test_threads_of_a_worker_share() -> None:
