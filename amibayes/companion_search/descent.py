@@ -12,9 +12,12 @@ from typing import Any
 import numpy as np
 
 from amibayes.companion_search.optimise import CONVERGED, widest_steps
-from amibayes.likelihood.likelihood import BATCH, Likelihood
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import Box, Parameters
 from amibayes.units import BoolArray, FloatArray, IntArray
+
+MAX_NUMBERS = 1_500_000
+"""Of derivatives of the data that are held at once: 12 MB."""
 
 MAX_STEPS = 30
 """Of a fit that only has to tell seeds apart: most arrive after six."""
@@ -52,7 +55,7 @@ def descend(
     chi2 : (n,) float array
     """
     size = len(likelihood.observables.data) * (1 + seeds.shape[1])
-    at_once = max(1, BATCH // size)
+    at_once = max(1, MAX_NUMBERS // size)
     parts = [seeds[k : k + at_once] for k in range(0, len(seeds), at_once)]
     found = [_together(likelihood, part, box) for part in parts]
     return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])

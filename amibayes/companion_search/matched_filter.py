@@ -70,8 +70,8 @@ def dense_filter(
         fill(fringes, place)
         product = factor @ waves
         kept, taken = product[1:last], product[last:]
-        square = float(kept @ kept)
-        sigma = float(floored(square, square + float(taken @ taken))) ** -0.5
+        square = kept @ kept
+        sigma = float(floored(square, square + taken @ taken)) ** -0.5
         return positive(float(product[0]) * sigma, sigma)
 
     return best
