@@ -32,6 +32,16 @@ def few(n_rows: int, n_samples: int) -> bool:
     return n_rows * (2 * n_samples + 1) <= MAX_NUMBERS
 
 
+Waves = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None]
+"""Puts cosine and sine (n_samples, m) of east and north (m,) into its first arguments."""
+
+
+def fill_one(waves_into: Waves, out: FloatArray, place: FloatArray) -> None:
+    """Put cosines, then sines of one place (2,) into one array (2 n_samples,)."""
+    n = len(out) // 2
+    waves_into(out[:n, None], out[n:, None], place[:1], place[1:])
+
+
 def dense_filter(
     even: Part,
     odd: Part,

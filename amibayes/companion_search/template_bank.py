@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -25,6 +26,7 @@ from amibayes.companion_search.matched_filter import (
     MatchedFilter,
     dense_filter,
     few,
+    fill_one,
     positive,
 )
 from amibayes.companion_search.reduction import Reduction, reduction_of
@@ -329,15 +331,10 @@ class TemplateBank:
         return cosine, sine
 
     def _one_wave(self) -> Callable[[FloatArray, FloatArray], None]:
-        """What `_waves_into` does, for one place (2,) and cosines and sines in one array."""
+        """What `_waves_into` does, for one place (2,), cosines and sines in one array."""
         if self._disc is None and self._samples.off_axis is None:
             return fringes_of_one(self._samples, self._smearing)
-        n = len(self._samples)
-
-        def fill(out: FloatArray, place: FloatArray) -> None:
-            self._waves_into(out[:n, None], out[n:, None], place[:1], place[1:])
-
-        return fill
+        return partial(fill_one, self._waves_into)
 
     def _waves_into(
         self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter, NullLocator, ScalarFormatter
 
-from amibayes.companion_search.residuals_by_file import FileResiduals
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Measurements
+from amibayes.detection.residuals_by_file import FileResiduals
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.plots.style import (
     BLACK,

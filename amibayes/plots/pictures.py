@@ -9,8 +9,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from amibayes.companion_search.field import resolution_mas
-from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.comparison.compare import ModelComparison
+from amibayes.detection.residuals_by_file import file_residuals
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.plots.calibration import calibrator_plot

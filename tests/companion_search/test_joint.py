@@ -15,7 +15,6 @@ from amibayes.calibration import calibrate
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import make_grid, trial_rates
 from amibayes.companion_search.optimise import fit_single, refine
-from amibayes.companion_search.residuals_by_file import file_residuals
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
 from amibayes.companion_search.template_bank import TemplateBank
@@ -24,6 +23,7 @@ from amibayes.data.covariance import dense_covariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.detection.residuals_by_file import file_residuals
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.statistic import make_statistic
 from amibayes.errors import DataError, UsageError
