@@ -2,8 +2,9 @@
 
 - quadrature: no companion; only nuisance parameters are integrated.
 - grid: one companion, by `grid_posterior`.
-- importance: draws from the modes' Gaussians with heavy tails, from the modes beside the
-  prior, and from the prior itself, weighted; unbiased, with its own error.
+- importance: draws from t distributions with the posterior's own mean and covariance at every
+  mode, from these beside the prior, and from the prior itself, weighted; unbiased, with its own
+  error.
 - laplace: a Gaussian at every mode; right for strong companions only.
 - nested: nested sampling with dynesty.
 
@@ -31,8 +32,9 @@ from amibayes.posterior.laplace import (
     sampled,
 )
 from amibayes.posterior.nuisance import log_evidence_none
+from amibayes.posterior.polynomial import Around
 from amibayes.posterior.priors import Prior, Range
-from amibayes.posterior.sampler import draw_posterior, log_mean
+from amibayes.posterior.sampler import ModelPrior, draw_posterior, log_mean
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import html_table
 from amibayes.support.options import SAMPLERS
@@ -41,7 +43,10 @@ from amibayes.units import FloatArray
 MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
 
-MIN_DRAWS, MAX_DRAWS = 10_000, 200_000
+MIN_DRAWS, MAX_DRAWS = 4000, 200_000
+
+WORTH = 0.05
+"""Share of the draws from which on a mode's own proposal is looked for."""
 
 DEFENSIVE = 0.2
 """Share of the draws that comes from the prior."""
@@ -232,10 +237,10 @@ def log_evidence_importance(
     rng : numpy.random.Generator
     """
     k = likelihood.model.companions
-    sources = [_Gaussians(likelihood, modes, prior, n_free=0)]
+    sources = [_Gaussians(likelihood, modes, prior, rng, n_free=0)]
     if k == 2:
         alone = likelihood.with_model(replace(likelihood.model, companions=1))
-        sources.append(_Gaussians(alone, one, prior, n_free=1))
+        sources.append(_Gaussians(alone, one, prior, rng, n_free=1))
     share = (1.0 - DEFENSIVE) / len(sources)
     wanted = MODEL_VALUES / len(likelihood.samples) / (1.0 - DEFENSIVE)
     n = int(np.clip(wanted, MIN_DRAWS, MAX_DRAWS))
@@ -254,13 +259,18 @@ def log_evidence_importance(
 
 
 class _Gaussians:
-    """Multivariate t distributions around modes, the last companion drawn from the prior.
+    """Multivariate t distributions of modes, the last companion drawn from the prior.
 
     With two companions the density is that of both orders, each with half the weight.
     """
 
     def __init__(
-        self, likelihood: Likelihood, modes: Sequence[Mode], prior: Prior, n_free: int
+        self,
+        likelihood: Likelihood,
+        modes: Sequence[Mode],
+        prior: Prior,
+        rng: np.random.Generator,
+        n_free: int,
     ) -> None:
         self.companions = likelihood.model.companions + n_free
         self.one = prior.parameters(1)
@@ -275,7 +285,14 @@ class _Gaussians:
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
         self.weight = weight / weight.sum()
-        self.mixture = [HeavyTailed(*fit) for fit in fits]
+        around = Around(
+            likelihood.log_prob_in_batches, ModelPrior(prior, likelihood.parameters), rng
+        )
+        # Laplace's covariance is of one noise and knows no tails: draws from it alone miss some.
+        self.mixture = [
+            (around.heavy_tailed(*fit) if share > WORTH else None) or HeavyTailed(*fit)
+            for fit, share in zip(fits, self.weight, strict=True)
+        ]
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         counts = rng.multinomial(n, self.weight)

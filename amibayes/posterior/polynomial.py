@@ -30,6 +30,9 @@ DRAWS_PER_TERM = 2.5
 FIRST_DRAWS = 40
 """Draws per parameter from which the posterior's own centre and covariance are estimated."""
 
+TAIL_DRAWS = 200
+"""Draws per parameter that make a proposal for evidences of it."""
+
 LEAST_EFFECTIVE = 4.0
 """Effective number of those draws per parameter, without which their weights are tempered."""
 
@@ -128,7 +131,7 @@ def polynomial_log_prob(
     PolynomialLogProb or None
         None where ln L is no polynomial: its errors at draws for comparison are too large.
     """
-    work = _Around(log_prob, prior, rng)
+    work = Around(log_prob, prior, rng)
     own = work.own(centre, scatter)
     if own is None:
         return None
@@ -156,8 +159,17 @@ def polynomial_log_prob(
 
 
 @dataclass(frozen=True, eq=False)
-class _Around:
-    """Draws around a mode, with ln L."""
+class Around:
+    """Draws around a mode, with ln L.
+
+    Parameters
+    ----------
+    log_prob : callable
+        ln L (n,) of parameter sets (n, n_dim).
+    prior : ModelPrior
+        Draws are made where it has density.
+    rng : numpy.random.Generator
+    """
 
     log_prob: LogProb
     prior: ModelPrior
@@ -171,12 +183,27 @@ class _Around:
             x = centre + z @ scatter.T
             log_weight = value + self.prior.prior.log_density(x) + 0.5 * (z * z).sum(1) / WIDER**2
             weight, power = tempered(log_weight, LEAST_EFFECTIVE * n_dim)
-            centre = np.asarray(weight @ x)
-            away = np.sqrt(weight)[:, None] * (x - centre)
-            scatter = np.asarray(np.linalg.cholesky(away.T @ away), dtype=float)
+            centre, scatter = _moments(x, weight)
             if power == 1.0:
                 return centre, scatter
         return None
+
+    def heavy_tailed(self, centre: FloatArray, scatter: FloatArray) -> HeavyTailed | None:
+        """A t distribution like the posterior around a mode, to draw from; None if not found.
+
+        Draws from a first one, of `own`, reach the tails that its few narrow draws did not.
+        """
+        own = self.own(centre, scatter)
+        if own is None:
+            return None
+        first, n_dim = HeavyTailed(*own), len(centre)
+        x = first.draw(self.rng, TAIL_DRAWS * n_dim)
+        log_prior = self.prior.prior.log_density(x)
+        x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
+        value = self.log_prob(physical(x, self.prior.parameters))
+        log_weight = value + log_prior - first.log_density(x)
+        weight, _ = tempered(log_weight, LEAST_EFFECTIVE * n_dim)
+        return HeavyTailed(*_moments(x, weight))
 
     def drawn(
         self, centre: FloatArray, scatter: FloatArray, wider: float, n: int, radius: float
@@ -187,6 +214,13 @@ class _Around:
         inside = np.isfinite(self.prior.prior.log_density(x)) & ((z * z).sum(axis=1) < radius**2)
         z, x = z[inside][:n], x[inside][:n]
         return z, self.log_prob(physical(x, self.prior.parameters))
+
+
+def _moments(x: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and scatter matrix of weighted draws (n, n_dim)."""
+    centre = np.asarray(weight @ x)
+    away = np.sqrt(weight)[:, None] * (x - centre)
+    return centre, np.asarray(np.linalg.cholesky(away.T @ away), dtype=float)
 
 
 def _fitted(z: FloatArray, value: FloatArray, radius: float, n_terms: int) -> FloatArray:

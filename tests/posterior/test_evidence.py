@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from scipy.stats import chi2
 
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
@@ -15,6 +16,7 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.posterior import evidence
 from amibayes.posterior.evidence import compare_models, log_evidence_importance
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.laplace import log_evidence_laplace
@@ -232,3 +234,27 @@ def test_nested_sampling_integrates_nuisance_parameters() -> None:
     assert nested.method == ("nested", "nested")
     assert agree((nested.log_z[1], nested.log_z_error[1]), (grid.log_z, 0.0))
     assert agree((nested.log_z[0], nested.log_z_error[0]), (grid.log_z_none, 0.0))
+
+
+def test_few_draws_of_importance_scatter_as_stated_about_the_grid(monkeypatch) -> None:
+    """An unresolved disc (ln L by its 4th power) with a prior of heavy tails: no Gaussian."""
+    model = BinaryModel(diameter_mas="free")
+    truth = [150.0, -80.0, 0.01, 8.0]
+    field = (120.0, 220.0)
+    data = simulated(niriss(), truth, np.random.default_rng(5), model)
+    result = search(Likelihood(data, model), field)
+    prior = default_prior(result.likelihood, *field)
+    expected = grid_posterior(result.likelihood, prior).log_z
+    monkeypatch.setattr(evidence, "MODEL_VALUES", 0.0)
+    found = np.array([
+        log_evidence_importance(
+            result.likelihood, result.modes, result.modes, prior, np.random.default_rng(seed)
+        )
+        for seed in range(10)
+    ])  # fmt: skip
+    assert found[:, 1].max() < 0.06
+    mean_error = np.sqrt((found[:, 1] ** 2).mean() / len(found))
+    assert abs(found[:, 0].mean() - expected) < 0.005 + 4.5 * mean_error
+    pulls = (found[:, 0] - found[:, 0].mean()) / found[:, 1]
+    low, high = chi2.ppf([5e-5, 1.0 - 5e-5], len(found) - 1)
+    assert low < pulls @ pulls < high
