@@ -285,9 +285,7 @@ class _Gaussians:
         # Weaker modes keep a share: their Gaussians may be too narrow.
         weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
         self.weight = weight / weight.sum()
-        around = Around(
-            likelihood.log_prob_in_batches, ModelPrior(prior, likelihood.parameters), rng
-        )
+        around = Around(likelihood.log_prob, ModelPrior(prior, likelihood.parameters), rng)
         # Laplace's covariance is of one noise and knows no tails: draws from it alone miss some.
         self.mixture = [
             (around.heavy_tailed(*fit) if share > WORTH else None) or HeavyTailed(*fit)
