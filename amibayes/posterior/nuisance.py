@@ -20,6 +20,10 @@ MIN_NODES, MAX_NODES = 10, 64
 """Nodes of one parameter: half of a Gaussian, at a bound of the prior, needs the fewest."""
 
 
+MAX_LAYOUTS, SAME_LOG_Z = 8, 0.002
+"""How often nodes are laid for the evidence of a star alone, until ln Z changes by less."""
+
+
 @dataclass(frozen=True, eq=False)
 class Nuisance:
     """Quadrature of the nuisance parameters.
@@ -114,7 +118,19 @@ def log_evidence_none(
     """
     alone = single_likelihood(likelihood)
     best = fit_single(likelihood)[0] if single is None else single
-    errors = alone.errors(best) if len(best) else np.empty((0, 0))
-    # Where a star alone does not fit, more noise than in the errors makes its tails long.
-    nodes = nuisance_nodes(prior, best[None], errors, 2.0 * NUISANCE_REACH)
-    return float(logsumexp(alone.log_prob(nodes.value) + nodes.log_weight))
+    if not len(best):
+        return float(alone.log_prob(best[None])[0])
+    centre, errors, found = best, alone.errors(best), np.inf
+    # Where a star alone does not fit, more noise than in the errors makes the posterior wider than
+    # they are, many times: nodes are laid again by its own mean and covariance.
+    for _ in range(MAX_LAYOUTS):
+        nodes = nuisance_nodes(prior, centre[None], errors, 2.0 * NUISANCE_REACH)
+        log = alone.log_prob(nodes.value) + nodes.log_weight
+        before, found = found, float(logsumexp(log))
+        if abs(found - before) < SAME_LOG_Z:
+            break
+        weight = np.exp(log - found)
+        centre = weight @ nodes.value
+        away = nodes.value - centre
+        errors = (weight[:, None] * away).T @ away
+    return found

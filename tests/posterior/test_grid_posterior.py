@@ -12,8 +12,10 @@ from helpers import niriss, simulated
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
+from amibayes.companion_search.search import search
+from amibayes.companion_search.with_extra_noise import noise_averaged
 from amibayes.errors import UsageError
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.binary import BinaryModel
 from amibayes.posterior.grid import GridPosterior, grid_posterior
@@ -250,3 +252,18 @@ def test_cells_have_the_width_of_their_shape(degrees: float) -> None:
         found = GridPosterior._along(one, *direction)
         width = float((found.high - found.low)[0])
         assert width / np.sqrt(12.0) == pytest.approx(drawn.std(), rel=0.03)
+
+
+def test_evidence_of_a_star_that_does_not_fit_has_its_tails() -> None:
+    """Extra noise, unknown, takes the place of the companion: the disc is then hardly known."""
+    model = BinaryModel(diameter_mas="free")
+    data = simulated(niriss(), [150.0, -80.0, 0.05, 20.0], np.random.default_rng(7), model)
+    result = search(Likelihood(data, model), FIELD)
+    likelihood = noise_averaged(result, None, data)[0].likelihood
+    prior = default_prior(likelihood, *FIELD)
+    alone, (one,) = single_likelihood(likelihood), prior.ranges
+    x = np.linspace(one.low, 150.0, 30_001)
+    log = alone.log_prob(x[:, None]) + one.log_density(x)
+    expected = log.max() + np.log(np.trapezoid(np.exp(log - log.max()), x))
+    assert alone.chi2(result.single_theta[None])[0] > 10.0 * likelihood.n_independent
+    assert log_evidence_none(likelihood, prior) == pytest.approx(expected, abs=0.005)
