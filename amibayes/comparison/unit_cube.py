@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from amibayes.comparison.hypotheses import Hypothesis, groups, periodic
-from amibayes.likelihood.likelihood import NEVER_ZERO, Likelihood
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.priors import Prior
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -134,16 +134,9 @@ class CubeModel:
 
     def linear(self, cube: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What models predict (n_data, n), and whitened derivatives (n, n_independent, n_dim)."""
-        likelihood, samples = self.likelihood, self.likelihood.samples
-        value, slopes = likelihood.model.gradient(samples, self.theta(cube))
-        d, m, n = slopes.shape
-        by_phase = (slopes / (value + NEVER_ZERO)).imag.transpose(1, 0, 2).reshape(m, d * n)
-        by_power = 2.0 * (slopes * value.conj()).real.transpose(1, 0, 2).reshape(m, d * n)
-        parts = [samples.squares @ by_power, samples.legs @ by_phase]
-        predicted = np.concatenate(
-            [samples.squares @ np.abs(value) ** 2, samples.legs @ np.angle(value)]
-        )
-        white = likelihood.noise.whiten(np.concatenate(parts)).reshape(-1, d, n)
+        predicted, slopes = self.likelihood.model_and_slopes(self.theta(cube))
+        white = self.likelihood.noise.whiten(slopes.reshape(len(slopes), -1))
+        white = white.reshape(-1, *slopes.shape[1:])
         return predicted, np.einsum("kdn,nde->nke", white, self._stretch(cube), optimize=True)
 
     def _stretch(self, cube: FloatArray) -> FloatArray:

@@ -196,25 +196,25 @@ class Likelihood(Shown):
 
     def slopes(self, theta: ArrayLike) -> FloatArray:
         """Derivatives of the model of the data at one parameter set, (n_data, n_dim)."""
-        return self._slopes(*self.model.gradient(self.samples, self._sets(theta)))[:, :, 0]
+        return self.model_and_slopes(theta)[1][:, :, 0]
 
-    def _slopes(self, value: ComplexArray, slopes: ComplexArray) -> FloatArray:
-        """Derivatives of the data, (n_data, n_dim, n), from those of visibilities."""
+    def model_and_slopes(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Model of the data (n_data, n), and its derivatives (n_data, n_dim, n)."""
+        value, slopes = self.model.gradient(self.samples, self._sets(theta))
         n_dim, n_samples, n = slopes.shape
         by_phase = (slopes / (value + NEVER_ZERO)).imag
         by_vis2 = 2.0 * (slopes * value.conj()).real
         flat = [x.transpose(1, 0, 2).reshape(n_samples, -1) for x in (by_vis2, by_phase)]
         data = np.concatenate([self.samples.squares @ flat[0], self.samples.legs @ flat[1]])
-        return np.asarray(data.reshape(len(data), n_dim, n))
+        return self.observe(value), data.reshape(len(data), n_dim, n)
 
     def residuals_and_slopes(self, theta: ArrayLike) -> FloatArray:
         """Whitened residuals of parameter sets (n, n_dim), and derivatives of the whitened model.
 
         (n_independent, 1 + n_dim, n), residuals first.
         """
-        value, slopes = self.model.gradient(self.samples, self._sets(theta))
-        left = self._difference(self.observe(value))[:, None]
-        both = np.concatenate([left, self._slopes(value, slopes)], axis=1)
+        model, slopes = self.model_and_slopes(theta)
+        both = np.concatenate([self._difference(model)[:, None], slopes], axis=1)
         white = self.noise.whiten(both.reshape(len(both), -1))
         return np.asarray(white.reshape(-1, *both.shape[1:]))
 
