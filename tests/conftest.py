@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 from hypothesis import settings
+from matplotlib.figure import Figure
+from PIL import Image
 from threadpoolctl import threadpool_limits
 
 from amibayes.oifits import write_oifits
@@ -142,16 +144,22 @@ PICTURED = ("plots", "report")
 
 
 @pytest.fixture(autouse=True)
-def _sketches(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are drawn small and without layout, two thirds of the time of a quick search."""
+def _unprinted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are composed, but neither laid out nor rendered: half of the time of a quick search.
+
+    That what is rendered is right is for the tests of `PICTURED` and those with `full_pictures`.
+    """
     if request.path.parent.name in PICTURED or "full_pictures" in request.fixturenames:
         return
-    monkeypatch.setattr("amibayes.plots.style.DPI", 40)
-    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", _no_layout)
+    monkeypatch.setattr("matplotlib.figure.Figure.get_layout_engine", lambda figure: None)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", _save_noise)
 
 
-def _no_layout(engine: object, figure: object) -> None:
-    """Leave the axes where they are."""
+def _save_noise(figure: Figure, path: str | Path, **options: object) -> None:
+    """Write a picture of some kilobytes, as large as one of the figure."""
+    size = (figure.get_size_inches() * 10.0).astype(int)
+    noise = np.random.default_rng(0).integers(0, 256, (*size[::-1],), dtype=np.uint8)
+    Image.fromarray(noise).save(path, format="png")
 
 
 @pytest.fixture(scope="session")

@@ -65,8 +65,8 @@ def test_whole_job(target: Path, calibrators: list[Path], tmp_path: Path, capsys
     assert (out / "report.html").stat().st_size > 1e5
     again = tmp_path / "again"
     calibrated = out / "calibrated.oifits"
-    assert run("search", calibrated, "--out", again, "--separation", "60:250", "--null-draws", "0",
-               "--no-posterior") == 0  # fmt: skip
+    assert run("search", calibrated, "--out", again, "--separation", "60:250", "--null-draws", 0,
+               "--no-posterior", "--no-limits", "--no-pictures") == 0  # fmt: skip
     second = json.loads((again / "result.json").read_text())
     assert second["fit"]["chi2_binary"] == pytest.approx(fit["chi2_binary"], rel=1e-10)
     assert second["significance"]["detected"] is None

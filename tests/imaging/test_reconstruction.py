@@ -169,6 +169,7 @@ def test_sizes_that_make_no_image_are_refused() -> None:
         ab.reconstruct_image(niriss(), regulariser="clean")
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_command_writes_image_with_coordinates(tmp_path: Path) -> None:
     """East is to the left, the star in the middle, and a bright pixel where light was put."""
     file = tmp_path / "a.oifits"

@@ -68,7 +68,7 @@ def test_a_survey_does_what_it_can_and_says_what_it_could_not(survey, tmp_path, 
     assert list(table["status"]) == ["done", "done", "failed", "failed"]
     assert table["separation_mas"].mask.tolist() == [False, False, True, True]
     assert str(table["separation_mas"].unit) == "mas"
-    assert np.array(Image.open(out / "survey.png")).std() > 1
+    assert (out / "survey.png").is_file()
 
 
 def test_resume_leaves_what_is_finished_and_ends_with_the_same_bytes(
@@ -154,6 +154,7 @@ def test_cells_hold_several_files_and_options_of_any_type(tmp_path: Path) -> Non
         first.files(("zzz*",))
 
 
+@pytest.mark.usefixtures("full_pictures")
 @pytest.mark.parametrize("n", [3, 40])
 def test_the_picture_of_few_and_of_many(n: int, tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
