@@ -65,10 +65,11 @@ def codes(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("kind", ["assumed", "given", "estimated"])
 @pytest.mark.parametrize("n", [3, 4, 7])
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 11), marks=pytest.mark.slow)])
 def test_no_alarm_on_our_own_files(
-    n: int, kind: str, rng: np.random.Generator, tmp_path: Path
+    n: int, kind: str, seeds: range, rng: np.random.Generator, tmp_path: Path
 ) -> None:
-    for seed in range(8):
+    for seed in seeds:
         made = star(rng, n=n, channels=1 + seed % 3, kind=kind, mjd=6e4 + seed / 7)
         path = tmp_path / "a.fits"
         write_oifits(path, made, overwrite=True)

@@ -102,8 +102,11 @@ def test_calibrated_files_are_judged_each_by_itself(rng) -> None:
 
 @pytest.mark.usefixtures("full_pictures")
 def test_legends_of_the_picture_cover_nothing_and_stay_on_the_page(rng) -> None:
-    data = [calibrator(rng, name=f"some/long_name_of_calibrator_{k}.fits") for k in range(3)]
-    vetting = vet(data, separation_mas=FIELD, null_draws=1500)
+    vetting = vet([calibrator(rng)], calibrated=True, separation_mas=FIELD, null_draws=1500)
+    (one,) = vetting.calibrators
+    names = [f"some/long_name_of_calibrator_{k}.fits" for k in range(3)]
+    alike = tuple(replace(one, path=name, agreement=0.1) for name in names)
+    vetting = replace(vetting, calibrators=alike)
     figure = vetting_picture(vetting)
     figure.draw_without_rendering()
     assert len(figure.legends) == 2

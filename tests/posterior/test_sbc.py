@@ -110,7 +110,9 @@ def test_chain_and_grid_are_one_posterior(contrast) -> None:
     assert (posterior.elsewhere < 1e-3) == (contrast > 0)
 
 
-@pytest.mark.parametrize("contrast_form", ["uniform", "log-uniform"])
+@pytest.mark.parametrize(
+    "contrast_form", ["log-uniform", pytest.param("uniform", marks=pytest.mark.slow)]
+)
 def test_chain_takes_the_prior_it_is_given(contrast_form) -> None:
     """On data that say nothing, the chain is the prior (distance as above)."""
     likelihood = Likelihood(niriss(vis2_error=1e3, closure_error_deg=1e4))
