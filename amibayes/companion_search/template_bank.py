@@ -279,9 +279,8 @@ class TemplateBank:
 
     def _rows(self, data: FloatArray | SingleArray) -> DataRows:
         """Data sets (n_data, n) as rows."""
-        every = np.ascontiguousarray(data.T)
-        parts = (np.ascontiguousarray(data[p.rows].T) for p in (self._even, self._odd))
-        return DataRows(every, *parts)
+        # Products take transposed matrices as they are.
+        return DataRows(data.T, data[self._even.rows].T, data[self._odd.rows].T)
 
     def pieces(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
         """Yield positions (2m,), rates (2m, 2) and their templates in all bands."""
