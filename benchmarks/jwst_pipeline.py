@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes import Observables, analytic_limit, calibrate, load_instrument
+from amibayes import Likelihood, Observables, analytic_limit, calibrate, load_instrument
 from amibayes.extraction.reading import ImageOptions, of_one_visit, read_observations
+from amibayes.models.binary import BinaryModel
 from amibayes.optics import PupilMap
 from amibayes.parallel import SerialExecutor
 from amibayes.scene.orientation import Orientation
@@ -169,10 +170,22 @@ def numbers(data: Observables) -> dict[str, list[float]]:
     }
 
 
+def misfit(data: Observables, truth: FloatArray) -> dict[str, float]:
+    """χ² of the truth for each independent number, of V² and of closure phases."""
+    point = BinaryModel(diameter_mas=0.0)
+    off, n = Likelihood(data, point).difference(truth[None])[:, 0], data.n_vis2
+    parts = {"vis2": off[:n], "cp": off[n:]}
+    noise = {kind: data.only((kind,)).covariance for kind in parts}
+    return {
+        f"chi2_{kind}": float((noise[kind].whiten(part) ** 2).sum() / noise[kind].rank)
+        for kind, part in parts.items()
+    }
+
+
 def measured(data: Observables, truth: FloatArray | None) -> dict[str, Any]:
     """Of a single star its numbers and limits; of a binary what is stated of its companion."""
     if truth is not None:
-        return errors_of(data, truth)
+        return {**errors_of(data, truth), **misfit(data, truth)}
     limit = analytic_limit(searched(data).noisy, "absil", separation_mas=LIMIT_MAS)
     return {**numbers(data), "limit_mag": limit.delta_mag.tolist()}
 

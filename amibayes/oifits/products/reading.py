@@ -11,6 +11,7 @@ import numpy as np
 
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
+from amibayes.oifits.products.fringe_fit import correlated
 from amibayes.oifits.products.integrations import averaged
 from amibayes.oifits.products.mask_map import map_of
 from amibayes.oifits.products.recognise import DATA_MODEL, Product, product_of
@@ -27,6 +28,8 @@ NO_MAP = (
     "does not tell with which map of the mask the pipeline fitted the fringes: position angles may "
     "be off by 0.4 deg, separations by 0.7 %"
 )
+
+CORRELATED = "errors correlated as a fit of the fringes makes them"
 
 USED = ("OI_VIS", "OI_Q4", "ASDF")
 """Tables that need not be said to be set aside: used for repairs, or derived from others."""
@@ -176,8 +179,10 @@ def _average(product: Product, options: dict[str, Any]) -> Observables:
     _refuse_without_errors(product)
     oifits, done = repaired(product)
     found = observables_of(oifits, **options)
-    count = product.n_integrations or None
-    return _noted(replace(found, n_integrations=count), [product], done, "")
+    found = replace(found, n_integrations=product.n_integrations or None)
+    if options.get("closure_covariance") == "diagonal":
+        return _noted(found, [product], done, "")
+    return _noted(correlated(found, product), [product], done, CORRELATED)
 
 
 def _refuse_without_errors(product: Product) -> None:
