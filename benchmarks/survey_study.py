@@ -7,6 +7,12 @@
     python -m benchmarks.survey_study cost --targets 40 | python docs/pages.py howto/survey.md \\
         "cost: benchmarks/survey_study.py"
 
+    python -m benchmarks.survey_study peer FOLDER | python docs/pages.py howto/survey.md \\
+        "peer: benchmarks/survey_study.py"
+    python -m benchmarks.survey_study ways FILE --targets 1000 --companions 50
+    python -m benchmarks.survey_study ways_table FILE | python docs/pages.py howto/survey.md \\
+        "ways: benchmarks/survey_study.py"
+
 `simulate` writes NIRISS files and their table, at the level of V² and closure phases. `study`
 searches whole surveys and adds a line of JSON for each to FILE, of which `table` counts false
 discoveries and covered frequencies. `cost` measures what a target costs and what a dask scheduler
@@ -48,6 +54,8 @@ from amibayes.oifits import write_oifits
 from amibayes.survey.completeness import DetectionProbability
 from amibayes.survey.false_alarms import false_alarms
 from amibayes.survey.rows import Outcome
+from benchmarks.peers import PEERS, measure, version_of
+from benchmarks.survey_ways import ways, ways_table
 
 FIELD = (70.0, 400.0)
 """Separations that are searched and that companions are drawn from, mas."""
@@ -351,6 +359,39 @@ PARTS: dict[str, tuple[str, tuple[str, ...]]] = {
 """What is measured: the table, and words of the command."""
 
 
+def peer(folder: Path, seed: int) -> str:
+    """Cost of one target's row of the table with virgil, and here; ``folder`` has its environment.
+
+    Its pipeline for binaries, from the file of V² and closure phases: null draws, posterior and
+    limits; here the command with all of its stages, and those of a survey's row.
+    """
+    virgil = next(one for one in PEERS if one.name == "virgil")
+    with tempfile.TemporaryDirectory() as made:
+        star = Path(made) / "star00000.oifits"
+        write(Path(made), simulated(1, 1, np.random.default_rng(seed)), np.random.default_rng(seed))
+        theirs = measure(virgil, folder, str(star), "pipeline", str(Path(made) / "v"))["whole"]
+        whole = _timed(["search", star, "--out", Path(made) / "a", "--quiet", *NARROW])[0]
+        bare = _timed(["search", star, "--out", Path(made) / "b", "--quiet", *BARE])[0]
+    return "\n".join(
+        [
+            "| one NIRISS target alone, with the start of the program | CPU |",
+            "|---|---|",
+            f"| virgil {version_of(virgil, folder)}, `virgil-pipeline binary` | {theirs:.0f} s |",
+            f"| amibayes, search to posterior, limits and pictures | {whole:.0f} s |",
+            f"| amibayes, search and significance | {bare:.1f} s |",
+        ]
+    )
+
+
+def _ways(path: Path, targets: int, companions: int, seed: int) -> None:
+    """One survey in every way of `WAYS`, in a folder beside a file of what came of it."""
+    folder, rng = path.with_suffix(f".{targets}"), np.random.default_rng(seed)
+    table = folder / "targets.ecsv"
+    if not table.exists():
+        write(folder, simulated(targets, companions, rng), rng)
+    ways(table, folder, targets, path, BARE)
+
+
 def _nothing(piece: Any) -> Any:
     return piece[1]
 
@@ -395,7 +436,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("part", choices=("simulate", "study", "table", "cost"))
+    parser.add_argument(
+        "part", choices=("simulate", "study", "table", "cost", "peer", "ways", "ways_table")
+    )
     parser.add_argument("path", nargs="?", type=Path)
     parser.add_argument("--targets", type=int, default=24)
     parser.add_argument("--companions", type=int, default=5)
@@ -412,6 +455,12 @@ def main() -> None:
         study(arguments.path, *numbers, arguments.spread, limits=arguments.limits)
     elif arguments.part == "table":
         print("\n".join(tables(arguments.path)))
+    elif arguments.part == "peer":
+        print(peer(arguments.path, arguments.seed))
+    elif arguments.part == "ways":
+        _ways(arguments.path, arguments.targets, arguments.companions, arguments.seed)
+    elif arguments.part == "ways_table":
+        print("\n".join(ways_table(arguments.path)))
     else:
         rng = np.random.default_rng(arguments.seed)
         write(arguments.path, simulated(arguments.targets, arguments.companions, rng), rng)

@@ -73,6 +73,16 @@ TEXTS = {
 }
 
 
+NO_LIMITS = {
+    "survey.png": (
+        "Companions",
+        "Separation and magnitude difference of the companions that are detected; detection limits "
+        "were not asked for.",
+    ),
+}
+"""Of surveys without limits."""
+
+
 @dataclass(frozen=True)
 class _Cell:
     text: str
@@ -122,7 +132,8 @@ def write_survey_page(path: Path, content: Json, pictures: Sequence[str], link: 
     link : str
         File of a target's folder that its name leads to.
     """
-    figures = {name: read_png(path.parent / name, *TEXTS[name]) for name in pictures}
+    texts = TEXTS if _has_limits(content) else TEXTS | NO_LIMITS
+    figures = {name: read_png(path.parent / name, *texts[name]) for name in pictures}
     page = Page(
         command=f"amibayes {content['command']} --batch",
         title=f"Survey of {content['n_targets']} targets",
@@ -147,11 +158,12 @@ def _statement(content: Json) -> Statement:
     head = f"{n or 'None'} of {alarms['n_tested']} targets {'is' if n < 2 else 'are'} listed"
     head += f" as {'a companion' if n < 2 else 'companions'} at a false-discovery rate of {level:g}"
     sentences = (
-        f"Single targets: {alarms['n_detected']} detected at their own α, where noise alone "
-        f"gives {alarms['expected_false_detections']:.2g} on average.",
-        f"The smallest probability, {alarms['smallest_probability']:.2g}, or a smaller one comes "
-        f"up anywhere in a survey of noise with probability "
-        f"{alarms['survey_wide_probability']:.2g}.",
+        f"Taken one by one, {alarms['n_detected']} targets have a companion detected (false-alarm "
+        f"probability up to their α); {alarms['expected_false_detections']:.2g} such detections "
+        "are expected of noise.",
+        f"The smallest false-alarm probability is {alarms['smallest_probability']:.2g}. Were none "
+        f"of the {alarms['n_tested']} stars to have a companion, one as small or smaller would "
+        f"turn up with probability {alarms['survey_wide_probability']:.2g}.",
         *_uniformity(alarms),
         *_failed(content),
     )
@@ -162,11 +174,11 @@ def _uniformity(alarms: Json) -> list[str]:
     uniform = alarms["uniformity"]
     if uniform is None:
         return []
-    agree = "agree with" if uniform["p"] > 0.01 else "DISAGREE with"
-    return [
-        f"The {uniform['n']} probabilities above {uniform['above']:g} {agree} uniform ones, as of "
-        f"noise (Kolmogorov–Smirnov p = {uniform['p']:.2g})."
-    ]
+    told = f"The {uniform['n']} false-alarm probabilities above {uniform['above']:g} are "
+    test = f"(Kolmogorov–Smirnov p = {uniform['p']:.2g})"
+    if uniform["p"] > 0.01:
+        return [f"{told}uniform, as those of stars without companions should be {test}."]
+    return [f"{told}NOT uniform {test}: errors of many targets are wrong."]
 
 
 def _failed(content: Json) -> tuple[str, ...]:
@@ -179,7 +191,11 @@ def _facts(content: Json) -> tuple[Fact, ...]:
     if alarms := content.get("false_alarms"):
         facts += [
             Fact("Listed companions", str(len(alarms["discovered"])), "by false-discovery rate"),
-            Fact("Survey-wide false alarm", f"{alarms['survey_wide_probability']:.2g}"),
+            Fact(
+                "Survey-wide false alarm",
+                f"{alarms['survey_wide_probability']:.2g}",
+                "chance of one as good anywhere, of noise",
+            ),
         ]
     if frequency := content.get("companion_frequency"):
         low, high = frequency["interval_68"]
@@ -197,7 +213,7 @@ def _facts(content: Json) -> tuple[Fact, ...]:
 def _sections(content: Json, figures: dict[str, Figure]) -> tuple[Section, ...]:
     parts: tuple[tuple[str, tuple[str, ...], Callable[[Json], tuple[str, ...]]], ...] = (
         ("False alarms", ("survey_false_alarms.png",), _alarm_text),
-        ("Limits", ("survey.png",), lambda _: ()),
+        ("Limits" if _has_limits(content) else "Companions", ("survey.png",), lambda _: ()),
         (
             "Completeness",
             ("survey_completeness.png", "survey_completeness_au.png"),
@@ -214,12 +230,18 @@ def _sections(content: Json, figures: dict[str, Figure]) -> tuple[Section, ...]:
     )
 
 
+def _has_limits(content: Json) -> bool:
+    return any(entry.get("limits") for entry in content["targets"])
+
+
 def _alarm_text(content: Json) -> tuple[str, ...]:
     alarms = content["false_alarms"]
     return (
-        "Benjamini and Hochberg's rate is the share of noise among the listed companions, on "
-        f"average. A single companion among {alarms['n_tested']} targets can be listed with "
-        f"{alarms['null_draws_needed']} null searches for each target or more.",
+        "The false-discovery rate is the share of the listed companions that is noise, on "
+        "average (Benjamini and Hochberg). A probability is counted from null searches, and is "
+        "1 over their number at least: to list a companion that is alone among "
+        f"{alarms['n_tested']} targets takes {alarms['null_draws_needed']} for each target "
+        "(--null-draws).",
     )
 
 

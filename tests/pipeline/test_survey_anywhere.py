@@ -139,6 +139,16 @@ def test_killed_twice_and_resumed(survey: Path, tmp_path: Path, workers: int) ->
     same(survey, out)
 
 
+def test_a_target_killed_when_it_was_done_leaves_nothing(survey: Path, tmp_path: Path) -> None:
+    """Between its result and the end of its journal."""
+    out = tmp_path / "out"
+    shutil.copytree(survey / "serial", out)
+    (out / "s2" / "search.journal" / "digest").mkdir(parents=True)
+    words = ("--batch", survey / "targets.ecsv", *WORDS, "--out", out, "--resume")
+    assert run("search", *words) == 4
+    same(survey, out)
+
+
 def test_interrupt_says_what_is_kept(survey: Path, tmp_path: Path) -> None:
     out, many = tmp_path / "out", 60  # more than are done before the signal comes
     names = {"target": ["s0.oifits"] * many, "name": [f"t{k}" for k in range(many)]}

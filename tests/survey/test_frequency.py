@@ -9,6 +9,8 @@ from scipy import integrate, stats
 from amibayes.errors import UsageError
 from amibayes.survey.completeness import Crossings, DetectionProbability
 from amibayes.survey.frequency import Box, frequency_posterior
+from amibayes.survey.rows import Outcome
+from amibayes.survey.together import statistics, suggested_box
 from amibayes.units import delta_mag_to_contrast
 
 
@@ -56,6 +58,63 @@ def test_intervals_cover_the_frequency_that_was_simulated(truth: float) -> None:
     for level, count in inside.items():
         error = np.sqrt(level * (1 - level) / surveys)
         assert abs(count / surveys - level) < 4 * error + 0.05
+
+
+FIELD, FAINTEST, ALPHA = (70.0, 400.0), 9.0, 0.005
+
+
+def drawn_survey(rng: np.random.Generator, n: int) -> tuple[float, dict]:
+    """The true share in the survey's box, and what the survey says: no search, but its limits.
+
+    The share is drawn from the prior; companions in the box are uniform in ln separation and
+    magnitude, found with each star's own completeness; of the other stars some have fainter
+    ones, which may be found and do not count, and some raise a false alarm.
+    """
+    rings, outcomes = np.geomspace(*FIELD, 6), []
+    for k in range(n):
+        half = 5.5 + rng.normal(0.0, 0.6) + 0.4 * np.sin(np.arange(6))
+        middles = np.log(delta_mag_to_contrast(half)).tolist()
+        target = DetectionProbability(rings, tuple(Crossings(m, 4.0) for m in middles))
+        row = {"alpha": ALPHA, "limit_delta_mag_best": float(half.max())}
+        outcomes.append(Outcome(f"t{k}", "done", row=row, detection=target))
+    box = suggested_box(outcomes)
+    truth = drawn_share(rng, np.array([box.completeness(o.detection) for o in outcomes]))
+    for outcome in outcomes:
+        inside = rng.uniform() < truth
+        mags = box.delta_mag if inside else (box.delta_mag[1], FAINTEST)
+        rho, mag = np.exp(rng.uniform(*np.log(box.separation_mas))), rng.uniform(*mags)
+        seen = outcome.detection.at(np.array([rho]), delta_mag_to_contrast(np.array([[mag]])))
+        hit = (inside or rng.uniform() < 0.2) and rng.uniform() < seen[0, 0]
+        if not inside and rng.uniform() < ALPHA:
+            hit, mag = True, rng.uniform(*box.delta_mag)
+        outcome.row.update(detected=bool(hit), separation_mas=float(rho), delta_mag=float(mag))
+    return truth, statistics(outcomes)[1]["companion_frequency"]
+
+
+def drawn_share(rng: np.random.Generator, p: np.ndarray) -> float:
+    """From Jeffreys' prior, the root of the Fisher information."""
+    theta = (np.arange(2000) + 0.5) * np.pi / 4000.0
+    f = np.sin(theta)[:, None] ** 2
+    q = f * p + (1.0 - f) * ALPHA
+    prior = np.sqrt(((p - ALPHA) ** 2 / (q * (1.0 - q))).sum(axis=1)) * np.sin(2.0 * theta)
+    return float(rng.choice(f[:, 0], p=prior / prior.sum()))
+
+
+@pytest.mark.slow
+def test_whole_surveys_cover_the_frequency_of_their_box() -> None:
+    """Over shares of the prior the levels are those of a posterior: exact."""
+    rng, surveys = np.random.default_rng(8), 2000
+    inside, ranks = np.zeros(2), []
+    for _ in range(surveys):
+        truth, told = drawn_survey(rng, 12)
+        edges = told["interval_68"], told["interval_95"]
+        inside += [low <= truth <= high for low, high in edges]
+        ranks.append(truth < told["median"])
+    levels = np.array([0.68, 0.95])
+    assert (
+        np.abs(inside / surveys - levels) < 4.0 * np.sqrt(levels * (1 - levels) / surveys)
+    ).all()
+    assert abs(np.mean(ranks) - 0.5) < 4.0 * 0.5 / np.sqrt(surveys)
 
 
 def test_the_completeness_of_a_box_is_that_of_drawn_companions() -> None:

@@ -6,6 +6,7 @@ import argparse
 import copy
 import importlib
 import logging
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -126,6 +127,10 @@ class Job:
         """File of the result, which is written last."""
         assert self.arguments is not None
         return Path(self.arguments.out) / str(self.command.RESULT)
+
+    def tidy(self) -> None:
+        """Remove the stages of a target that is done, killed before it could do so itself."""
+        shutil.rmtree(self.result.parent / self.command.JOURNAL, ignore_errors=True)
 
     def request(self) -> str:
         """Digest of the options and of the files' content; empty where a file is missing."""
@@ -372,7 +377,9 @@ def _one(job: Job) -> Outcome:
         return Outcome(job.name, "failed", job.error, facts=job.facts)
     key = job.request()
     content = answers(job.result, key) if job.arguments.resume else None
-    if content is None:
+    if content is not None:
+        job.tidy()
+    else:
         fault = _performed(job)
         if fault:
             return Outcome(job.name, "failed", fault, key, facts=job.facts, chosen=job.chosen)
