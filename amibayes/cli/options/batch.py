@@ -6,7 +6,6 @@ import argparse
 import copy
 import importlib
 import logging
-import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -14,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from amibayes.cli.options import common
@@ -32,7 +32,6 @@ NOT_OF_A_ROW = {
 """Options of the whole run, which no row can set for itself."""
 
 SOME_FAILED = 4
-
 TASKS = 10_000
 """A table of more targets than twice that is handed out several targets at a time: a scheduler does
 some hundred tasks in a second, and a thousand workers would wait for it."""
@@ -127,10 +126,6 @@ class Job:
         """File of the result, which is written last."""
         assert self.arguments is not None
         return Path(self.arguments.out) / str(self.command.RESULT)
-
-    def tidy(self) -> None:
-        """Remove the stages of a target that is done, killed before it could do so itself."""
-        shutil.rmtree(self.result.parent / self.command.JOURNAL, ignore_errors=True)
 
     def request(self) -> str:
         """Digest of the options and of the files' content; empty where a file is missing."""
@@ -377,13 +372,11 @@ def _one(job: Job) -> Outcome:
         return Outcome(job.name, "failed", job.error, facts=job.facts)
     key = job.request()
     content = answers(job.result, key) if job.arguments.resume else None
-    if content is not None:
-        job.tidy()
-    else:
-        fault = _performed(job)
-        if fault:
-            return Outcome(job.name, "failed", fault, key, facts=job.facts, chosen=job.chosen)
-        content = read_answer(job.result) or {}
+    if content is None and (fault := _performed(job)):
+        return Outcome(job.name, "failed", fault, key, facts=job.facts, chosen=job.chosen)
+    # Killed just after its result, it has a journal still.
+    rmtree(job.result.parent / job.command.JOURNAL, ignore_errors=True)
+    content = content or read_answer(job.result) or {}
     row, detection = row_of(content), detection_of(content)
     return Outcome(job.name, "done", "", key, row, job.facts, detection, job.chosen)
 
