@@ -253,7 +253,7 @@ def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> N
     ("field", "said"),
     [
         ("700:1500", "nearer the star, a companion fits as well or better"),
-        ("250:400", "nearer the star"),
+        pytest.param("250:400", "nearer the star", marks=pytest.mark.slow),
         ("60:100", "on the edge of the field that was asked for"),
         ("50:400", None),
     ],

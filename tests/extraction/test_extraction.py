@@ -228,7 +228,9 @@ def test_wrong_pixel_scale_and_rotation_are_found_and_do_no_harm(
         assert rms(wrong - 1.0) > 3.0 * rms(vis2 - 1.0)
 
 
-@pytest.mark.parametrize(("name", "most"), [("F480M", 0.005), ("F277W", 0.03)])
+@pytest.mark.parametrize(
+    ("name", "most"), [("F480M", 0.005), pytest.param("F277W", 0.03, marks=pytest.mark.slow)]
+)
 def test_slopes_of_the_geometry_are_those_of_the_fringe_model(name: str, most: float) -> None:
     instrument = load_instrument("niriss", filter=name)
     channels = instrument.bandpass.channels()

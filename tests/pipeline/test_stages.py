@@ -107,7 +107,13 @@ def numbers(report: SearchReport) -> dict[str, object]:
     return content
 
 
-@pytest.mark.parametrize("after", range(1, len(STAGES)))
+@pytest.mark.parametrize(
+    "after",
+    [
+        pytest.param(k, marks=() if k in (1, len(STAGES) - 1) else pytest.mark.slow)
+        for k in range(1, len(STAGES))
+    ],
+)
 def test_a_run_goes_on_behind_every_finished_stage(target, tmp_path, monkeypatch, after) -> None:
     """Cut off before a stage, it does none again of those before, with the same numbers."""
     options = replace(QUICK, null_draws=4000, limits=after == len(STAGES) - 1)
