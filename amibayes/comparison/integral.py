@@ -48,9 +48,10 @@ class Effort:
 
 def log_z_laplace(model: CubeModel, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> float:
     """ln Z of a Gaussian at the best fit, half of it in every dimension that is at an edge."""
-    best = cube[int(np.argmin(chi2))]
+    first = int(np.argmin(chi2))
+    best = cube[first]
     edges = ((best <= 0.0) | (best >= 1.0)) & ~model.turning
-    triangle = laplace_shapes(model, best[None])[0]
+    triangle = laplace_shapes(model, best[None], model.inflation(chi2[[first]]))[0]
     volume = np.log(np.diag(triangle)).sum() + 0.5 * len(best) * np.log(2.0 * np.pi)
     at_best = model.log_prob(best[None], data)[0]
     return float(at_best + min(volume - np.log(2.0) * edges.sum(), 0.0))
@@ -94,12 +95,13 @@ def integrate(
     def log_prob(points: FloatArray) -> FloatArray:
         return model.log_prob(points, data)[:, None]
 
-    mixture = first_mixture(model, cube[None], chi2[None], effort.centres)
+    mixture = first = first_mixture(model, cube[None], chi2[None], effort.centres)
     for _ in range(effort.rounds):
-        drawn = weighted(mixture, known, at_prior, log_prob, effort.modes // 2, rng)
+        drawn = weighted(mixture.beside(first), known, at_prior, log_prob, effort.modes // 2, rng)
         mixture = mixture.adapted(drawn)
     for k in range(1 + effort.repeats):
-        drawn = weighted(mixture, known, at_prior, log_prob, effort.modes * 2**k, rng)
+        n = effort.modes * 2**k
+        drawn = weighted(mixture.beside(first), known, at_prior, log_prob, n, rng)
         (log_z,), (error,) = drawn.log_z
         if error < GOOD_ERROR:
             break

@@ -33,6 +33,9 @@ MODE_LIMIT = 30.0
 LEAST_SHARE = 0.02
 """Every t distribution keeps so much of the draws."""
 
+KEPT = 0.2
+"""Share of the draws that always come from around the best fits."""
+
 ENOUGH, LEAST_POWER = 12.0, 0.02
 """Draws that count in a fit of the mixture, in each dimension, and the least power of weights."""
 
@@ -121,6 +124,18 @@ class Mixture:
             out[k] = norm - log_volume - 0.5 * (TAILS + d) * np.log1p(size / TAILS)
         return out + np.log(self.share)[:, None]
 
+    def beside(self, first: Mixture) -> Mixture:
+        """The distributions of this mixture, and those of the first one with `KEPT` of the draws.
+
+        Weights of few draws are tempered, and a mixture fitted to them may leave a narrow mode.
+        """
+        share = np.concatenate([(1.0 - KEPT) * self.share, KEPT * first.share])
+        centre, scatter = (
+            np.concatenate([getattr(m, name) for m in (self, first)])
+            for name in ("centre", "scatter")
+        )
+        return Mixture(self.model, centre, scatter, share)
+
     def adapted(self, drawn: WeightedDraws) -> Mixture:
         """Fit to the mean of the data sets' posteriors: one step of expectation, maximisation."""
         cube, least = drawn.cube, ENOUGH * self.model.n_dim
@@ -152,7 +167,11 @@ def first_mixture(model: CubeModel, cube: FloatArray, chi2: FloatArray, most: in
         Fits of each data set; the best of each come first.
     most : int
     """
-    merit = (chi2 - chi2.min(axis=1, keepdims=True)).ravel()
+    best = chi2.min(axis=1, keepdims=True)
+    # With more noise other fits are as good, and all of them less well known.
+    scale = model.inflation(best)
+    merit = ((chi2 - best) / scale).ravel()
+    inflation = np.broadcast_to(scale, chi2.shape).ravel()
     fits = cube.reshape(-1, model.n_dim)
     order = np.argsort(merit, kind="stable")
     kept: list[int] = []
@@ -162,7 +181,7 @@ def first_mixture(model: CubeModel, cube: FloatArray, chi2: FloatArray, most: in
         if not kept or np.abs(model.apart(fits[i], fits[kept])).max(axis=1).min() >= SAME:
             kept.append(int(i))
     centre, worth = fits[kept], np.exp(-0.25 * merit[kept])
-    shapes = laplace_shapes(model, centre)
+    shapes = laplace_shapes(model, centre, inflation[kept])
     chosen: list[int] = []
     belongs = np.full(len(centre), -1)
     for i in range(len(centre)):
@@ -231,18 +250,22 @@ def off_edges(model: CubeModel, centre: FloatArray, shapes: FloatArray) -> Float
     return np.where(model.turning, found, np.clip(found, 0.0, 1.0))
 
 
-def laplace_shapes(model: CubeModel, centre: FloatArray) -> FloatArray:
-    """Lower triangles (k, n_dim, n_dim) of the covariances of fits (k, n_dim)."""
+def laplace_shapes(model: CubeModel, centre: FloatArray, inflation: FloatArray) -> FloatArray:
+    """Lower triangles (k, n_dim, n_dim) of the covariances of fits (k, n_dim).
+
+    Variances of the data are ``inflation`` (k,) times those that are stated.
+    """
     scatter = []
-    for part, reach in zip(model.linear(centre)[1], _reach(model, centre), strict=True):
-        precision = part.T @ part + UNIFORM_PRECISION * np.eye(model.n_dim)
+    reaches = _reach(model, centre, inflation)
+    for part, reach, scale in zip(model.linear(centre)[1], reaches, inflation, strict=True):
+        precision = part.T @ part / scale + UNIFORM_PRECISION * np.eye(model.n_dim)
         bent = np.diag(precision) < 0.1 / reach**2
         precision[bent, bent] = 1.0 / reach[bent] ** 2
         scatter.append(_cholesky(np.linalg.inv(precision)))
     return np.array(scatter)
 
 
-def _reach(model: CubeModel, centre: FloatArray) -> FloatArray:
+def _reach(model: CubeModel, centre: FloatArray, inflation: FloatArray) -> FloatArray:
     """How far from points (k, n_dim) each dimension alone changes the data by 1σ, (k, n_dim).
 
     At an edge, as of a ring without width, the data do not move to first order: their slopes
@@ -255,5 +278,5 @@ def _reach(model: CubeModel, centre: FloatArray) -> FloatArray:
     change = model.predict(model.inside(trial.reshape(-1, d))) - there
     white = model.likelihood.noise.whiten(model.likelihood.wrapped(change))
     size = (white**2).sum(axis=0).reshape(inside.shape)
-    seen = np.where(inside & (size < 1.0), np.abs(step), REACHES[-1])
+    seen = np.where(inside & (size < inflation[:, None, None]), np.abs(step), REACHES[-1])
     return np.asarray(seen.max(axis=2))

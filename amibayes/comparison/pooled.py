@@ -75,8 +75,9 @@ def pooled_evidences(
     def log_prob(points: FloatArray) -> FloatArray:
         return model.log_prob_of_many(model.predict(points), data, best)
 
-    mixture = first_mixture(model, cube, chi2, effort.centres)
+    mixture = first = first_mixture(model, cube, chi2, effort.centres)
     for _ in range(effort.rounds):
         few = int(PER_ROUND * effort.draws)
-        mixture = mixture.adapted(weighted(mixture, prior, at_prior, log_prob, few, rng))
-    return weighted(mixture, prior, at_prior, log_prob, effort.draws, rng).log_z
+        drawn = weighted(mixture.beside(first), prior, at_prior, log_prob, few, rng)
+        mixture = mixture.adapted(drawn)
+    return weighted(mixture.beside(first), prior, at_prior, log_prob, effort.draws, rng).log_z

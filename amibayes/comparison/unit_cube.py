@@ -100,16 +100,22 @@ class CubeModel:
         Where ln L is below that of a best fit, of χ² (m,), by more than `FAR`, it is −∞: which
         pairs these are is seen in one product of matrices of whitened data.
         """
-        noise = self.likelihood.noise
-        # Where even the best fit is bad, noise of unknown amount makes up for it: what counts as
-        # far away goes with that.
-        scale = np.maximum(1.0, best / noise.n_independent)
-        seen = self._near(predicted, data, best + scale * noise.delta_chi2(np.full(1, FAR)))
+        far = self.likelihood.noise.delta_chi2(np.full(1, FAR))
+        seen = self._near(predicted, data, best + self.inflation(best) * far)
         out = np.full(seen.shape, -np.inf)
         for k, one in enumerate(data.T):
             if seen[:, k].any():
                 out[seen[:, k], k] = self.log_prob_of(predicted[:, seen[:, k]], one)
         return out
+
+    def inflation(self, chi2: FloatArray) -> FloatArray:
+        """Variance of the noise at fits of some χ², in units of that they are whitened by.
+
+        Where even the best fit is bad, noise of unknown amount makes up for it.
+        """
+        noise = self.likelihood.noise
+        ratio = np.maximum(chi2 / noise.n_independent, 1.0)
+        return ratio if noise.parameters else np.ones_like(ratio)
 
     def _near(self, predicted: FloatArray, data: FloatArray, limit: FloatArray) -> BoolArray:
         """Which pairs of a model (n) and a data set (m) have a χ² below the limits (m,)."""
