@@ -122,11 +122,29 @@ class _Quadratic:
     def step(self, damping: FloatArray, widest: FloatArray, held: BoolArray) -> FloatArray:
         """Damped step (n, n_dim); parameters that are held stay."""
         diagonal = np.maximum(np.einsum("npp->np", self.curvature), widest**-2.0)
-        matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, self.curvature)
-        each = np.arange(len(widest))
-        matrix[:, each, each] += np.where(held, 1.0, damping[:, None] * diagonal)
-        slope = np.where(held, 0.0, self.slope)
-        return np.asarray(np.linalg.solve(matrix, slope[:, :, None])[:, :, 0])
+        return damped_steps(self.curvature, self.slope, damping[:, None] * diagonal, held)
+
+
+def damped_steps(
+    curvature: FloatArray, slope: FloatArray, damping: FloatArray, held: BoolArray
+) -> FloatArray:
+    """Marquardt's steps, (n, n_dim).
+
+    Parameters
+    ----------
+    curvature : (n, n_dim, n_dim) float array
+    slope : (n, n_dim) float array
+        Downward.
+    damping : (n, n_dim) float array
+        Added to the diagonal of the curvature.
+    held : (n, n_dim) bool array
+        Parameters that stay.
+    """
+    matrix = np.where(held[:, :, None] | held[:, None, :], 0.0, curvature)
+    each = np.arange(slope.shape[1])
+    matrix[:, each, each] += np.where(held, 1.0, damping)
+    downward = np.where(held, 0.0, slope)
+    return np.asarray(np.linalg.solve(matrix, downward[:, :, None])[:, :, 0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
+from amibayes.companion_search.descent import damped_steps
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.units import FloatArray, IntArray
 
@@ -97,13 +98,10 @@ def _steps(
     """Damped steps (n, n_dim); what stands at an edge and is pulled outward stays there."""
     held = ((cube <= 0.0) & (pull < 0.0)) | ((cube >= 1.0) & (pull > 0.0))
     held &= ~model.turning
-    free = ~held
-    normal = normal * free[:, :, None] * free[:, None, :]
-    diagonal = np.einsum("ndd->nd", normal)
+    diagonal = np.where(held, 0.0, np.einsum("ndd->nd", normal))
     # A dimension that the data do not feel gets the scale of the others: it stays.
     scale = np.maximum(diagonal, 1e-9 * diagonal.max(axis=1, keepdims=True) + 1e-12)
-    system = normal + np.eye(cube.shape[1]) * (damping[:, None] * scale + held)[:, None, :]
-    step = np.linalg.solve(system, (pull * free)[:, :, None])[:, :, 0]
+    step = damped_steps(normal, pull, damping[:, None] * scale, held)
     longest = np.abs(step).max(axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, LONGEST / np.maximum(longest, 1e-300)))
 

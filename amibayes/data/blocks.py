@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -121,7 +121,12 @@ class Stack:
             basis, upper = np.linalg.qr(f[:, :, None] * self.basis)
             # Signs as those of `orthonormal`, which do not depend on rounding.
             basis = basis * np.sign(np.einsum("grr->gr", upper))[:, None]
-        return Stack(self.index, f[:, :, None] * self.matrix * f[:, None], basis)
+        return replace(self.stretched(factors), basis=basis)
+
+    def stretched(self, factors: FloatArray) -> Stack:
+        """Blocks of errors that are multiplied by numbers (size,), the data as they are."""
+        f = factors[self.index]
+        return replace(self, matrix=f[:, :, None] * self.matrix * f[:, None])
 
     def part_of(self, matrix: csr_array) -> FloatArray:
         """What a matrix (size, size) has in these blocks, (g, m, m)."""
@@ -276,10 +281,7 @@ class BlockCovariance:
 
     def dense(self) -> FloatArray:
         """The full matrix, (size, size)."""
-        matrix = np.zeros((self.size, self.size))
-        values, where = self.entries
-        matrix[where] = values
-        return matrix
+        return np.asarray(self.sparse.toarray())
 
     @property
     def independent(self) -> bool:
@@ -293,11 +295,7 @@ class BlockCovariance:
 
     def stretched(self, factors: FloatArray) -> BlockCovariance:
         """Covariance of errors (size,) that are multiplied by numbers, the data as they are."""
-        stacks = []
-        for s in self.stacks:
-            f = factors[s.index]
-            stacks.append(Stack(s.index, f[:, :, None] * s.matrix * f[:, None], s.basis))
-        return BlockCovariance(self.size, stacks)
+        return BlockCovariance(self.size, [s.stretched(factors) for s in self.stacks])
 
     def scaled(self, factors: FloatArray) -> BlockCovariance:
         """Covariance of data that are multiplied by numbers (size,), none of them zero."""
