@@ -77,3 +77,24 @@ class RunError(AmibayesError):
     """A run that started well and could not finish."""
 
     exit_status = 4
+
+
+def fault_of(error: Exception, remedy: str) -> str:
+    """Say in one line what went wrong.
+
+    Parameters
+    ----------
+    error : Exception
+    remedy : str
+        For errors that no input should bring about.
+    """
+    if isinstance(error, AmibayesError):
+        text = error.command_line
+    elif isinstance(error, MemoryError):
+        text = f"not enough memory: {error} (ask for less)"
+    elif isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        text = f"{where}{error.strerror or error} (--debug shows where)"
+    else:
+        text = f"unexpected {type(error).__name__}: {error} (a fault of amibayes: {remedy})"
+    return " ".join(text.split())

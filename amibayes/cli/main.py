@@ -7,16 +7,14 @@ import difflib
 import importlib
 import os
 import re
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import NoReturn
 
 from amibayes import __version__
-from amibayes.errors import AmibayesError
+from amibayes.errors import AmibayesError, fault_of
+from amibayes.support.interrupts import ending, polite_end
 
 COMMANDS = {
     "search": "find a companion in a target's data, with calibrators",
@@ -103,7 +101,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status (0, 2, 3 or 4; audit's 1)."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        with _stopped_politely():
+        with polite_end(), ending():
             status = run_command(words)
             sys.stdout.flush()
         return status
@@ -144,35 +142,11 @@ def run_command(words: list[str]) -> int:
 
 def _report(error: Exception) -> int:
     """Print in one line what went wrong; give the exit status."""
-    status = 4
-    if isinstance(error, AmibayesError):
-        text, status = error.command_line, error.exit_status
-    elif isinstance(error, MemoryError):
-        text = f"not enough memory: {error} (ask for less)"
-    elif isinstance(error, OSError):
-        where = f"{error.filename}: " if error.filename else ""
-        text = f"{where}{error.strerror or error} (--debug shows where)"
+    if isinstance(error, OSError):
         _abandon_output()
-    else:
-        text = (
-            f"unexpected {type(error).__name__}: {error} (a fault of amibayes: please report it "
-            "with what --debug shows)"
-        )
-    print(f"amibayes: {' '.join(text.split())}", file=sys.stderr)
-    return status
-
-
-@contextmanager
-def _stopped_politely() -> Iterator[None]:
-    """Make a request to end (SIGTERM) as gentle as Ctrl-C: half-written files are removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+    text = fault_of(error, "please report it with what --debug shows")
+    print(f"amibayes: {text}", file=sys.stderr)
+    return error.exit_status if isinstance(error, AmibayesError) else 4
 
 
 def _way_on(words: list[str]) -> str:

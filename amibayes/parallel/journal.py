@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from amibayes.parallel.kept_stages import read_stage, write_stage
 from amibayes.support.atomic_files import atomic_path, cannot_write
+from amibayes.support.interrupts import ending
 
 NAMES = {"null": "the null searches", "limits": "the injections"}
 """What the jobs of a search are called."""
@@ -132,7 +133,8 @@ class Journals:
             Of a posterior, which is kept too.
         """
         try:
-            yield
+            with ending():
+                yield
         except KeyboardInterrupt:
             raise KeyboardInterrupt(self.kept(chain)) from None
 

@@ -17,8 +17,9 @@ from shutil import rmtree
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from amibayes.cli.options import common
-from amibayes.errors import AmibayesError, DataError, UsageError
+from amibayes.errors import AmibayesError, DataError, UsageError, fault_of
 from amibayes.support.atomic_files import output_locks
+from amibayes.support.interrupts import ending
 from amibayes.support.shared_results import sharing
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ NOT_OF_A_ROW = {
 """Options of the whole run, which no row can set for itself."""
 
 SOME_FAILED = 4
+
 TASKS = 10_000
 """A table of more targets than twice that is handed out several targets at a time: a scheduler does
 some hundred tasks in a second, and a thousand workers would wait for it."""
@@ -386,15 +388,10 @@ def _performed(job: Job) -> str:
     assert job.arguments is not None
     common.configure_logging(job.arguments)
     try:
-        with output_locks(), sharing():
+        with ending(), output_locks(), sharing():
             job.command.perform(job.arguments)
-    except AmibayesError as error:
-        return error.command_line
-    except MemoryError as error:
-        return f"not enough memory: {error} (ask for less)"
     except Exception as error:
         # One target's failure must not end the others; --debug shows it whole.
         logging.getLogger("amibayes").debug("%s failed", job.name, exc_info=True)
-        text = " ".join(str(error).split())
-        return f"{type(error).__name__}: {text} (a fault of amibayes: run it alone with --debug)"
+        return fault_of(error, "run it alone with --debug")
     return ""
