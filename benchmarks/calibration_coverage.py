@@ -13,7 +13,7 @@ import sys
 import numpy as np
 from scipy.stats import norm, t
 
-from amibayes.calibration.hierarchical import PRIOR_WIDTH, Group, Population
+from amibayes.calibration.scatter_likelihood import PRIOR_WIDTH, Group, Population
 
 N_OBSERVABLES = 21
 NOMINAL = (0.6827, 0.9545)

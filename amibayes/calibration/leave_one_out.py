@@ -13,21 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.calibration.hierarchical import Group, Population, population_of
 from amibayes.calibration.matching import Keys
+from amibayes.calibration.scatter_likelihood import Group, Population, population_of
+from amibayes.calibration.scatter_posterior import tau_posterior
 from amibayes.calibration.transfer import Diameter, Transfer, on_one_branch, transfer_of
 from amibayes.data.observables import Observables
 from amibayes.units import BoolArray, FloatArray, IntArray
-
-LOWEST, HIGHEST = 0.01, 3.0
-"""Scatters between calibrators in units of the scale of their prior, 5 times the median error: a
-twentieth of an error changes nothing, three scales have a prior of 1 %."""
-
-NODES = 16
-"""Of the scatter of each kind; set twice, the second time where the first found its posterior."""
-
-NEGLIGIBLE = 1e-4
-"""Part of the highest posterior below which a scatter does not count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,31 +224,4 @@ def _restricted(transfer: Transfer, keys: BoolArray) -> Transfer:
     return replace(transfer, value=np.where(keys, transfer.value, 0.0), seen=keys)
 
 
-def tau_posterior(population: Population) -> tuple[FloatArray, FloatArray]:
-    """Scatters between calibrators (m, 2) and their posterior (m,), on a grid.
-
-    In 0.05 s what `amibayes.calibration.hierarchical.sample_tau` samples in a second or two: a
-    search leaves out every calibrator in turn. A kind that is absent has scatter 0.
-    """
-    present = np.isfinite(population.prior_scale)
-    scale = np.where(present, population.prior_scale, 0.0)
-    ends = [(LOWEST, HIGHEST) if here else (1.0, 1.0) for here in present]
-    for _ in range(2):
-        axes = [np.geomspace(*end, NODES if end[1] > end[0] else 1) for end in ends]
-        relative = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-        # Equal steps of the logarithm: the density is per unit of the scatter itself.
-        log_p = population.log_prob(relative * scale) + np.log(relative).sum(axis=1)
-        weight = np.exp(log_p - log_p.max())
-        used = weight > NEGLIGIBLE
-        ends = [_widened(axis, relative[used, k]) for k, axis in enumerate(axes)]
-    return relative * scale, weight / weight.sum()
-
-
-def _widened(axis: FloatArray, used: FloatArray) -> tuple[float, float]:
-    """First and last of the nodes that are used, one more on each side."""
-    low = np.searchsorted(axis, used.min()) - 1
-    high = np.searchsorted(axis, used.max()) + 1
-    return float(axis[max(low, 0)]), float(axis[min(high, len(axis) - 1)])
-
-
-__all__ = ["Comparison", "LeftOut", "leave_out", "tau_posterior"]
+__all__ = ["Comparison", "LeftOut", "leave_out"]

@@ -16,9 +16,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from amibayes.calibration.hierarchical import population_of, predictive
-from amibayes.calibration.leave_one_out import tau_posterior
+from amibayes.calibration.hierarchical import predictive
 from amibayes.calibration.matching import keys_of
+from amibayes.calibration.scatter_likelihood import population_of
+from amibayes.calibration.scatter_posterior import tau_posterior
 from amibayes.calibration.transfer import transfer_of
 from amibayes.companion_search.search import search
 from amibayes.data.closure import closure_matrix, kernel_basis

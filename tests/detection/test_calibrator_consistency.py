@@ -11,9 +11,10 @@ from helpers import niriss, simulated
 from scipy import stats
 
 from amibayes.calibration import calibrate
-from amibayes.calibration.hierarchical import population_of, sample_tau
-from amibayes.calibration.leave_one_out import leave_out, tau_posterior
+from amibayes.calibration.leave_one_out import leave_out
 from amibayes.calibration.matching import keys_of
+from amibayes.calibration.scatter_likelihood import population_of
+from amibayes.calibration.scatter_posterior import sample_tau, tau_posterior
 from amibayes.calibration.transfer import transfer_of
 from amibayes.companion_search.optimise import refine
 from amibayes.data.observables import Observables
