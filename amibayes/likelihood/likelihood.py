@@ -38,7 +38,7 @@ def _told_apart(model: BinaryModel) -> tuple[object, ...]:
 
 
 VALUES_AT_ONCE, LEAST_SETS = 25_000, 64
-"""Model values (samples × parameter sets) that `Likelihood.log_prob` works on at once, whose arrays
+"""Model values (samples × parameter sets) that are worked on at once, whose arrays
 fit a processor's cache and need no new memory; not fewer sets than repay the calls."""
 
 FAINTEST = 0.005
@@ -176,10 +176,13 @@ class Likelihood(Shown):
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood of parameter sets (n, n_dim), (n,)."""
-        sets, n_samples = self._sets(theta), max(len(self.samples), 1)
-        at_once = max(LEAST_SETS, VALUES_AT_ONCE // n_samples)
-        parts = np.split(sets, range(at_once, len(sets), at_once))
+        parts = self.in_parts(self._sets(theta))
         return np.concatenate([self.noise.log_prob(self.difference(part)) for part in parts])
+
+    def in_parts(self, sets: FloatArray) -> list[FloatArray]:
+        """Cut parameter sets (n, n_dim) into as many as are worked on at once."""
+        at_once = max(LEAST_SETS, VALUES_AT_ONCE // max(len(self.samples), 1))
+        return np.split(sets, range(at_once, len(sets), at_once))
 
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""

@@ -28,7 +28,7 @@ from amibayes.posterior.chain import (
 )
 from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.independence import leaps_within
+from amibayes.posterior.independence import leaps_within, mode_mixture
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.polynomial import PolynomialLogProb, polynomial_log_prob
@@ -226,7 +226,7 @@ def sample(
         Go on from ``path`` if it holds the chain of the same data, prior and seed.
     grid : GridPosterior, optional
         Of the same likelihood and prior: gives the modes' probabilities, and the
-        `IndependenceProposal`.
+        `IndependenceProposal`. Without it that is a `mode_mixture`.
     max_steps : int
         Steps after which a chain that has not converged is given up (and said to be so).
     progress : callable, optional
@@ -240,6 +240,8 @@ def sample(
         leaps = leaps_within(grid, region)
     elif (quick := _quick(result, everything, rng)) is not None:
         leaps = quick.leaps
+    else:
+        leaps = mode_mixture(result.likelihood, modes_to_sample(result), prior, rng)
     walkers = EnsembleSampler(start, region, leaps, path, resume, max_steps, progress)
     chain = walkers.run(quick or result.likelihood.log_prob, everything, rng)
     return _posterior(chain, result, prior, grid)

@@ -3,8 +3,8 @@
 - quadrature: no companion; only nuisance parameters are integrated.
 - grid: one companion, by `grid_posterior`.
 - importance: draws from t distributions with the posterior's own mean and covariance at every
-  mode, from these beside the prior, and from the prior itself, weighted; unbiased, with its own
-  error.
+  mode, of companions as the prior has them beside the star as the data have it, from these beside
+  the prior, and from the prior itself, weighted; unbiased, with its own error.
 - laplace: a Gaussian at every mode; right for strong companions only.
 - nested: nested sampling with dynesty.
 
@@ -24,17 +24,11 @@ from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.laplace import (
-    HeavyTailed,
-    gaussian_of,
-    log_evidence_laplace,
-    physical,
-    sampled,
-)
+from amibayes.posterior.independence import Mixture, mode_mixture
+from amibayes.posterior.laplace import log_evidence_laplace, physical, sampled
 from amibayes.posterior.nuisance import log_evidence_none
-from amibayes.posterior.polynomial import Around
 from amibayes.posterior.priors import Prior, Range
-from amibayes.posterior.sampler import ModelPrior, draw_posterior, log_mean
+from amibayes.posterior.sampler import draw_posterior, log_mean
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.notebook import html_table
 from amibayes.support.options import SAMPLERS
@@ -44,9 +38,6 @@ MODEL_VALUES = 4e6
 """Model values (samples × parameter sets) of an importance sum."""
 
 MIN_DRAWS, MAX_DRAWS = 4000, 200_000
-
-WORTH = 0.05
-"""Share of the draws from which on a mode's own proposal is looked for."""
 
 DEFENSIVE = 0.2
 """Share of the draws that comes from the prior."""
@@ -237,10 +228,11 @@ def log_evidence_importance(
     rng : numpy.random.Generator
     """
     k = likelihood.model.companions
-    sources = [_Gaussians(likelihood, modes, prior, rng, n_free=0)]
+    own = mode_mixture(likelihood, modes, prior, rng)
+    sources: list[Mixture | _Pairs] = [own]
     if k == 2:
         alone = likelihood.with_model(replace(likelihood.model, companions=1))
-        sources.append(_Gaussians(alone, one, prior, rng, n_free=1))
+        sources = [_Pairs(own, prior, 0), _Pairs(mode_mixture(alone, one, prior, rng), prior, 1)]
     share = (1.0 - DEFENSIVE) / len(sources)
     wanted = MODEL_VALUES / len(likelihood.samples) / (1.0 - DEFENSIVE)
     n = int(np.clip(wanted, MIN_DRAWS, MAX_DRAWS))
@@ -258,63 +250,45 @@ def log_evidence_importance(
     return float(log_z), float(error)
 
 
-class _Gaussians:
-    """Multivariate t distributions of modes, the last companion drawn from the prior.
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Two companions out of a mixture of both, or of one and the prior of the other.
 
-    With two companions the density is that of both orders, each with half the weight.
+    The density is that of both orders, each with half the weight.
+
+    Parameters
+    ----------
+    mixture : Mixture
+        Of two companions, or of one.
+    prior : Prior
+    n_free : int
+        Companions drawn from the prior.
     """
 
-    def __init__(
-        self,
-        likelihood: Likelihood,
-        modes: Sequence[Mode],
-        prior: Prior,
-        rng: np.random.Generator,
-        n_free: int,
-    ) -> None:
-        self.companions = likelihood.model.companions + n_free
-        self.one = prior.parameters(1)
-        self.all = prior.parameters(self.companions)
-        self.prior, self.n_free = prior, n_free
-        fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
-        at_peak = [
-            likelihood.log_prob(physical(c[None], likelihood.parameters))[0]
-            + np.log(np.abs(np.linalg.det(s)))
-            for c, s in fits
-        ]
-        # Weaker modes keep a share: their Gaussians may be too narrow.
-        weight = np.exp(0.5 * (np.array(at_peak) - max(at_peak))) + 1e-3
-        self.weight = weight / weight.sum()
-        around = Around(likelihood.log_prob, ModelPrior(prior, likelihood.parameters), rng)
-        # Laplace's covariance is of one noise and knows no tails: draws from it alone miss some.
-        self.mixture = [
-            (around.heavy_tailed(*fit) if share > WORTH else None) or HeavyTailed(*fit)
-            for fit, share in zip(fits, self.weight, strict=True)
-        ]
+    mixture: Mixture
+    prior: Prior
+    n_free: int
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
-        counts = rng.multinomial(n, self.weight)
-        x = np.concatenate([t.draw(rng, int(m)) for t, m in zip(self.mixture, counts, strict=True)])
+        x = self.mixture.draw(rng, n)
         if not self.n_free:
             return x
-        out = np.empty((n, len(self.all)))
-        free = sampled(self.prior.draw(rng, n, 1), self.one)
-        out[:, self.all.companion(1)] = x[:, self.one.companion()]
-        out[:, self.all.companion(2)] = free[:, self.one.companion()]
-        out[:, self.all.nuisance] = x[:, self.one.nuisance]
+        one, both = self.prior.parameters(1), self.prior.parameters(2)
+        out = np.empty((n, len(both)))
+        free = sampled(self.prior.draw(rng, n), one)
+        out[:, both.companion(1)] = x[:, one.companion()]
+        out[:, both.companion(2)] = free[:, one.companion()]
+        out[:, both.nuisance] = x[:, one.nuisance]
         return out
 
     def log_density(self, x: FloatArray) -> FloatArray:
-        if self.companions == 1:
-            return self._ordered(x)
-        swapped = x[:, self.all.swapped]
+        swapped = x[:, self.prior.parameters(2).swapped]
         return np.asarray(np.logaddexp(self._ordered(x), self._ordered(swapped)) - np.log(2.0))
 
     def _ordered(self, x: FloatArray) -> FloatArray:
-        log = np.zeros(len(x))
-        if self.n_free:
-            bare = replace(self.prior, nuisance=(), half_cauchy=())
-            free = self.all.companion(2)
-            log, x = bare.log_density(x[:, free]), np.delete(x, free, axis=1)
-        parts = [t.log_density(x) for t in self.mixture]
-        return np.asarray(log + logsumexp(parts, axis=0, b=self.weight[:, None]))
+        if not self.n_free:
+            return self.mixture.log_density(x)
+        bare = replace(self.prior, nuisance=(), half_cauchy=())
+        free = self.prior.parameters(2).companion(2)
+        rest = self.mixture.log_density(np.delete(x, free, axis=1))
+        return np.asarray(bare.log_density(x[:, free]) + rest)

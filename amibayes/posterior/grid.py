@@ -203,9 +203,16 @@ def grid_posterior(likelihood: Likelihood, prior: Prior, *, step: float = STEP) 
     Raises
     ------
     DataError
-        Where the likelihood is nowhere finite.
+        Where the likelihood is nowhere finite, or a companion moves the star's parameters so
+        much that nodes of these are too far apart.
     """
     work = Integrand(likelihood, prior)
+    if not work.nuisance.close:
+        raise DataError(
+            "the star's parameters depend too much on the companion for a direct integral",
+            source=likelihood.observables.source,
+            remedy="use a chain (sample), and evidences without a grid (compare_models)",
+        )
     cells = work.start()
     shares = work.shares(cells)
     if not np.isfinite(shares.log_mass).any():
@@ -234,11 +241,14 @@ MORE_CELLS = 2000
 def affordable(likelihood: Likelihood, prior: Prior, most: float = 3e8) -> bool:
     """Whether the grid posterior takes fewer model values than ``most`` (some ten seconds).
 
-    Several contrasts and motion are dimensions that it does not have.
+    Several contrasts and motion are dimensions that it does not have; and its nodes are too far
+    apart for a star whose disc is any size, by what its companion is.
     """
     if not integrable(likelihood):
         return False
     work = Integrand(likelihood, prior)
+    if not work.nuisance.close:
+        return False
     n_sets = (len(work.start()) + MORE_CELLS) * len(work.nuisance.value) * POINTS
     return n_sets * len(likelihood.samples) < most
 

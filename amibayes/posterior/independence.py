@@ -1,15 +1,27 @@
-"""Draws out of a grid posterior: proposals that lead a chain from mode to mode, and a sampler."""
+"""Draws that do not start from where a walker is: of a grid posterior, or of the modes.
+
+They lead a chain from mode to mode, and weighted by the posterior they are a sampler and an
+evidence.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
+from scipy.special import logsumexp
 
+from amibayes.companion_search.result import Mode
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.laplace import physical
+from amibayes.posterior.laplace import HeavyTailed, gaussian_of, log_masses, physical, sampled
 from amibayes.posterior.modes import Region
+from amibayes.posterior.nuisance import StarAlone, star_alone
+from amibayes.posterior.polynomial import Around
+from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior, log_mean
 from amibayes.units import FloatArray, IntArray
 
@@ -99,6 +111,134 @@ def leaps_within(grid: GridPosterior, region: Region) -> IndependenceProposal | 
     if not grid.probability[inside].any():
         return None
     return IndependenceProposal(grid.within(inside))
+
+
+class Proposal(Protocol):
+    """Places in the sampled coordinates (ln contrast), and their density."""
+
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
+        """Draws (n, n_dim)."""
+        ...
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """ln of the density at x (n, n_dim), (n,)."""
+        ...
+
+
+class Unnoticed:
+    """A companion as the prior has it, beside the star as the data then have it.
+
+    Companions too faint for the data, most of the prior of the contrast, have this posterior: the
+    star's own, moved by one Gauss–Newton step for what the companion does to the data.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With one companion.
+    prior : Prior
+    alone : StarAlone
+        Of the same likelihood and prior.
+    """
+
+    def __init__(self, likelihood: Likelihood, prior: Prior, alone: StarAlone) -> None:
+        self.likelihood, self.prior = likelihood, prior
+        self.parameters = likelihood.parameters
+        values, vectors = np.linalg.eigh(alone.covariance)
+        self.star = HeavyTailed(alone.mean, vectors * np.sqrt(np.clip(values, 1e-20, None)))
+        single = single_likelihood(likelihood)
+        self._step = np.linalg.pinv(single.jacobian(alone.mean)) if len(alone.mean) else None
+        self._without = single.residuals(alone.mean)
+
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
+        """Draws (n, n_dim)."""
+        x = sampled(self.prior.draw(rng, n), self.parameters)
+        x[:, self.parameters.nuisance] = self.star.draw(rng, n) + self.moved(x)
+        return x
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """ln of the density at x (n, n_dim), (n,)."""
+        companion = replace(self.prior, nuisance=(), half_cauchy=())
+        bare = companion.log_density(x[:, self.parameters.companion()])
+        return np.asarray(
+            bare + self.star.log_density(x[:, self.parameters.nuisance] - self.moved(x))
+        )
+
+    def moved(self, x: FloatArray) -> FloatArray:
+        """What companions at x (n, n_dim) do to the nuisance parameters, (n, n_nuisance)."""
+        theta = physical(x, self.parameters)
+        if self._step is None:
+            return theta[:, self.parameters.nuisance]
+        theta[:, self.parameters.nuisance] = self.star.centre
+        found = [self.likelihood.residuals(part) for part in self.likelihood.in_parts(theta)]
+        return np.asarray((self._step @ (np.hstack(found) - self._without)).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Proposals in given shares; called, it is one for `emcee.moves.MHMove`.
+
+    Parameters
+    ----------
+    parts : tuple of Proposal
+    share : (n_parts,) float array
+    """
+
+    parts: tuple[Proposal, ...]
+    share: FloatArray
+
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
+        """Draws (n, n_dim)."""
+        counts = rng.multinomial(n, self.share)
+        drawn = [p.draw(rng, int(m)) for p, m in zip(self.parts, counts, strict=True)]
+        return np.asarray(rng.permutation(np.concatenate(drawn)))
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """ln of the density at x (n, n_dim), (n,)."""
+        parts = [p.log_density(x) for p in self.parts]
+        return np.asarray(logsumexp(parts, axis=0, b=self.share[:, None]))
+
+    def __call__(
+        self, walkers: FloatArray, random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Propose places (n, n_dim) for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
+        places = self.draw(random, len(walkers))
+        return places, self.log_density(walkers) - self.log_density(places)
+
+
+WORTH = 0.05
+"""Share of the draws from which on a mode's own proposal is looked for."""
+
+
+def mode_mixture(
+    likelihood: Likelihood, modes: Sequence[Mode], prior: Prior, rng: np.random.Generator
+) -> Mixture:
+    """t distributions like the posterior at each mode, and a companion that is not noticed.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+    modes : sequence of Mode
+        Of its model.
+    prior : Prior
+    rng : numpy.random.Generator
+    """
+    log_mass = log_masses(likelihood, modes, prior)
+    unnoticed: list[Proposal] = []
+    if likelihood.model.companions == 1:
+        alone = star_alone(likelihood, prior)
+        unnoticed.append(Unnoticed(likelihood, prior, alone))
+        log_mass = np.append(log_mass, alone.log_z)
+    # What holds less keeps a share: its Gaussian may be too narrow.
+    share = np.exp(0.5 * (log_mass - log_mass.max())) + 1e-3
+    share /= share.sum()
+    around = Around(likelihood.log_prob, ModelPrior(prior, likelihood.parameters), rng)
+    fits = [gaussian_of(likelihood, np.array(m.theta), prior) for m in modes]
+    # Laplace's covariance is of one noise and knows no tails: draws from it alone miss some.
+    found = [
+        (around.heavy_tailed(*fit) if s > WORTH else None) or HeavyTailed(*fit)
+        for fit, s in zip(fits, share, strict=False)
+    ]
+    return Mixture((*found, *unnoticed), share)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.posterior.contrast_profile import profile
-from amibayes.posterior.nuisance import Nuisance, log_evidence_none, nuisance_nodes
+from amibayes.posterior.nuisance import Nuisance, given_rest, log_evidence_none, nuisance_nodes
 from amibayes.posterior.priors import Prior
 from amibayes.units import MAS, FloatArray, IntArray
 
@@ -207,10 +207,12 @@ class Integrand:
             return nuisance_nodes(self.prior, np.empty((1, 0)), np.empty((0, 0)))
         best = self._best
         columns = self.likelihood.parameters.nuisance
-        errors = self.likelihood.errors(best)[np.ix_(columns, columns)]
+        errors = self.likelihood.errors(best)
+        marginal = errors[np.ix_(columns, columns)]
         gain = float(self.likelihood.log_prob(best[None])[0]) - self.best_none
         centres = [best[columns]] if gain > CERTAIN else [self.single, best[columns]]
-        return nuisance_nodes(self.prior, np.array(centres), errors)
+        narrow = given_rest(errors, columns)
+        return nuisance_nodes(self.prior, np.array(centres), marginal, at_companion=narrow)
 
     @cached_property
     def _best(self) -> FloatArray:

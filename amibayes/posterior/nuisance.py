@@ -10,14 +10,16 @@ from scipy.special import logsumexp
 from amibayes.companion_search.optimise import fit_single
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.posterior.priors import Prior
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 NUISANCE_REACH, NODES_PER_SIGMA = 5.0, 1.0
-"""Errors to each side that nodes reach, and nodes in each."""
+"""Errors to each side that nodes reach, and nodes in each error that is left where everything else
+is known."""
 
 
 MIN_NODES, MAX_NODES = 10, 64
-"""Nodes of one parameter: half of a Gaussian, at a bound of the prior, needs the fewest."""
+"""Nodes of one parameter: half of a Gaussian, at a bound of the prior, needs the fewest. With the
+most they may be too far apart: the companion moves the parameter by many of its errors."""
 
 
 MAX_LAYOUTS, SAME_LOG_Z = 8, 0.002
@@ -46,6 +48,11 @@ class Nuisance:
     shape: tuple[int, ...] = ()
 
     @property
+    def close(self) -> bool:
+        """Whether nodes are as close as they have to be."""
+        return max(self.shape, default=0) < MAX_NODES
+
+    @property
     def outer(self) -> FloatArray:
         """Nodes at the ends and in the middle of each parameter, (n, n_nuisance)."""
         if not self.shape:
@@ -55,7 +62,11 @@ class Nuisance:
 
 
 def nuisance_nodes(
-    prior: Prior, centres: FloatArray, errors: FloatArray, reach: float = NUISANCE_REACH
+    prior: Prior,
+    centres: FloatArray,
+    errors: FloatArray,
+    reach: float = NUISANCE_REACH,
+    at_companion: FloatArray | None = None,
 ) -> Nuisance:
     """Gauss–Legendre nodes around fits, each parameter given the ones before it.
 
@@ -68,17 +79,21 @@ def nuisance_nodes(
         Their covariance: correlated parameters are followed along their ridge.
     reach : float
         Errors that nodes reach.
+    at_companion : (n_nuisance, n_nuisance) float array, optional
+        Their covariance where place and contrast of the companion are known; ``errors`` by
+        default. The integrand is as narrow as that in every cell, and nodes are as close.
     """
+    narrow = errors if at_companion is None else at_companion
     value, low, high = (np.empty((1, 0)) for _ in range(3))
     log_weight, shape = np.zeros(1), []
     for k, one in enumerate(prior.ranges):
         bounds = one.low, one.high
-        turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
-        sigma = float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
+        turn, sigma = _given_before(errors, k)
         if not 0.0 < sigma < bounds[1] - bounds[0]:
             sigma, turn = bounds[1] - bounds[0], 0.0 * turn
+        finest = _given_before(narrow, k)[1] or sigma
         middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
-        x, w, a, b = _axis(middle, sigma, bounds, reach)
+        x, w, a, b = _axis(middle, reach * sigma, min(finest, sigma), bounds)
         n = x.shape[1]
         shape.append(n)
         value, low, high = (
@@ -89,13 +104,28 @@ def nuisance_nodes(
     return Nuisance(value, log_weight, low, high, tuple(shape))
 
 
+def given_rest(errors: FloatArray, columns: IntArray) -> FloatArray:
+    """Covariance of some parameters where all others are known, of the covariance of all."""
+    sigma = np.sqrt(np.diag(errors))
+    sigma[sigma == 0.0] = 1.0
+    precision = np.linalg.pinv(errors / np.outer(sigma, sigma), hermitian=True)
+    block = np.linalg.pinv(precision[np.ix_(columns, columns)], hermitian=True)
+    return np.asarray(block * np.outer(sigma[columns], sigma[columns]))
+
+
+def _given_before(errors: FloatArray, k: int) -> tuple[FloatArray, float]:
+    """Regression of parameter k on those before it (k,), and its error where they are known."""
+    turn = np.linalg.pinv(errors[:k, :k]) @ errors[:k, k]
+    return turn, float(np.sqrt(max(errors[k, k] - errors[k, :k] @ turn, 0.0)))
+
+
 def _axis(
-    middle: FloatArray, sigma: float, bounds: tuple[float, float], reach: float
+    middle: FloatArray, reach: float, sigma: float, bounds: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Nodes, widths and ranges (n, n_nodes) of one parameter around its centres (n, n_fits)."""
     centres = np.clip(middle, *bounds)
-    begin = np.maximum(centres.min(axis=1) - reach * sigma, bounds[0])[:, None]
-    length = np.minimum(centres.max(axis=1) + reach * sigma, bounds[1])[:, None] - begin
+    begin = np.maximum(centres.min(axis=1) - reach, bounds[0])[:, None]
+    length = np.minimum(centres.max(axis=1) + reach, bounds[1])[:, None] - begin
     wanted = int(np.ceil(NODES_PER_SIGMA * length.max() / sigma))
     x, w = np.polynomial.legendre.leggauss(int(np.clip(wanted, MIN_NODES, MAX_NODES)))
     edges = begin + 0.5 * length * np.concatenate([[0.0], np.cumsum(w)])
@@ -103,10 +133,25 @@ def _axis(
     return begin + 0.5 * length * (1.0 + x), weight, edges[:, :-1], edges[:, 1:]
 
 
-def log_evidence_none(
-    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
-) -> float:
-    """Logarithm of the evidence without a companion, nuisance parameters integrated.
+@dataclass(frozen=True, eq=False)
+class StarAlone:
+    """The posterior of the nuisance parameters without a companion.
+
+    Parameters
+    ----------
+    log_z : float
+        Logarithm of the evidence.
+    mean : (n_nuisance,) float array
+    covariance : (n_nuisance, n_nuisance) float array
+    """
+
+    log_z: float
+    mean: FloatArray
+    covariance: FloatArray
+
+
+def star_alone(likelihood: Likelihood, prior: Prior, single: FloatArray | None = None) -> StarAlone:
+    """Integrate the nuisance parameters without a companion.
 
     Parameters
     ----------
@@ -119,7 +164,7 @@ def log_evidence_none(
     alone = single_likelihood(likelihood)
     best = fit_single(likelihood)[0] if single is None else single
     if not len(best):
-        return float(alone.log_prob(best[None])[0])
+        return StarAlone(float(alone.log_prob(best[None])[0]), best, np.empty((0, 0)))
     centre, errors, found = best, alone.errors(best), np.inf
     # Where a star alone does not fit, more noise than in the errors makes the posterior wider than
     # they are, many times: nodes are laid again by its own mean and covariance.
@@ -127,10 +172,17 @@ def log_evidence_none(
         nodes = nuisance_nodes(prior, centre[None], errors, 2.0 * NUISANCE_REACH)
         log = alone.log_prob(nodes.value) + nodes.log_weight
         before, found = found, float(logsumexp(log))
-        if abs(found - before) < SAME_LOG_Z:
-            break
         weight = np.exp(log - found)
         centre = weight @ nodes.value
         away = nodes.value - centre
         errors = (weight[:, None] * away).T @ away
-    return found
+        if abs(found - before) < SAME_LOG_Z:
+            break
+    return StarAlone(found, centre, errors)
+
+
+def log_evidence_none(
+    likelihood: Likelihood, prior: Prior, single: FloatArray | None = None
+) -> float:
+    """Logarithm of the evidence without a companion, as `star_alone` has it."""
+    return star_alone(likelihood, prior, single).log_z

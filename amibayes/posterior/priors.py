@@ -230,7 +230,9 @@ class Prior:
             return self.contrast_min + (self.contrast_max - self.contrast_min) * probability
         return self.contrast_min * np.exp(self._log_range * probability)
 
-    def draw(self, rng: np.random.Generator, n: int, companions: int = 1) -> FloatArray:
+    def draw(
+        self, rng: np.random.Generator | np.random.RandomState, n: int, companions: int = 1
+    ) -> FloatArray:
         """Draw parameter sets (n, n_dim), contrast as a flux ratio."""
         return self.from_cube(rng.random((n, len(self.parameters(companions)))))
 
