@@ -21,7 +21,7 @@ from amibayes.extraction.charge import CubeMigration, visit_migration
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.options import ExtractOptions
-from amibayes.extraction.response import pipeline_response
+from amibayes.extraction.response import pipeline_response, seen_at_pointing
 from amibayes.extraction.visits import visit_maps
 from amibayes.instrument import load_instrument
 from amibayes.kpfits import is_kpfits, kernel_observables
@@ -33,6 +33,7 @@ from amibayes.oifits.products import (
     Contents,
     is_product_header,
     open_products,
+    pointing_of,
     product_of,
     read_products,
     refuse_calibrating_again,
@@ -164,7 +165,23 @@ def _with_response(found: Observables) -> Observables:
     if all(s.response is None for s in setups):
         return found
     note = "light off the axis taken as let through by the pipeline's fit of the fringes"
-    return replace(found, setups=setups, notes=(*found.notes, note))
+    return _centred(replace(found, setups=setups, notes=(*found.notes, note)))
+
+
+def _centred(found: Observables) -> Observables:
+    """Take out what the star itself lost, as the model of the fringes was not centred on it."""
+    data, used = found.data.copy(), found.unflagged()
+    n = used.n_vis2
+    for number, setup in enumerate(found.setups):
+        if setup.response is None:
+            continue
+        star = seen_at_pointing(setup.response)
+        one, other = (m.setup == number for m in (used.vis2, used.closure_phase))
+        a, b = used.vis2.stations[one].T
+        data[:n][one] /= np.abs(star[a, b]) ** 2
+        i, j, k = used.closure_phase.stations[other].T
+        data[n:][other] -= np.angle(star[i, j] * star[j, k] * star[i, k].conj())
+    return found.with_data(data)
 
 
 def _pipeline_response(setup: Setup) -> OffAxisResponse | None:
@@ -179,7 +196,11 @@ def _pipeline_response(setup: Setup) -> OffAxisResponse | None:
         return None
     side = header.get("SUBSIZE1")
     size = min(side if isinstance(side, int) else instrument.n_pixels, instrument.n_pixels)
-    return pipeline_response(instrument, size, orientation, setup.station_xyz_m[:, :2])
+    found = pipeline_response(instrument, size, orientation, setup.station_xyz_m[:, :2])
+    if found is None:
+        return None
+    pointings = [pointing_of(p) for p in open_products(setup.source.split(SEPARATOR))]
+    return replace(found, pointing=np.mean(pointings, axis=0))
 
 
 def _is_fitted_image(contents: Contents) -> bool:

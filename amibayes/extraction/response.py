@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import spline_filter1d
 
-from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.off_axis_response import OffAxisResponse, bspline_weights
 from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.fourier.sampling import Sampling
 from amibayes.extraction.image_plane import FringeModel, fringe_sampling, weighted_fit
@@ -136,6 +136,15 @@ def _monomials(place: FloatArray) -> FloatArray:
     """Products (n, 15) of powers of x and y, up to degree 4."""
     x, y = place.T
     return np.stack([x ** (d - k) * y**k for d in range(5) for k in range(d + 1)], axis=1)
+
+
+def seen_at_pointing(response: OffAxisResponse) -> ComplexArray:
+    """Visibility (n_stations, n_stations) that is measured of a lone star at the pointing."""
+    place = (response.to_node @ response.pointing)[:, None]
+    index, weight = bspline_weights(place, response.n_nodes)
+    shape = (*response.coefficients.shape[:2], -1)
+    seen = response.coefficients.reshape(shape)[..., index[0]] @ weight[0, 0]
+    return np.asarray(seen / seen[0, 0].real)
 
 
 SAME_HOLE = 0.05

@@ -13,9 +13,11 @@ from jwst_products import binary, integrations, write_product
 from amibayes.instrument import load_instrument
 from amibayes.oifits import read_oifits
 from amibayes.oifits.products.fringe_fit import fit_covariance
+from amibayes.oifits.products.pointing import place_of
 from amibayes.oifits.products.repairs import CLIPPED
 from amibayes.optics import scene_image
 from amibayes.scene.sources import Scene
+from amibayes.units import MAS
 
 
 def test_correlations_are_those_of_images_fitted_with_even_weights(
@@ -80,3 +82,16 @@ def test_clipping_adds_what_clipped_means_scatter(n: int, rng: np.random.Generat
     off = sigma_clipped_stats(drawn, axis=0)[0] - drawn.mean(axis=0)
     share = np.interp(1.0 / n, *CLIPPED)
     assert n * np.mean(off**2) == pytest.approx(share, abs=0.004)
+
+
+@pytest.mark.parametrize("place_mas", [(0.0, 0.0), (-12.0, 26.0), (90.0, -130.0)])
+def test_the_place_of_light_is_that_of_its_phases(
+    place_mas: tuple[float, float], rng: np.random.Generator
+) -> None:
+    mask = load_instrument("niriss", "F480M").mask
+    uv = mask.uv_m / 4.8e-6
+    place = MAS * np.array(place_mas)
+    fringe = 0.9 * np.exp(-2j * np.pi * uv @ place + 0.02j * rng.standard_normal(21))
+    # 0.02 rad of 21 baselines of 4 m and less: 0.2 mas.
+    np.testing.assert_allclose(place_of(fringe, uv) / MAS, place_mas, atol=1.2)
+    assert (place_of(fringe[:0], uv[:0]) == 0.0).all()

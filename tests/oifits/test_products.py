@@ -25,8 +25,9 @@ from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import check_together, read_observations
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.oifits.audit import audit, repair
-from amibayes.oifits.products import product_of, read_product
+from amibayes.oifits.products import open_products, pointing_of, product_of, read_product
 from amibayes.oifits.tables import open_oifits
+from amibayes.units import MAS
 
 SIGMA = 0.02
 KINDS = ("ami-oi", "amimulti-oi", "aminorm-oi")
@@ -262,6 +263,17 @@ def test_an_audit_of_one_integration_or_of_roll_0(tmp_path: Path, rng: np.random
     found = audit(path).findings
     assert {"product-no-errors", "product-roll-zero"} <= {f.code for f in found}
     assert not any(f.certain for f in found)
+
+
+def test_most_of_a_centre_is_common_to_star_and_calibrator(data: Path) -> None:
+    """Of a quotient it is not known: by the star's alone, a companion moved by 1.6 mas."""
+    star, calibrator, quotient = (
+        pointing_of(open_products([str(data / "jwst" / f"sima{name}-oi.fits")])[0]) / MAS
+        for name in ("-target_amimulti", "-calibrator_amimulti", "_aminorm")
+    )
+    # 1 % of the light 198 mas away moves the centroid by 2 mas.
+    assert 1.0 < np.hypot(*(star - calibrator)) < 3.0 < 4.0 < np.hypot(*calibrator)
+    assert (quotient == 0.0).all()
 
 
 ROUTES = {

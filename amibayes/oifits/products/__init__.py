@@ -1,5 +1,6 @@
 """JWST stage-3 products: recognised, read, repaired, and what is wrong with them."""
 
+from amibayes.oifits.products.pointing import pointing_of
 from amibayes.oifits.products.reading import (
     open_products,
     read_product,
@@ -31,6 +32,7 @@ __all__ = [
     "exposure_of",
     "is_product_header",
     "open_products",
+    "pointing_of",
     "product_of",
     "read_product",
     "read_products",
