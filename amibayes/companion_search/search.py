@@ -86,8 +86,9 @@ def search(
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
-    found = _fits(likelihood, grid, survey, single, box, deviance_single, known)
-    check = _checked(likelihood, bank, box, single, deviance_single)
+    coarse = coarse_likelihood(likelihood, box)
+    found = _fits(likelihood, coarse, grid, survey, single, box, deviance_single, known)
+    check = _checked(likelihood, coarse, bank, box, single, deviance_single)
     every = distinct_modes([*found, check], box.fringe_mas)
     modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
     theta = np.array(modes[0].theta)
@@ -167,10 +168,14 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
 
 
 def _checked(
-    likelihood: Likelihood, bank: TemplateBank, box: Box, single: FloatArray, deviance_single: float
+    likelihood: Likelihood,
+    coarse: Likelihood,
+    bank: TemplateBank,
+    box: Box,
+    single: FloatArray,
+    deviance_single: float,
 ) -> Mode:
     """Global check by NLopt; of large data with their channels averaged."""
-    coarse = coarse_likelihood(likelihood, box)
     if coarse is not likelihood:
         bank = TemplateBank(coarse, make_grid(box.inner_mas, box.outer_mas, box.fringe_mas), single)
     bank = bank.reduced(np.zeros(bank.n_data, dtype=np.intp))
@@ -179,6 +184,7 @@ def _checked(
 
 def _fits(
     likelihood: Likelihood,
+    coarse: Likelihood,
     grid: Grid,
     survey: ScanResult,
     single: FloatArray,
@@ -193,12 +199,13 @@ def _fits(
     """
     seeds = linear_seeds(likelihood, grid, survey, single, box)
     if known is not None:
-        return refine_all(likelihood, np.vstack([seeds, known]), box, deviance_single)
-    found = refine_all(likelihood, seeds, box, deviance_single)
+        seeds = np.vstack([seeds, known])
+    found = refine_all(likelihood, coarse, seeds, box, deviance_single)
+    if known is not None:
+        return found
     at = peaks(grid, survey.gain, box.fringe_mas)
     if not may_be_bright(survey, at):
         return found
-    coarse = coarse_likelihood(likelihood, box)
     tried: list[FloatArray] = []
     linear = survey.contrasts[at].max()
     fitted = max(m.companion.contrast for m in found)
@@ -210,7 +217,7 @@ def _fits(
         if not new:
             break
         starts = np.vstack([bright_seeds(coarse, star, box) for star in new])
-        found += refine_all(likelihood, starts, box, deviance_single)
+        found += refine_all(likelihood, coarse, starts, box, deviance_single)
         best = max(found, key=lambda m: m.delta_chi2)
         stars = [np.array(best.theta)[likelihood.parameters.nuisance]]
     return found

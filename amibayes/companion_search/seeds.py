@@ -121,15 +121,18 @@ def bright_seeds(likelihood: Likelihood, nuisance: FloatArray, box: Box) -> Floa
 
 
 def refine_all(
-    likelihood: Likelihood, seeds: FloatArray, box: Box, deviance_single: float
+    likelihood: Likelihood,
+    coarse: Likelihood,
+    seeds: FloatArray,
+    box: Box,
+    deviance_single: float,
 ) -> list[Mode]:
     """Local fits from seeds (n, n_dim): all of them together, the best to the end.
 
-    Large data are first fitted with their channels averaged.
+    Large data are first fitted with their channels averaged, as `coarse_likelihood` has it.
     """
     if not len(seeds):
         return []
-    coarse = coarse_likelihood(likelihood, box)
     base = float(coarse.deviance(coarse.chi2(_without(coarse, seeds[:1])))[0])
     tried = _descended(coarse, seeds, box, base)
     kept = _best_distinct(tried, box.fringe_mas, MIN_SEEDS, ROUGHNESS)

@@ -82,9 +82,9 @@ def _headers(path: str | Path) -> tuple[Any, ...]:
             names = tuple(hdu.name.upper() for hdu in hdus)
             shapes = tuple(tuple(hdu.shape) if hdu.is_image else () for hdu in hdus)
             columns = frozenset(
-                str(value).strip().upper()
+                str(hdu.header[key]).strip().upper()
                 for hdu in hdus
-                for key, value in hdu.header.items()
+                for key in hdu.header
                 if key.startswith("TTYPE")
             )
             return dict(hdus[0].header), names, shapes, columns

@@ -193,26 +193,27 @@ def _haar(content: bytes) -> tuple[IntArray, IntArray, FloatArray]:
     """`haar`, remembered: it is asked for at every noise that is tried."""
     weight = np.frombuffer(content)
     n = len(weight)
-    rows, columns, values = [np.zeros(n, dtype=np.intp)], [np.arange(n)], [weight / _norm(weight)]
-    ranges, row = [(0, n)], 1
-    while ranges:
-        first, last = ranges.pop()
-        if last - first < 2:
-            continue
-        middle = (first + last) // 2
-        left, right = weight[first:middle], weight[middle:last]
-        a, b = _norm(left), _norm(right)
-        detail = np.concatenate([left * (b / a), right * (-a / b)]) / np.hypot(a, b)
-        rows.append(np.full(last - first, row))
-        columns.append(np.arange(first, last))
-        values.append(detail)
-        row += 1
-        ranges += [(first, middle), (middle, last)]
+    rows, columns = [np.zeros(n, dtype=np.intp)], [np.arange(n)]
+    values = [weight / np.sqrt(weight @ weight)]
+    first, last, used = np.array([0]), np.array([n]), 1
+    while (cut := last - first >= 2).any():
+        first, last = first[cut], last[cut]
+        middle, length = (first + last) // 2, last - first
+        begin = np.cumsum(length) - length
+        column = np.arange(length.sum()) + np.repeat(first - begin, length)
+        part = weight[column]
+        halves = np.stack([begin, begin + middle - first], axis=1).ravel()
+        a, b = np.sqrt(np.add.reduceat(part**2, halves)).reshape(-1, 2).T
+        of_left, of_right = b / a / np.hypot(a, b), -a / b / np.hypot(a, b)
+        left = column < np.repeat(middle, length)
+        rows.append(used + np.repeat(np.arange(len(first)), length))
+        columns.append(column)
+        values.append(
+            part * np.where(left, np.repeat(of_left, length), np.repeat(of_right, length))
+        )
+        used += len(first)
+        first, last = np.concatenate([first, middle]), np.concatenate([middle, last])
     return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-
-
-def _norm(x: FloatArray) -> float:
-    return float(np.sqrt(x @ x))
 
 
 def channel_layout(data: Observables) -> ChannelLayout:
