@@ -4,8 +4,7 @@ At small contrast c a companion changes the whitened data by c·t(α, δ), so th
 the residuals r of the fit without a companion the best contrast is t·r/t·t and it lowers
 χ² by (t·r)²/t·t. Where bands have contrasts of their own there is one template of each, and
 the gain is that of the best contrasts, none below zero; where a companion moves, rates are
-tried on a lattice and the largest gain counts. The statistic of the data and of null draws
-is the same.
+tried on a lattice and the largest gain counts. Data and null draws have the same statistic.
 
 Three facts make the grid cheap: a position and its mirror image share everything, the whitening
 is folded into one sparse matrix before any position is looked at, and what templates of the whole
@@ -109,8 +108,7 @@ class TemplateBank:
     @property
     def work(self) -> float:
         """Products that the search of one data set takes."""
-        rates = len(self.rates_mas_yr) if self._moves else 1
-        return float(len(self)) * self.n_rows * self.n_contrasts * rates
+        return float(len(self)) * self.n_rows * self.n_contrasts * len(self.rates_mas_yr)
 
     @property
     def n_nuisance(self) -> int:
@@ -267,6 +265,10 @@ class TemplateBank:
         templates = self._mirrored(*self._waves_at(east_mas, north_mas)).laid_out()
         return np.asarray(templates / np.linalg.norm(templates, axis=0))
 
+    def match_at(self, own: FloatArray, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
+        """Products of data (n_data, m), each with its one of `templates_at`, (m,)."""
+        return self._mirrored(*self._waves_at(east_mas, north_mas)).match_each(own)
+
     def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
         for index, _, templates in self._at_rest():
@@ -287,13 +289,12 @@ class TemplateBank:
         if not self.joint:
             yield from self._at_rest()
             return
-        half = len(self.grid) // 2
         for rate in self.rates_mas_yr:
             drift = (self._years * rate[0], self._years * rate[1]) if self._moves else None
             for index, cosine, sine in self._half_plane(drift):
                 # The mirror image of a moving place moves the other way.
                 rates = np.repeat([rate, -rate], len(index), axis=0)
-                both = np.concatenate([index, index + half])
+                both = np.concatenate([index, index + len(self.grid) // 2])
                 yield both, rates, self._in_bands(cosine, sine, mirrored=True)
 
     def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:

@@ -193,6 +193,12 @@ class MirroredTemplates:
         product *= self.sigma[0].astype(kind)
         return [product]
 
+    def match_each(self, own: FloatArray) -> FloatArray:
+        """Products with data (n_data, m) without nuisance directions, one a position, (m,)."""
+        even = np.einsum("dm,dm->m", own[self.even_rows], self.even)
+        odd = np.einsum("dm,dm->m", own[self.odd_rows], self.odd)
+        return np.asarray((even + odd) * self.sigma[0, : len(even)])
+
     def best(self, match: Match) -> tuple[FloatArray, FloatArray]:
         """Contrast that gains most, not below zero."""
         return best_positive(match, {})
@@ -205,7 +211,7 @@ class MirroredTemplates:
         """
         squares = self.norm[None] if weights is None else self._squares(weights.groups)
         here, mirrored = np.split(squares, 2, axis=1)
-        if not np.allclose(here, mirrored, rtol=EQUAL, atol=0.0):
+        if (np.abs(here - mirrored) > EQUAL * mirrored).any():
             gain = np.maximum(self.match(data)[0], 0.0) ** 2
             if weights is not None:
                 gain *= self.norm.astype(gain.dtype) / weights.of_sums(squares)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -116,10 +117,14 @@ def consistency(
     splits = [(name, parts) for name, parts in every if 1 < len(parts) <= MAX_PARTS]
     wanted = int(DRAWS_PER_RATE * (len(splits) + len(calibrators)) / alpha)
     simulations = max(SIMULATIONS, wanted)
+    known: dict[bytes, Likelihood] = {}  # one file a night is one part of both splits
     for name, parts in splits:
         own = None
         if name != "observables":
-            own = [_own_noise(result, mask, stated, prior) for mask in parts.values()]
+            for mask in parts.values():
+                if mask.tobytes() not in known:
+                    known[mask.tobytes()] = _own_noise(result, mask, stated, prior)
+            own = [known[mask.tobytes()] for mask in parts.values()]
         found.append(compare(whole, theta, name, parts, rng, simulations, own))
     apart = compare_calibrators(result, calibrators, own_rng, simulations)
     return (*found, *apart)
@@ -192,6 +197,17 @@ class _Part:
         white = self.likelihood.noise.whiten(residual[self.mask])
         return np.asarray(white - self.basis @ (self.basis.T @ white))
 
+    @cached_property
+    def fisher(self) -> FloatArray:
+        """Information on the companion's parameters, (n_companion, n_companion)."""
+        return np.asarray(self.rows.T @ self.rows)
+
+    def slopes_of_noise(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Slopes of χ² (n_companion, n) by Gaussian noise: the information is their covariance."""
+        values, vectors = np.linalg.eigh(self.fisher)
+        scatter = vectors * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(scatter @ rng.standard_normal((len(values), n)))
+
 
 def _scaled(columns: FloatArray) -> FloatArray:
     length = np.linalg.norm(columns, axis=0)
@@ -226,12 +242,16 @@ def compare(
     each = own or [_selected(data, model, mask) for mask in masks]
     made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
     ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
+    gaussian = all(np.isinf(one.degrees) for one in each)
     above = made_draws = 0
-    for n in pieces_of(simulations, len(data.data)):
-        noise = likelihood.noise.draw(n, rng)
-        for one, mask in zip(own or (), masks, strict=False):
-            noise[mask] = one.noise.draw(n, rng)
-        drawn, by_noise = _apart(made, noise)
+    for n in pieces_of(simulations, len(theta) if own and gaussian else len(data.data)):
+        if own and gaussian:
+            by_noise = _gain_apart(made, [part.slopes_of_noise(n, rng) for part in made])
+        else:
+            noise = likelihood.noise.draw(n, rng)
+            for one, mask in zip(own or (), masks, strict=False):
+                noise[mask] = one.noise.draw(n, rng)
+            drawn, by_noise = _apart(made, noise)
         # What a part cannot explain by itself is no excuse for going apart, once its noise is
         # known.
         above += int(((by_noise >= gain[0]) if own else (drawn >= ratio[0])).sum())
@@ -339,15 +359,19 @@ def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, Fl
     The ratio does not depend on the scale of the noise.
     """
     white = [part.project(residual) for part in parts]
-    fisher = [part.rows.T @ part.rows for part in parts]
-    slope = [part.rows.T @ w for part, w in zip(parts, white, strict=True)]
+    gain = _gain_apart(parts, [part.rows.T @ w for part, w in zip(parts, white, strict=True)])
+    chi2 = np.sum([(w**2).sum(axis=0) for w in white], axis=0)
+    return np.asarray(gain / np.maximum(chi2 - gain, 1e-300)), gain
+
+
+def _gain_apart(parts: Sequence[_Part], slope: Sequence[FloatArray]) -> FloatArray:
+    """Gain in χ² (n,) of the parts apart over together, of their slopes (n_companion, n)."""
+    fisher = [part.fisher for part in parts]
     scale = np.sqrt(np.diag(np.sum(fisher, axis=0)))
     scale = np.where(scale > 0.0, scale, 1.0)
     each = [_gain(f, s, scale) for f, s in zip(fisher, slope, strict=True)]
     together = _gain(np.sum(fisher, axis=0), np.sum(slope, axis=0), scale)
-    gain = np.maximum(np.sum(each, axis=0) - together, 0.0)
-    chi2 = np.sum([(w**2).sum(axis=0) for w in white], axis=0)
-    return np.asarray(gain / np.maximum(chi2 - gain, 1e-300)), np.asarray(gain)
+    return np.asarray(np.maximum(np.sum(each, axis=0) - together, 0.0))
 
 
 def _gain(fisher: FloatArray, slope: FloatArray, scale: FloatArray) -> FloatArray:

@@ -148,7 +148,7 @@ def _between_lattice_points(
     best, middle = most[likely], at[likely]
     for shift in itertools.product(SUBSTEPS * grid.step_mas, repeat=2):
         there = middle + shift
-        match = (own * bank.templates_at(*there.T)).sum(axis=0)
+        match = bank.match_at(own, *there.T)
         better = match > best
         best[better], at[likely[better]] = match[better], there[better]
     out = most.copy()

@@ -196,20 +196,32 @@ def fringes_into(
 
     Of places (n,) or of moving ones (n_samples, n).
     """
-    u, v = (np.pi * MAS * f[:, None] for f in (samples.u, samples.v))
+    half_turns = np.pi * MAS * np.column_stack([samples.u, samples.v])
     band, step = _half_band(samples), max(1, BLOCK // max(cosine.shape[1], 1))
     for first in range(0, len(samples), step):
         rows = slice(first, first + step)
-        east, north = (x[rows] if x.ndim == 2 else x for x in (east_mas, north_mas))
-        half = u[rows] * east
-        half += v[rows] * north
+        half = _along(half_turns[rows], east_mas, north_mas, rows)
         c, s = _cosine_and_sine(half)
-        if smearing:
-            half *= band[rows]
-            damping = _sinc_of_twice(half)
-            c *= damping
-            s *= damping
-        cosine[rows], sine[rows] = c, s
+        if not smearing:
+            cosine[rows], sine[rows] = c, s
+            continue
+        half *= band[rows]
+        damping = _sinc_of_twice(half)
+        np.multiply(c, damping, out=cosine[rows])
+        np.multiply(s, damping, out=sine[rows])
+
+
+def _along(
+    frequency: FloatArray, east_mas: FloatArray, north_mas: FloatArray, rows: slice
+) -> FloatArray:
+    """Products of frequencies (m, 2) with places (n,), or with those of ``rows``, (m, n)."""
+    if east_mas.ndim == 2 or len(east_mas) == 1:
+        east, north = (x[rows] if x.ndim == 2 else x for x in (east_mas, north_mas))
+        product = frequency[:, :1] * east
+        product += frequency[:, 1:] * north
+        return np.asarray(product)
+    # A product of matrices: rows of some ten places are too short for sums by broadcasting.
+    return np.asarray(frequency @ np.stack([east_mas, north_mas]))
 
 
 def fringes_of_one(samples: UVPoints, smearing: bool) -> Callable[[FloatArray, FloatArray], None]:
