@@ -16,28 +16,29 @@ from scipy.sparse import coo_array, csr_array
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.scatter_likelihood import AT_ONCE, Group, Population, population_of
-from amibayes.calibration.scatter_posterior import sample_tau
+from amibayes.calibration.scatter_posterior import sample_tau, tau_posterior
 from amibayes.calibration.transfer import Transfer
 from amibayes.calibration.weighted import TransferFunction, shared_changes
 from amibayes.support.shared_results import shared
 from amibayes.units import FloatArray
 
-MAX_DRAWS = 256
-"""Of the scatter, over which the moments of the response are averaged."""
 
+def _posterior_of(
+    population: Population, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Draws of the scatter, its nodes and their weights.
 
-def _tau_of(population: Population, rng: np.random.Generator) -> FloatArray:
-    """Draws of `sample_tau`, which targets of a survey share where their calibrators are the same.
-
-    The target's own data are no part of the population.
+    Targets of a survey share them where their calibrators are the same: the target's own data are
+    no part of the population.
     """
 
-    def drawn() -> tuple[FloatArray, Any]:
-        return sample_tau(population, rng), rng.bit_generator.state
+    def made() -> tuple[tuple[FloatArray, FloatArray, FloatArray], Any]:
+        found = sample_tau(population, rng), *tau_posterior(population)
+        return found, rng.bit_generator.state
 
-    tau, after = shared(drawn, "scatter between calibrators", population, rng.bit_generator.state)
+    found, after = shared(made, "scatter between calibrators", population, rng.bit_generator.state)
     rng.bit_generator.state = after
-    return tau
+    return found
 
 
 def hierarchical_response(
@@ -55,26 +56,35 @@ def hierarchical_response(
     """
     known = np.asarray(np.array([t.seen for t in transfers]).any(axis=0))
     population = population_of(transfers, keys, known, covariate)
-    tau = _tau_of(population, rng)
-    value, covariance = predictive(population, tau, len(keys))
+    draws, tau, weight = _posterior_of(population, rng)
+    value, covariance = predictive(population, tau, weight, len(keys))
 
     def combine(changes: FloatArray) -> FloatArray:
         # The mean is linear in what the calibrators see, at any scatter between them.
         moved = [replace(t, value=own) for t, own in zip(transfers, changes, strict=True)]
-        return predictive(population_of(moved, keys, known, covariate), tau, len(keys))[0]
+        return predictive(population_of(moved, keys, known, covariate), tau, weight, len(keys))[0]
 
     shared = shared_changes(transfers, combine)
-    return TransferFunction(value, covariance, known, tau, shared=shared)
+    return TransferFunction(value, covariance, known, draws, shared=shared)
 
 
 def predictive(
-    population: Population, tau: FloatArray, n_keys: int
+    population: Population, tau: FloatArray, weight: FloatArray, n_keys: int
 ) -> tuple[FloatArray, csr_array]:
-    """Mean and covariance of the target's response over draws of τ."""
+    """Mean and covariance of the target's response.
+
+    Parameters
+    ----------
+    population : Population
+    tau, weight : (m, 2) and (m,) float arrays
+        Scatters between calibrators and their posterior: moments by a sum over the grid do not
+        depend on a seed, as those of a chain would by 5 %.
+    n_keys : int
+    """
     value = np.zeros(n_keys)
     rows, columns, values = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
     for group in population.groups:
-        mean, covariance = _moments(group, np.nan_to_num(_thinned(tau, group)))
+        mean, covariance = _moments(group, tau, weight)
         for i, keys in enumerate(group.keys):
             value[keys] = group.basis[i] @ mean[i]
             rows.append(np.repeat(keys, len(keys)))
@@ -84,20 +94,20 @@ def predictive(
     return value, coo_array((np.concatenate(values), places), shape=(n_keys, n_keys)).tocsr()
 
 
-def _thinned(tau: FloatArray, group: Group) -> FloatArray:
-    """Evenly chosen draws, as many as the size of the components allows."""
-    size = group.noise.size
-    n = int(np.clip(min(1e9 / (size * group.noise.shape[-1]), AT_ONCE / size), 32, MAX_DRAWS))
-    return np.asarray(tau[np.linspace(0, len(tau) - 1, min(n, len(tau))).astype(int)])
-
-
-def _moments(group: Group, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (g, r) and covariance (g, r, r) of the target's parameters over draws of τ."""
+def _moments(group: Group, tau: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (g, r) and covariance (g, r, r) of the target's parameters over scatters."""
     r = group.noise.shape[-1]
-    mean, covariance = group.response(tau)
-    mean, covariance = mean[..., :r], covariance[..., :r, :r]
-    square = (tau**2).mean(axis=0)
-    own = square[0] * group.target_scatter[0] + square[1] * group.target_scatter[1]
-    centre = mean.mean(axis=0)
-    spread = np.einsum("ngp,ngq->gpq", mean - centre, mean - centre) / len(tau)
-    return centre, covariance.mean(axis=0) + own + spread
+    square = weight @ tau**2
+    second = square[0] * group.target_scatter[0] + square[1] * group.target_scatter[1]
+    near = group.response(tau[[weight.argmax()]])[0][0, :, :r]
+    first = np.zeros_like(near)
+    n_parts = 1 + int(len(tau) * group.noise.size / AT_ONCE)
+    for some, share in zip(
+        np.array_split(tau, n_parts), np.array_split(weight, n_parts), strict=True
+    ):
+        mean, covariance = group.response(some)
+        off = mean[..., :r] - near
+        first += np.einsum("n,ngp->gp", share, off)
+        second += np.einsum("n,ngpq->gpq", share, covariance[..., :r, :r])
+        second += np.einsum("n,ngp,ngq->gpq", share, off, off)
+    return near + first, second - first[:, :, None] * first[:, None, :]

@@ -32,13 +32,14 @@ MAX_STEPS = 8000
 def tau_posterior(population: Population) -> tuple[FloatArray, FloatArray]:
     """Scatters between calibrators (m, 2) and their posterior (m,), on a grid.
 
-    Where moments are enough: a search leaves out every calibrator in turn. A kind that is absent
-    has scatter 0.
+    Where moments are enough. Nodes that do not count are left out; a kind that is absent has
+    scatter 0.
     """
     found = Proposals.of(population)
-    tau = np.zeros((found.weight.size, 2))
+    tau, weight = np.zeros((found.weight.size, 2)), found.weight.ravel()
     tau[:, found.present] = found.nodes * found.scale
-    return tau, found.weight.ravel()
+    used = weight > NEGLIGIBLE * weight.max()
+    return tau[used], weight[used] / weight[used].sum()
 
 
 @dataclass(frozen=True, eq=False)

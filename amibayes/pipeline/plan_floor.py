@@ -371,9 +371,7 @@ def calibrated_covariance(
     for stars in drawn:
         seen = [transfer_of(photons.with_data(star), keys, (0.0, 0.0)) for star in stars]
         population = population_of(seen, keys, seen[0].seen)
-        grid, weight = tau_posterior(population)
-        some = grid[rng.choice(len(grid), 64, p=weight)]
-        response = predictive(population, some, len(keys))[1].toarray()
+        response = predictive(population, *tau_posterior(population), len(keys))[1].toarray()
         total += response[np.ix_(keys.key, keys.key)] * np.outer(keys.sign, keys.sign)
     return np.asarray(noise + total / REALISATIONS)
 
