@@ -15,6 +15,9 @@ LOWEST, HIGHEST = 0.01, 3.0
 """Scatters between calibrators in units of the scale of their prior, 5 times the median error: a
 twentieth of an error changes nothing, three scales have a prior of 1 %."""
 
+FURTHER = 10.0
+"""By which the highest is multiplied while the posterior goes on there."""
+
 NODES = 16
 """Of the scatter of each kind; set twice, the second time where the first found its posterior."""
 
@@ -64,18 +67,45 @@ class Proposals:
 
     @classmethod
     def of(cls, population: Population) -> Proposals:
-        """Lay the grid where the posterior is, by one that covers the prior."""
+        """Lay the grid where the posterior is, by one that covers the prior.
+
+        The prior's tail is no bound: of errors that are far too small the data tell a scatter of
+        many scales.
+        """
         present = np.flatnonzero(np.isfinite(population.prior_scale))
         ends = [(LOWEST, HIGHEST)] * len(present)
-        for _ in range(2):
-            axes = [np.geomspace(*end, NODES) for end in ends]
-            found = cls(population, present, axes, np.ones([NODES] * len(present)))
-            # Equal steps of the logarithm: the density is per unit of the scatter itself.
-            log_p = found.log_prob(found.nodes) + np.log(found.nodes).sum(axis=1)
-            weight = np.exp(log_p - log_p.max())
-            used = found.nodes[weight > NEGLIGIBLE]
-            ends = [_widened(axis, values) for axis, values in zip(axes, used.T, strict=True)]
-        return replace(found, weight=weight.reshape(found.weight.shape) / weight.sum())
+        while True:
+            found = cls.over(population, present, ends)
+            beyond = [_used(w)[-1] == NODES - 1 for w in found._of_axes()]
+            if not any(beyond):
+                break
+            ends = [
+                (low, FURTHER * high if b else high)
+                for (low, high), b in zip(ends, beyond, strict=True)
+            ]
+        ends = [
+            (axis[max(_used(w)[0] - 1, 0)], axis[_used(w)[-1] + 1])
+            for axis, w in zip(found.axes, found._of_axes(), strict=True)
+        ]
+        return cls.over(population, present, ends)
+
+    @classmethod
+    def over(
+        cls, population: Population, present: IntArray, ends: list[tuple[float, float]]
+    ) -> Proposals:
+        """Lay the grid between ends of each axis."""
+        axes = [np.geomspace(*end, NODES) for end in ends]
+        found = cls(population, present, axes, np.ones([NODES] * len(present)))
+        # Equal steps of the logarithm: the density is per unit of the scatter itself.
+        log_p = found.log_prob(found.nodes) + np.log(found.nodes).sum(axis=1)
+        weight = np.exp(log_p - log_p.max()).reshape(found.weight.shape)
+        return replace(found, weight=weight / weight.sum())
+
+    def _of_axes(self) -> list[FloatArray]:
+        """Highest weight of each node of each axis, in units of the highest of all."""
+        axes = range(self.weight.ndim)
+        others = [tuple(k for k in axes if k != axis) for axis in axes]
+        return [self.weight.max(axis=other) / self.weight.max() for other in others]
 
     @property
     def scale(self) -> FloatArray:
@@ -129,11 +159,9 @@ class Proposals:
         ]
 
 
-def _widened(axis: FloatArray, used: FloatArray) -> tuple[float, float]:
-    """First and last of the nodes that are used, one more on each side."""
-    low = np.searchsorted(axis, used.min()) - 1
-    high = np.searchsorted(axis, used.max()) + 1
-    return float(axis[max(low, 0)]), float(axis[min(high, len(axis) - 1)])
+def _used(weight: FloatArray) -> IntArray:
+    """Nodes that count."""
+    return np.flatnonzero(weight > NEGLIGIBLE)
 
 
 def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:

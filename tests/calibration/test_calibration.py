@@ -419,14 +419,14 @@ def grid_moments(population, grid):  # type: ignore[no-untyped-def]
     return weight, tau
 
 
-@pytest.mark.parametrize("tau", [0.0, 2.0])
+@pytest.mark.parametrize("tau", [0.0, 2.0, 100.0])
 def test_sampled_scatter_against_a_grid(tau: float, rng: np.random.Generator) -> None:
     keys = keys_of(vis2_keys(7))
     values = 0.8 + 0.01 * np.hypot(1, tau) * rng.normal(size=(4, 21))
     stars = transfers(values, np.full((4, 21), 0.01))
     population = population_of(stars, keys, np.ones(21, dtype=bool))
     draws = sample_tau(population, np.random.default_rng(1))
-    weight, grid = grid_moments(population, np.linspace(1e-6, 0.06, 4000))
+    weight, grid = grid_moments(population, np.linspace(1e-6, 0.03 * max(tau, 2.0), 20_000))
     for power in (1, 2):
         expected = weight @ grid[:, 0] ** power
         # 20 walkers x 100 steps / 2: 1000 independent draws, of relative width < 1.
