@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from astropy import units
-from astropy.coordinates import SkyCoord
 from astropy.table import QTable
 
 from amibayes.companion_search.grid import Grid
@@ -27,6 +26,9 @@ from amibayes.units import (
     position_angle_deg,
     separation,
 )
+
+if TYPE_CHECKING:  # a quarter of a second that a search does not need
+    from astropy.coordinates import SkyCoord
 
 RIVAL = 9.0
 """Δχ² within which another position is a rival: three standard deviations."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -309,8 +309,17 @@ class BlockCovariance:
 
     def plus(self, addition: csr_array) -> BlockCovariance:
         """The sum with a covariance (size, size), of which what lies in the blocks counts."""
-        stacks = [Stack(s.index, s.matrix + s.part_of(addition), s.basis) for s in self.stacks]
-        return BlockCovariance(self.size, stacks)
+        return self.growing(addition)(1.0)
+
+    def growing(self, addition: csr_array) -> Callable[[float], BlockCovariance]:
+        """The sum with any amount of a covariance, as `plus` has it with one."""
+        parts = [(s, s.part_of(addition)) for s in self.stacks]
+
+        def grown(amount: float) -> BlockCovariance:
+            stacks = [Stack(s.index, s.matrix + amount * part, s.basis) for s, part in parts]
+            return BlockCovariance(self.size, stacks)
+
+        return grown
 
     def against(self, addition: csr_array, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Eigenvalues (rank,) of an addition in units of this, and data (size,) along each.

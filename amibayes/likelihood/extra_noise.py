@@ -151,7 +151,7 @@ def add_noise(observables: Observables, extra: ExtraNoise) -> Observables:
     if not extra.any:
         return observables
     data = observables.unflagged()
-    noisy = _with_noise(data, extra)
+    noisy = replace(data, covariance=data.covariance.plus(covariance_of(data, extra)))
     if data.freedom is None:
         return noisy
     stated, whole = data.covariance.sparse, noisy.covariance.sparse
@@ -166,10 +166,6 @@ def with_noise(likelihood: Likelihood, extra: ExtraNoise) -> Likelihood:
     return Likelihood(
         data, likelihood.model, noise_with_channels(data, extra.channels, extra.floors)
     )
-
-
-def _with_noise(data: Observables, extra: ExtraNoise) -> Observables:
-    return replace(data, covariance=data.covariance.plus(covariance_of(data, extra)))
 
 
 def covariance_of(data: Observables, extra: ExtraNoise) -> csr_array:

@@ -9,6 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 from scipy import optimize
 
+from amibayes.data.blocks import BlockCovariance
 from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
@@ -28,7 +29,6 @@ from amibayes.likelihood.extra_noise import (
     ExtraNoise,
     FileNoise,
     NoisePrior,
-    _with_noise,
     covariance_of,
     mean_of_files,
 )
@@ -122,24 +122,27 @@ class _Kind:
 
     def covariance(self, amount: float, shared: Correlation) -> Covariance:
         """With an amount of extra noise, and channels that share some of the noise."""
-        data = self._with(amount)
+        base = self._with(amount)
         if shared.value == 0.0 and not self.floors:
-            return data.covariance
+            return base
         if shared not in self._rows:
             shares = [ChannelShare(shared, shared)]
             self._rows[shared] = channel_rows(self._layout, shares, self._own_floors)
-        return ChannelCovariance(data.covariance, self._rows[shared])
+        return ChannelCovariance(base, self._rows[shared])
 
     @cached_property
     def _rows(self) -> dict[Correlation, ChannelRows]:
         """Of the shares that were tried: the amount of noise does not change them."""
         return {}
 
-    def _with(self, amount: float) -> Observables:
-        """The data with an amount of extra noise, channels independent."""
-        if amount <= 0.0:
-            return self.data
-        return _with_noise(self.data, self._extra(amount))
+    def _with(self, amount: float) -> BlockCovariance:
+        """With an amount of extra noise, channels independent."""
+        return self._grown(amount**2) if amount > 0.0 else self.data.covariance
+
+    @cached_property
+    def _grown(self) -> Callable[[float], BlockCovariance]:
+        """The covariance with extra noise of a variance."""
+        return self.data.covariance.growing(covariance_of(self.data, self._extra(1.0)))
 
     def _extra(self, amount: float) -> ExtraNoise:
         if self.kind == "vis2":
@@ -214,7 +217,7 @@ class _Kind:
 
     def correlation(self, amount: float) -> Correlation:
         """What channels share, given an amount of extra noise."""
-        base = self._with(amount).covariance
+        base = self._with(amount)
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
         return correlation_of(self._layout, white, slopes, self._own_floors)
 
