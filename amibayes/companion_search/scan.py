@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.observables import Observables
-from amibayes.units import BoolArray, FloatArray, IntArray
+from amibayes.units import FloatArray, IntArray
 
 SWEEPS = 8
 """Rounds over the bands in which the contrasts of bands that are coupled find their best."""
@@ -103,9 +103,7 @@ class ScaleGroups:
         return np.asarray(np.clip(square / count, mean / MAX_UNEQUAL, mean * MAX_UNEQUAL))
 
 
-def scale_groups(
-    data: Observables, n_nuisance: int, common: BoolArray | None = None
-) -> ScaleGroups:
+def scale_groups(data: Observables, n_nuisance: int, smooth: IntArray | None = None) -> ScaleGroups:
     """Group the whitened data by file and kind.
 
     Parameters
@@ -115,9 +113,10 @@ def scale_groups(
         where the covariance was estimated: its scale was measured.
     n_nuisance : int
         Parameters of the fit without a companion.
-    common : (n_data,) bool array, optional
-        Rows that channels of an exposure share (`ChannelRows.common`): where there are enough
-        they have a scale of their own, so that the statistic does not depend on their share.
+    smooth : (n_data,) int array, optional
+        Rows of errors that are smooth over the channels (`ChannelRows.level`): where there are
+        enough of a level they have a scale of their own, so that the statistic does not depend
+        on how large these errors are.
     """
     whitening = data.covariance.whitening
     share = max(1.0 - n_nuisance / max(whitening.shape[0], 1), 1e-6)
@@ -128,10 +127,10 @@ def scale_groups(
     kind = np.arange(len(setup)) >= data.n_vis2
     of_datum = 2 * sources[setup] + kind
     label = _connected(whitening, of_datum)
-    if common is not None:
-        enough = np.bincount(label[common], minlength=label.max() + 1)[label] >= MIN_DATA
-        label = np.where(common & enough, label.max() + 1 + label, label)
-        label = np.unique(label, return_inverse=True)[1]
+    if smooth is not None:
+        split = label + (label.max() + 1) * smooth
+        enough = np.bincount(split)[split] >= MIN_DATA
+        label = np.unique(np.where(enough, split, label), return_inverse=True)[1]
     count = np.bincount(label)
     # Too few to tell their own scatter: they go with all else that is too few.
     label = np.where(count[label] < MIN_DATA, len(count), label)

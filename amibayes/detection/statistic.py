@@ -365,7 +365,7 @@ def _treatment(
         return bank, Rotations(null)
     if stated_errors:
         return bank, KnownErrors()
-    groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.common_rows)
+    groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.smooth_rows)
     least = 1.0 if likelihood.noise.floor else 0.0
     reduced = bank.reduced(groups.label)
     if reduced.reduction is not None:

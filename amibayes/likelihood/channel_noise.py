@@ -12,9 +12,10 @@ covariance
 w the shape of the gain or offset in units of the errors (of unit mean square), ρ the share of
 the variance that is common to all, φ the correlation of neighbours in the rest. ρ and φ are
 fitted with that covariance. For the data it is made diagonal by a rotation with w as its first
-axis and differences of ever shorter ranges of channels as the others (a weighted Haar
-transform): exact for φ = 0, and close for others. It has n log n entries, so that thousands of
-channels cost no more than a few passes over the data, where an inverse would cost n³.
+axis, a slope of w across the channels as its second, and details of ever shorter ranges of
+channels as the others (multiwavelets): exact for φ = 0, and close for others. It has n log n
+entries, so that thousands of channels cost no more than a few passes over the data, where an
+inverse would cost n³.
 """
 
 from __future__ import annotations
@@ -270,6 +271,8 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
         product = rest / (1.0 - rho) + single + (along / variance[:, None]).T @ along
         chi2, n_fitted, information = _fitted(product)
         count = len(both) - n_fitted
+        if count == 0:  # the fit passes through all data: they say nothing of their noise
+            return np.zeros(len(COMMON))
         logdet = log_step + n_rest * np.log1p(-rho) + np.log(variance).sum()
         found.append(count * np.log(max(chi2, 1e-300) / count) + logdet + information)
     return np.array(found)

@@ -97,33 +97,33 @@ class ChannelLayout:
         """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
-        variance = np.ones(n)
+        variance, level = np.ones(n), np.zeros(n, dtype=np.intp)
         parts: list[tuple[IntArray, IntArray, FloatArray]] = []
         for first, last in pairwise(cuts):
             if last == first + 1:
                 parts.append((np.array([first]), np.array([first]), np.ones(1)))
                 variance[first] += further[first]
                 continue
-            row, column, value = haar(self.weight[first:last])
-            parts.append((row + first, column + first, value))
+            basis = smooth_basis(self.weight[first:last])
+            parts.append((basis.row + first, basis.column + first, basis.value))
             rho, phi = common[first], neighbour[first]
             # Differences of neighbours are never trusted more than independent channels are:
             # what makes neighbours alike (overlap on the detector) blurs the signal there too.
-            rest = np.maximum(variance_of(row, value, phi), 1.0)
+            rest = np.maximum(variance_of(basis.row, basis.value, phi), 1.0)
             rest = (1.0 - rho) * rest
             # A floor says that exposures are too few to tell: no errors then shrink by a fit.
             variance[first:last] = np.maximum(rest, 1.0) if further[first] > 0.0 else rest
-            variance[first] += rho * (last - first)
-            smooth = smooth_in(row, column, value, self.weight[first:last])
-            variance[first:last] += further[first] * smooth
+            # Half of it is common to all channels, half changes: calibrations err in either way.
+            variance[first] += (rho + 0.5 * further[first]) * (last - first)
+            variance[first:last] += 0.5 * further[first] * basis.slope_share
+            level[first : first + 2] = OFFSET, SLOPE
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
         sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
-        several = self.count[self.group] > 1
         return ChannelRows(
             csr_array(sort.T @ rotation @ sort),
             self._unsorted(np.sqrt(variance)),
-            self._unsorted(self.starts & several),
+            self._unsorted(level),
         )
 
     def _unsorted(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -142,13 +142,17 @@ class ChannelRows:
         Orthonormal; the first row of each group is along its common error.
     sigma : (rank,) float array
         Standard deviation of the rows.
-    common : (rank,) bool array
-        Rows along a common error.
+    level : (rank,) int array
+        `OFFSET` of rows along an error that is common to the channels, `SLOPE` of those along one
+        that changes evenly across them, 0 of all others.
     """
 
     rotation: csr_array
     sigma: FloatArray
-    common: BoolArray
+    level: IntArray
+
+
+OFFSET, SLOPE = 1, 2
 
 
 def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
@@ -166,54 +170,85 @@ def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
     return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
 
 
-def smooth_in(row: IntArray, column: IntArray, value: FloatArray, weight: FloatArray) -> FloatArray:
-    """Variance in each row of an error that is smooth over the channels, of unit mean square.
+@dataclass(frozen=True, eq=False)
+class SmoothBasis:
+    """Orthonormal rows of n channels: an offset, a slope, and details of ever shorter ranges.
 
-    Half of it is common to all channels, half a slope across them: calibrations err in either
-    way. Rows are taken as independent, which counts a slope's share in each.
+    Parameters
+    ----------
+    row, column : (n_entries,) int arrays
+        Sorted by row, and by column within one.
+    value : (n_entries,) float array
+    depth : (n,) int array
+        How often a row's range was halved; −1 of offset and slope.
     """
-    across = np.linspace(-1.0, 1.0, len(weight))
-    across /= np.sqrt(np.mean(across**2))
-    offset = np.bincount(row, value * weight[column])
-    slope = np.bincount(row, value * (weight * across)[column])
-    return np.asarray(0.5 * (offset**2 + slope**2))
+
+    row: IntArray
+    column: IntArray
+    value: FloatArray
+    depth: IntArray
+
+    @property
+    def slope_share(self) -> FloatArray:
+        """Variance in each row of an error that changes over the channels, unit mean square.
+
+        As much as in the slope is beside it in curved changes, a quarter of it in the details of
+        the whole range and a quarter of that in those of its halves: red noise, as the
+        transfer functions of spectrographs differ.
+        """
+        depth = self.depth
+        share = CURVED ** (depth + 1.0) / np.bincount(depth + 1)[depth + 1]
+        share[0], share[1:2] = 0.0, 1.0
+        return np.asarray(len(depth) * share)
 
 
-def haar(weight: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Sparse orthonormal matrix whose first row is along ``weight`` (n,): row, column, value.
+CURVED = 0.25
+"""Variance of changes over half of a range of channels, in units of that over the whole of it."""
 
-    The other rows are differences between the two halves of a range of channels, of the
-    halves of these, and so on: n log n entries.
+LEAF = (4, 16)
+"""Channels of the shortest ranges, of up to 64 and of more than 256: they cost as many products."""
+
+
+def smooth_basis(weight: FloatArray) -> SmoothBasis:
+    """Rows of which the first is along ``weight`` (n,) and the second a slope of it.
+
+    All others see neither: differences within a range of channels that are orthogonal to both,
+    those between the halves of these, and so on (multiwavelets: Alpert 1993, SIAM J. Math.
+    Anal. 24, 246). They have n log n entries.
     """
-    return _haar(np.ascontiguousarray(weight, dtype=float).tobytes())
+    return _smooth_basis(np.ascontiguousarray(weight, dtype=float).tobytes())
 
 
 @lru_cache(maxsize=8192)
-def _haar(content: bytes) -> tuple[IntArray, IntArray, FloatArray]:
-    """`haar`, remembered: it is asked for at every noise that is tried."""
+def _smooth_basis(content: bytes) -> SmoothBasis:
+    """`smooth_basis`, remembered: it is asked for at every noise that is tried."""
     weight = np.frombuffer(content)
     n = len(weight)
-    rows, columns = [np.zeros(n, dtype=np.intp)], [np.arange(n)]
-    values = [weight / np.sqrt(weight @ weight)]
-    first, last, used = np.array([0]), np.array([n]), 1
-    while (cut := last - first >= 2).any():
-        first, last = first[cut], last[cut]
-        middle, length = (first + last) // 2, last - first
-        begin = np.cumsum(length) - length
-        column = np.arange(length.sum()) + np.repeat(first - begin, length)
-        part = weight[column]
-        halves = np.stack([begin, begin + middle - first], axis=1).ravel()
-        a, b = np.sqrt(np.add.reduceat(part**2, halves)).reshape(-1, 2).T
-        of_left, of_right = b / a / np.hypot(a, b), -a / b / np.hypot(a, b)
-        left = column < np.repeat(middle, length)
-        rows.append(used + np.repeat(np.arange(len(first)), length))
-        columns.append(column)
-        values.append(
-            part * np.where(left, np.repeat(of_left, length), np.repeat(of_right, length))
-        )
-        used += len(first)
-        first, last = np.concatenate([first, middle]), np.concatenate([middle, last])
-    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+    wanted = np.column_stack([weight, weight * np.linspace(-1.0, 1.0, n)])
+    details: list[tuple[int, int, FloatArray]] = []
+    leaf = int(np.clip(n // 16, *LEAF))
+
+    def along(first: int, last: int, depth: int) -> FloatArray:
+        """Basis of what is wanted in a range, (length, 1 or 2); the rest becomes details."""
+        if last - first <= leaf:
+            turned = np.linalg.qr(wanted[first:last], mode="complete")[0]
+        else:
+            middle = (first + last) // 2
+            left, right = along(first, middle, depth + 1), along(middle, last, depth + 1)
+            products = left.T @ wanted[first:middle], right.T @ wanted[middle:last]
+            mixed = np.linalg.qr(np.concatenate(products), mode="complete")[0]
+            cut = left.shape[1]
+            turned = np.concatenate([left @ mixed[:cut], right @ mixed[cut:]])
+        details.extend((depth, first, detail) for detail in turned[:, 2:].T)
+        return turned[:, :2]
+
+    whole = along(0, n, 0)
+    rows = [(-1, 0, part * np.sign(part @ w)) for part, w in zip(whole.T, wanted.T, strict=False)]
+    rows += sorted(details, key=lambda d: d[:2])
+    length = [len(values) for _, _, values in rows]
+    column = np.concatenate([first + np.arange(len(values)) for _, first, values in rows])
+    value, depth = np.concatenate([v for *_, v in rows]), np.array([d for d, *_ in rows])
+    return SmoothBasis(np.repeat(np.arange(n), length), column, value, depth)
 
 
 def channel_layout(data: Observables) -> ChannelLayout:

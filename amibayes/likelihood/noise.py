@@ -21,7 +21,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelRows
 from amibayes.likelihood.chi2 import deviance, log_peak
-from amibayes.units import BoolArray, FloatArray
+from amibayes.units import FloatArray, IntArray
 
 MAX_EXPONENT = 50.0
 """Gains in ln L are cut where their Δχ² would overflow; nothing is decided so far out."""
@@ -66,8 +66,8 @@ class NoiseModel(Protocol):
         ...
 
     @property
-    def common_rows(self) -> BoolArray | None:
-        """Whitened rows that channels of an exposure share, (n_independent,); None if none."""
+    def smooth_rows(self) -> IntArray | None:
+        """`ChannelRows.level` of whitened rows, (n_independent,); None where none share."""
         ...
 
     def aligned(self, white: FloatArray) -> FloatArray:
@@ -146,9 +146,9 @@ class GaussianNoise:
     floor: bool = False
 
     @property
-    def common_rows(self) -> BoolArray | None:
-        """Whitened rows that channels of an exposure share, (n_independent,); None if none."""
-        return None if self.rows is None else self.rows.common
+    def smooth_rows(self) -> IntArray | None:
+        """`ChannelRows.level` of whitened rows, (n_independent,); None where none share."""
+        return None if self.rows is None else self.rows.level
 
     def aligned(self, white: FloatArray) -> FloatArray:
         """Whitened data (n_independent, …) turned to rows that stand for single channels."""
@@ -297,9 +297,9 @@ class FittedNoise:
         return self.fit.floor
 
     @property
-    def common_rows(self) -> BoolArray | None:
+    def smooth_rows(self) -> IntArray | None:
         """Those of the fit."""
-        return self.fit.common_rows
+        return self.fit.smooth_rows
 
     def aligned(self, white: FloatArray) -> FloatArray:
         """As the fit does it."""

@@ -181,6 +181,12 @@ def _content(path: str, raw: bytes) -> OIFits:
     except OSError as error:
         raise cut from error
     with hdus:
+        if not hasattr(hdus[-1], "fileinfo"):  # the stand-in for a header that cannot be read
+            raise DataError(
+                f"is damaged: extension {len(hdus) - 1} has no readable header",
+                source=path,
+                remedy="copy or download it again",
+            )
         info = hdus[-1].fileinfo()
         end = info["datLoc"] + info["datSpan"]
         rest = raw[end : end + 9]
