@@ -125,9 +125,13 @@ def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
     pairs += [(x.closure_phase, y.closure_phase) for x, y in each]
     return all(
         abs(x.value - y.value) <= max(SHARE_CONVERGED, SHARE_OF_ERROR * np.nan_to_num(y.error))
+        and abs(np.log(x.offset / y.offset)) + abs(np.log(x.slope / y.slope)) <= GROWTH_CONVERGED
         for x, y in pairs
     )
 
+
+GROWTH_CONVERGED = 0.1
+"""Change of ln of a floor's variance likewise: of twenty gains it is known to 0.3."""
 
 SHARE_CONVERGED, SHARE_OF_ERROR = 0.02, 0.25
 """Change of a correlation at which search and noise agree: below what a hundred exposures tell, or

@@ -56,12 +56,17 @@ class Correlation:
     value, error : float
         Correlation of neighbouring channels in all, ρ + (1 − ρ)φ, and its standard
         deviation; NaN where no exposure has two channels.
+    offset, slope : float
+        Variance of what the floor has in common to all channels, and in changes across them, in
+        units of the floor's: more than 1 where residuals show more.
     """
 
     common: float = 0.0
     neighbour: float = 0.0
     value: float = 0.0
     error: float = float("nan")
+    offset: float = 1.0
+    slope: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -161,13 +166,15 @@ def channel_rows(
     """Rows of channels that are correlated as the shares and floors of their files say."""
     by_file = {s.source: s for s in shares}
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
+    growth = np.ones((2, len(layout.order)))
     for k, name in enumerate(layout.names):
         share = by_file.get(name) or by_file.get("") or ChannelShare()
         for kind, found in ((layout.vis2, share.vis2), (~layout.vis2, share.closure_phase)):
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour
-    floor = floor_of_rows(layout, floors)
-    return layout.turned(common, neighbour, floor)
+            growth[:, here] = np.array([[found.offset], [found.slope]])
+    # Half of it is common to all channels, half changes: calibrations err in either way.
+    return layout.turned(common, neighbour, 0.5 * growth * floor_of_rows(layout, floors))
 
 
 def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:

@@ -91,18 +91,20 @@ class ChannelLayout:
             )
 
     def turned(self, common: FloatArray, neighbour: FloatArray, further: FloatArray) -> ChannelRows:
-        """Rows for shares ρ, correlations φ and variances of further common errors (rank,).
+        """Rows for shares ρ, correlations φ (rank,) and variances of further errors (2, rank).
 
-        All sorted likewise; the last in units of the errors.
+        Of these the first is common to the channels and the second changes across them, in units
+        of the errors. All are sorted likewise.
         """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
-        variance, level = np.ones(n), np.zeros(n, dtype=np.intp)
+        variance, level, floor = np.ones(n), np.zeros(n, dtype=np.intp), further.sum(axis=0)
         parts: list[tuple[IntArray, IntArray, FloatArray]] = []
+        added = np.zeros(n)
         for first, last in pairwise(cuts):
             if last == first + 1:
                 parts.append((np.array([first]), np.array([first]), np.ones(1)))
-                variance[first] += further[first]
+                variance[first] += floor[first]
                 continue
             basis = smooth_basis(self.weight[first:last])
             parts.append((basis.row + first, basis.column + first, basis.value))
@@ -112,11 +114,12 @@ class ChannelLayout:
             rest = np.maximum(variance_of(basis.row, basis.value, phi), 1.0)
             rest = (1.0 - rho) * rest
             # A floor says that exposures are too few to tell: no errors then shrink by a fit.
-            variance[first:last] = np.maximum(rest, 1.0) if further[first] > 0.0 else rest
-            # Half of it is common to all channels, half changes: calibrations err in either way.
-            variance[first] += (rho + 0.5 * further[first]) * (last - first)
-            variance[first:last] += 0.5 * further[first] * basis.slope_share
+            variance[first:last] = np.maximum(rest, 1.0) if floor[first] > 0.0 else rest
+            added[first] = further[0, first] * (last - first)
+            added[first:last] += further[1, first] * basis.slope_share
+            variance[first] += rho * (last - first)
             level[first : first + 2] = OFFSET, SLOPE
+        variance += added
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
         sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
@@ -124,6 +127,7 @@ class ChannelLayout:
             csr_array(sort.T @ rotation @ sort),
             self._unsorted(np.sqrt(variance)),
             self._unsorted(level),
+            self._unsorted(added),
         )
 
     def _unsorted(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -145,11 +149,14 @@ class ChannelRows:
     level : (rank,) int array
         `OFFSET` of rows along an error that is common to the channels, `SLOPE` of those along one
         that changes evenly across them, 0 of all others.
+    floor : (rank,) float array
+        Variance by further errors, of several channels.
     """
 
     rotation: csr_array
     sigma: FloatArray
     level: IntArray
+    floor: FloatArray
 
 
 OFFSET, SLOPE = 1, 2

@@ -21,7 +21,13 @@ from amibayes.likelihood.channel_noise import (
     channel_rows,
     correlation_of,
 )
-from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
+from amibayes.likelihood.channel_rows import (
+    OFFSET,
+    SLOPE,
+    ChannelLayout,
+    ChannelRows,
+    channel_layout,
+)
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import (
     BOUND,
@@ -103,6 +109,7 @@ class _Fit:
             before = amount
             if self.prior.channels and self.data.freedom is None:
                 shared = one.correlation(amount)
+                shared = one.grown(amount, shared, self.prior)
             amount = one.amount(shared, self.prior.width(part, kind))
             if abs(amount - before) <= 1e-2 * amount:
                 break
@@ -220,6 +227,53 @@ class _Kind:
         base = self._with(amount)
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
         return correlation_of(self._layout, white, slopes, self._own_floors)
+
+    def grown(self, amount: float, shared: Correlation, prior: NoisePrior) -> Correlation:
+        """The same with floors as large as the residuals show them, and not smaller.
+
+        Gains and slopes of single exposures tell their size, which is that of a good night in a
+        table. By restricted likelihood, the excess with the prior of extra noise.
+        """
+        floors = [f.vis2 if self.kind == "vis2" else f.closure_phase_rad for f in self._own_floors]
+        width = prior.vis2 if self.kind == "vis2" else prior.closure_phase_rad
+        floor = max(floors, default=0.0)
+        if not floor or not width:
+            return shared
+        data = self._with(amount)
+        rows = channel_rows(channel_layout(data), [ChannelShare(shared, shared)], self._own_floors)
+        square = (rows.rotation @ data.covariance.whiten(self.residual)) ** 2
+        found = [
+            self._growth(square[at], rows.sigma[at] ** 2, rows.floor[at], floor / width)
+            for at in (rows.level == OFFSET, rows.level == SLOPE)
+        ]
+        return replace(shared, offset=found[0], slope=found[1])
+
+    def _growth(
+        self, square: FloatArray, variance: FloatArray, floor: FloatArray, ratio: float
+    ) -> float:
+        """Factor of a floor's variance, of squares of rows (n,); ``ratio`` of it to the prior."""
+        most = (BOUND / ratio) ** 2
+        if len(square) < MIN_ROWS or most <= 1.0:
+            return 1.0
+
+        def loss(log_growth: float) -> float:
+            more = float(np.expm1(log_growth))
+            total = variance + more * floor
+            fit = (square / total + self.share * np.log(total)).sum()
+            return float(fit + more * ratio**2)
+
+        best = optimize.minimize_scalar(
+            loss, bounds=(0.0, float(np.log(most))), method="bounded", options={"xatol": 1e-3}
+        )
+        growth = float(np.exp(best.x))
+        return growth if loss(0.0) - best.fun > CLEARLY_LARGER else 1.0
+
+
+MIN_ROWS = 6
+"""Gains (of baselines in exposures) from which on their scatter is known to a third."""
+
+CLEARLY_LARGER = 4.0
+"""2Δln L by which a floor has to be exceeded: two standard deviations."""
 
 
 def _chi2(covariance: Covariance, residual: FloatArray) -> float:

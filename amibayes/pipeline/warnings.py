@@ -151,8 +151,19 @@ def _floor_warning(noise: ExtraNoise) -> str:
     why = " (too few exposures to tell their own)" if tabulated else ""
     return (
         f"calibration errors of {', '.join(each)}, common to the channels of an exposure, are in "
-        f"the covariance{why}: --systematics none leaves them out"
+        f"the covariance{why}{_grown(noise)}: --systematics none leaves them out"
     )
+
+
+def _grown(noise: ExtraNoise) -> str:
+    """How much larger than their floor calibration errors were found, at most."""
+    each = []
+    for name, words in (("vis2", "V2"), ("closure_phase", "closure phase")):
+        found = [getattr(share, name) for share in noise.channels]
+        most = max((f for c in found for f in (c.offset, c.slope)), default=1.0)
+        if most > 1.0:
+            each.append(f"{np.sqrt(most):.2g} times as large in {words}")
+    return f"; residuals show them {' and '.join(each)}" if each else ""
 
 
 def _noise_warning(noise: ExtraNoise) -> str:

@@ -217,6 +217,24 @@ def test_fit_of_noise_finds_share_and_amount(rng) -> None:
     ).channels
 
 
+def test_gains_larger_than_the_floor_are_fitted_and_smaller_ones_are_not(rng) -> None:
+    """Gains of 6 % where the floor has 2 % common to all channels, from 24 of them (to 15 %)."""
+    sheet = pionier(4)
+    floors = (Systematics("", 0.02 * np.sqrt(2.0), 0.0, 0.0),)
+    theta = np.array([10.0, 5.0, 0.0])
+    rows = np.unique(np.stack([sheet.vis2.setup, sheet.vis2.row]), axis=1, return_inverse=True)[1]
+    for size, least, most in ((0.06, 0.5, 2.0), (0.01, 0.0, 0.12)):
+        draw = sheet.covariance.draw(rng, 1)[:, 0]
+        draw[: sheet.n_vis2] += size * rng.standard_normal(rows.max() + 1)[rows.ravel()]
+        noise = fit_noise(
+            Likelihood(with_draw(sheet, draw)), theta, prior=NoisePrior(floors=floors)
+        )
+        (told,) = noise.channels
+        assert least < 0.02**2 * told.vis2.offset / 0.06**2 < most
+        assert told.vis2.slope == told.closure_phase.offset == 1.0
+        assert noise.vis2 < 0.01
+
+
 def test_extra_noise_is_bounded_by_its_prior(rng) -> None:
     """A binary that a single star is fitted to looks like noise of tens of degrees."""
     data = simulated(pionier(4), [12.0, 6.0, 0.5], rng)
