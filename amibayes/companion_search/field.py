@@ -217,6 +217,36 @@ def choose_field(
     return (inner, MARGIN * separation), separation
 
 
+def wider_fields(result: SearchResult) -> list[tuple[float, float]]:
+    """Fields beyond that of a search, mas, where a bright companion outside may explain a misfit.
+
+    The looks outside are made with the templates of a faint companion. One half as bright as the
+    star changes V² otherwise: it is found by searches alone, and a fit inside that is far off
+    asks for these. None where the fit is no worse than errors that are somewhat too small make it,
+    or where the data are too many to search again.
+    """
+    likelihood, grid = result.likelihood, result.grid
+    n, alone = likelihood.n_independent, result.chi2_single
+    if n > MAX_COARSE_DATA or min(result.chi2_binary, 0.2 * alone) < FAR_OFF * n:
+        return []
+    fringe = resolution_mas(likelihood)
+    farthest = _affordable(likelihood, Box(grid.inner_mas, outermost(likelihood), fringe))[1]
+    edges = (min(times * grid.outer_mas, farthest) for times in WIDER)
+    return [(grid.inner_mas, edge) for edge in dict.fromkeys(edges) if edge > grid.outer_mas]
+
+
+FAR_OFF = 3.0
+"""χ² per datum of the best companion inside, and a fifth of that of the star alone, from which on
+fields beyond are searched."""
+
+WIDER = (2.5, 6.0)
+"""Outer edges of these fields, in units of that of the first: six times as many positions each."""
+
+EXPLAINED = 0.3
+"""Part of χ² that a companion in a wider field may leave of what that inside does: one of
+unknown noise takes no such share of it."""
+
+
 def _notable(
     likelihood: Likelihood, within: Grid, beyond: Grid, single: FloatArray
 ) -> FloatArray | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.companion_search.field import (
+    EXPLAINED,
     MARGIN,
     SURELY_NOT_NOISE,
     choose_field,
@@ -14,6 +15,7 @@ from amibayes.companion_search.field import (
     look_outside,
     notices_disc,
     resolution_mas,
+    wider_fields,
 )
 from amibayes.companion_search.optimise import fit_single, refine, with_disc
 from amibayes.companion_search.result import SearchResult
@@ -75,6 +77,9 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
                 "default one, a companion fits better than anywhere inside"
             ]
     first = search(likelihood, field)
+    if options.separation_mas is None:
+        first, wider = _in_wider_field(likelihood, first)
+        warnings += wider
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
     if options.companion_diameter is None and shows_disc(likelihood, first):
@@ -82,6 +87,19 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings))
+
+
+def _in_wider_field(likelihood: Likelihood, first: SearchResult) -> tuple[SearchResult, list[str]]:
+    """The search in a wider field, with a warning, where a companion there explains the data."""
+    for field in wider_fields(first):
+        found = search(likelihood, field)
+        if found.chi2_binary < EXPLAINED * first.chi2_binary:
+            place = found.companion.separation_mas
+            return found, [
+                f"the field was widened to {field[1]:.1f} mas: none in the default one fits, "
+                f"and a companion at {place:.1f} mas does far better"
+            ]
+    return first, []
 
 
 def _rival_outside(result: SearchResult) -> list[str]:

@@ -1,4 +1,4 @@
-"""What is free unasked: limb darkening only where the star is resolved past its first null."""
+"""What is chosen unasked: limb darkening past the first null, a field that holds the companion."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from helpers import simulated
 
+from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.pipeline.field import model_of
+from amibayes.pipeline.field import model_of, search_field
 from amibayes.pipeline.options import SearchOptions
 
 STATIONS = np.array([[0.0, 0.0], [30.0, 10.0], [-20.0, 45.0], [60.0, -30.0]])
@@ -26,3 +27,27 @@ def test_limb_darkening_is_free_where_the_star_is_past_its_null(diameter, expect
     found = model_of(Likelihood(data), SearchOptions())
     assert found.limb_darkening == expected
     assert model_of(Likelihood(data), SearchOptions(limb_darkening=0.1)).limb_darkening == 0.1
+
+
+@pytest.mark.parametrize(("position", "outer"), [((4.2, 4.6), 10.2), ((2.2, -1.4), 4.1)])
+def test_a_bright_companion_outside_the_default_field_is_found(position, outer, rng) -> None:
+    """V² of one baseline that turns, one narrow channel: the default field ends at 4.1 mas.
+
+    A companion of 0.56 at 6.2 mas: the templates of faint ones do not show it out there.
+    """
+    sheet = join([
+        point_source(
+            np.array([[0.0, 0.0], [110.0 * np.sin(a), 110.0 * np.cos(a)]]), np.array([2.2e-6]),
+            1e-10, vis2_error=0.02, closure_error_rad=0.02, mjd=60000.0 + a,
+        )
+        for a in np.linspace(-0.5, 0.9, 25)
+    ]).only(["vis2"])  # fmt: skip
+    data = simulated(sheet, [*position, 0.56], rng, BinaryModel(diameter_mas=0.5))
+    found = search_field(data, SearchOptions())
+    companion = found.result.companion
+    mirrored = np.sign(companion.north_mas * position[1])
+    np.testing.assert_allclose(
+        [mirrored * companion.east_mas, mirrored * companion.north_mas], position, atol=0.3
+    )
+    assert found.result.grid.outer_mas == pytest.approx(outer, abs=0.2)
+    assert bool(found.warnings) == (outer > 5.0)
