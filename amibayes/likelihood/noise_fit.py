@@ -109,7 +109,7 @@ class _Fit:
             before = amount
             if self.prior.channels and self.data.freedom is None:
                 shared = one.correlation(amount)
-                shared = one.grown(amount, shared, self.prior)
+                shared = one.with_larger_floors(amount, shared, self.prior)
             amount = one.amount(shared, self.prior.width(part, kind))
             if abs(amount - before) <= 1e-2 * amount:
                 break
@@ -228,7 +228,9 @@ class _Kind:
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
         return correlation_of(self._layout, white, slopes, self._own_floors)
 
-    def grown(self, amount: float, shared: Correlation, prior: NoisePrior) -> Correlation:
+    def with_larger_floors(
+        self, amount: float, shared: Correlation, prior: NoisePrior
+    ) -> Correlation:
         """The same with floors as large as the residuals show them, and not smaller.
 
         Gains and slopes of single exposures tell their size, which is that of a good night in a
@@ -239,9 +241,10 @@ class _Kind:
         floor = max(floors, default=0.0)
         if not floor or not width:
             return shared
-        data = self._with(amount)
-        rows = channel_rows(channel_layout(data), [ChannelShare(shared, shared)], self._own_floors)
-        square = (rows.rotation @ data.covariance.whiten(self.residual)) ** 2
+        base = self._with(amount)
+        layout = channel_layout(replace(self.data, covariance=base))
+        rows = channel_rows(layout, [ChannelShare(shared, shared)], self._own_floors)
+        square = (rows.rotation @ base.whiten(self.residual)) ** 2
         found = [
             self._growth(square[at], rows.sigma[at] ** 2, rows.floor[at], floor / width)
             for at in (rows.level == OFFSET, rows.level == SLOPE)
