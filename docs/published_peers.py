@@ -76,7 +76,7 @@ class Binary:
 
 BINARIES = (
     Binary("ι Peg, MIRC, 4 telescopes", iota_peg, (9.0, 12.0), 1.4, "22–26 %"),
-    Binary("o Leo, GRAVITY, 20220302", lambda d: o_leo(d, "20220302"), (3.0, 6.0), 2.5, "25.4 %"),
+    Binary("o Leo, GRAVITY, 20220302", lambda d: o_leo(d, "20220302"), (3.0, 6.0), 1.2, "25.4 %"),
 )
 
 STARS = "1.0", "0.5"

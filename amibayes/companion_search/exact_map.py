@@ -133,8 +133,9 @@ def lattice_waves(
     likelihood: Likelihood, grid: Grid
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Yield positions (m,) of one half plane with cosine and sine of a point's fringes."""
+    places = np.stack([grid.east_mas, grid.north_mas])
     for index in grid.half_plane(len(likelihood.samples)):
         cosine, sine = np.empty((2, len(likelihood.samples), len(index)))
-        places = grid.east_mas[index], grid.north_mas[index]
-        fringes_into(cosine, sine, likelihood.samples, *places, likelihood.model.smearing)
+        east, north = places[:, index]
+        fringes_into(cosine, sine, likelihood.samples, east, north, likelihood.model.smearing)
         yield index, cosine, sine

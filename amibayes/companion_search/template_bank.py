@@ -6,9 +6,8 @@ the residuals r of the fit without a companion the best contrast is t·r/t·t an
 the gain is that of the best contrasts, none below zero; where a companion moves, rates are
 tried on a lattice and the largest gain counts. Data and null draws have the same statistic.
 
-Three facts make the grid cheap: a position and its mirror image share everything, the whitening
-is folded into one sparse matrix before any position is looked at, and what templates of the whole
-field span are few numbers (`amibayes.companion_search.reduction`).
+Three facts make the grid cheap: a position and its mirror image share everything, whitening is
+one sparse matrix, and templates of the whole field span few numbers (`reduction.reduction_of`).
 """
 
 from __future__ import annotations
@@ -361,8 +360,9 @@ class TemplateBank:
 
         ``drift`` is how far east and north, mas, the companion has moved at each sample.
         """
+        places = np.stack([self.grid.east_mas, self.grid.north_mas])
         for index in self.grid.half_plane(len(self._samples)):
-            east, north = self.grid.east_mas[index], self.grid.north_mas[index]
+            east, north = places[:, index]
             if drift is not None:
                 east, north = east + drift[0][:, None], north + drift[1][:, None]
             yield index, *self._waves_at(east, north)

@@ -98,10 +98,10 @@ def _best_inward(
     own = bank.templates_at(*places.T).astype(np.float32)
     radius, grid = np.hypot(*places.T)[:, None], bank.grid
     best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
-    each = np.arange(len(places))
+    each, every = np.arange(len(places)), np.stack([grid.east_mas, grid.north_mas])
     for index, templates in bank.chunks():
         match = own.T @ templates.astype(np.float32)
-        east, north = grid.east_mas[index], grid.north_mas[index]
+        east, north = every[:, index]
         match[_same_place(bank, fringe_mas, places, east, north)] = 0.0
         inward = (radius - np.hypot(east, north)) / grid.step_mas
         for (most, where), zone in zip(best, (inward > 1.0, np.abs(inward) <= 1.0), strict=True):
