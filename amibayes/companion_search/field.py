@@ -12,6 +12,7 @@ from amibayes.companion_search.optimise import fit_single, refine_at
 from amibayes.companion_search.result import RIVAL, Mode, SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
@@ -47,6 +48,16 @@ def default_separation(likelihood: Likelihood) -> tuple[float, float]:
     frequency = likelihood.samples.frequency
     with np.errstate(divide="ignore"):
         return float(0.5 / frequency.max() / MAS), float(1.0 / frequency.min() / MAS)
+
+
+def refuse_no_length(likelihood: Likelihood) -> None:
+    """Raise a `DataError` where baselines have no length, and there is no field."""
+    if not np.isfinite(default_separation(likelihood)).all():
+        raise DataError(
+            "has baselines of zero or infinite length",
+            source=likelihood.observables.source,
+            remedy="check UCOORD and VCOORD",
+        )
 
 
 def resolution_mas(likelihood: Likelihood) -> float:

@@ -14,6 +14,7 @@ from amibayes.companion_search.field import (
     look_inside,
     look_outside,
     notices_disc,
+    refuse_no_length,
     resolution_mas,
     wider_fields,
 )
@@ -62,6 +63,8 @@ class FieldSearch:
 def search_field(observables: Observables, options: SearchOptions) -> FieldSearch:
     """Search the field; the default one is widened where something around it fits better."""
     likelihood = Likelihood(observables.only(options.observables))
+    if options.separation_mas is None:
+        refuse_no_length(likelihood)
     likelihood = joint_likelihood(
         likelihood.with_model(model_of(likelihood, options)),
         contrast=options.contrast,

@@ -17,7 +17,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits, write_oifits
-from amibayes.oifits.audit import audit, repair
+from amibayes.oifits.audit import audit, errors_in, repair
 from amibayes.oifits.audit.repair import REMEDIES
 
 DEGREE = np.pi / 180
@@ -526,8 +526,10 @@ def test_errors_in_radians_are_told_at_any_vis2(
         return change
 
     for sigma, told in ((right, True), (np.degrees(right), False)):
-        found = codes(changed(rng, tmp_path / "a.fits", with_errors(sigma), kind="diagonal"))
-        assert ("phase-in-radians" in found) == told
+        path = changed(rng, tmp_path / "a.fits", with_errors(sigma), kind="diagonal")
+        assert ("phase-in-radians" in codes(path)) == told
+        said = errors_in(open_oifits(path), read_oifits(path))
+        assert any("look like radians" in line for line in said) == told
 
 
 def reformatted(name: str, column: str, form: str) -> Change:

@@ -8,6 +8,7 @@ from helpers import simulated
 
 from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
+from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.field import model_of, search_field
@@ -51,3 +52,9 @@ def test_a_bright_companion_outside_the_default_field_is_found(position, outer, 
     )
     assert found.result.grid.outer_mas == pytest.approx(outer, abs=0.2)
     assert bool(found.warnings) == (outer > 5.0)
+
+
+def test_baselines_without_length_are_refused_by_their_columns() -> None:
+    data = point_source(np.zeros((4, 2)), [1.6e-6], [1e-8], vis2_error=0.01, closure_error_rad=0.02)
+    with pytest.raises(DataError, match=r"zero or infinite length \(check UCOORD"):
+        search_field(data, SearchOptions())
