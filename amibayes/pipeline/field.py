@@ -80,25 +80,35 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
                 "default one, a companion fits better than anywhere inside"
             ]
     first = search(likelihood, field)
-    if options.separation_mas is None:
-        first, wider = _in_wider_field(likelihood, first)
-        warnings += wider
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
-    if options.companion_diameter is None and shows_disc(likelihood, first):
-        first = _search_for_disc(likelihood, first)
+    first = _with_its_disc(likelihood, first, options)
+    if options.separation_mas is None:
+        first, wider = _in_wider_field(likelihood, first, options)
+        warnings += wider
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings))
 
 
-def _in_wider_field(likelihood: Likelihood, first: SearchResult) -> tuple[SearchResult, list[str]]:
+def _with_its_disc(
+    likelihood: Likelihood, first: SearchResult, options: SearchOptions
+) -> SearchResult:
+    """The search with a free disc of the companion, where V² show one and none was asked for."""
+    if options.companion_diameter is None and shows_disc(likelihood, first):
+        return _search_for_disc(likelihood, first)
+    return first
+
+
+def _in_wider_field(
+    likelihood: Likelihood, first: SearchResult, options: SearchOptions
+) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
     for field in wider_fields(first):
         found = search(likelihood, field)
         if found.chi2_binary < EXPLAINED * first.chi2_binary:
             place = found.companion.separation_mas
-            return found, [
+            return _with_its_disc(likelihood, found, options), [
                 f"the field was widened to {field[1]:.1f} mas: none in the default one fits, "
                 f"and a companion at {place:.1f} mas does far better"
             ]
