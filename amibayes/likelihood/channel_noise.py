@@ -78,6 +78,12 @@ class ChannelShare:
     source: str = ""
 
 
+def share_of(shares: Sequence[ChannelShare], source: str) -> ChannelShare:
+    """The correlations of one file: its own, or those of all."""
+    by_file = {s.source: s for s in shares}
+    return by_file.get(source) or by_file.get("") or ChannelShare()
+
+
 class ChannelCovariance:
     """A covariance with correlations between the channels of each exposure.
 
@@ -164,11 +170,10 @@ def channel_rows(
     layout: ChannelLayout, shares: Sequence[ChannelShare], floors: Sequence[Systematics] = ()
 ) -> ChannelRows:
     """Rows of channels that are correlated as the shares and floors of their files say."""
-    by_file = {s.source: s for s in shares}
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
     growth = np.ones((2, len(layout.order)))
     for k, name in enumerate(layout.names):
-        share = by_file.get(name) or by_file.get("") or ChannelShare()
+        share = share_of(shares, name)
         for kind, found in ((layout.vis2, share.vis2), (~layout.vis2, share.closure_phase)):
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour

@@ -197,11 +197,11 @@ class SmoothBasis:
 
     @property
     def slope_share(self) -> FloatArray:
-        """Variance in each row of an error that changes over the channels, unit mean square.
+        """Variance in each row of an error that changes over channels, its slope of mean square 1.
 
-        As much as in the slope is beside it in curved changes, a quarter of it in the details of
-        the whole range and a quarter of that in those of its halves: red noise, as the
-        transfer functions of spectrographs differ.
+        Beside the slope are curved changes, a quarter of it in the details of the whole range and a
+        quarter of that in those of its halves: red noise, as the transfer functions of
+        spectrographs differ.
         """
         depth = self.depth
         share = CURVED ** (depth + 1.0) / np.bincount(depth + 1)[depth + 1]

@@ -158,10 +158,13 @@ class Unnoticed:
     def log_density(self, x: FloatArray) -> FloatArray:
         """ln of the density at x (n, n_dim), (n,)."""
         companion = replace(self.prior, nuisance=(), half_cauchy=())
-        bare = companion.log_density(x[:, self.parameters.companion()])
-        return np.asarray(
-            bare + self.star.log_density(x[:, self.parameters.nuisance] - self.moved(x))
-        )
+        density = companion.log_density(x[:, self.parameters.companion()])
+        inside = np.isfinite(density)
+        if inside.any():
+            some = x[inside]
+            star = some[:, self.parameters.nuisance] - self.moved(some)
+            density[inside] += self.star.log_density(star)
+        return np.asarray(density)
 
     def moved(self, x: FloatArray) -> FloatArray:
         """What companions at x (n, n_dim) do to the nuisance parameters, (n, n_nuisance)."""

@@ -85,9 +85,11 @@ def gaussian_of(
     theta[bright] = np.clip(theta[bright], least, prior.contrast_max)
     bounded, ranges = _bounded(likelihood, prior)
     theta[bounded] = np.clip(theta[bounded], ranges[:, 0], ranges[:, 1])
-    stretch = np.ones(len(theta))
-    stretch[bright] = 1.0 / theta[bright]
-    values, vectors = np.linalg.eigh(likelihood.errors(theta) * np.outer(stretch, stretch))
+    stretch, errors = np.ones(len(theta)), likelihood.errors(theta)
+    # Data that say nothing of a contrast leave it as wide as the prior.
+    known = np.log(prior.contrast_max / prior.contrast_min) / np.sqrt(np.diag(errors)[bright])
+    stretch[bright] = np.minimum(1.0 / theta[bright], known)
+    values, vectors = np.linalg.eigh(errors * np.outer(stretch, stretch))
     theta[bright] = np.log(theta[bright])
     limit = max(widest * prior.outer_mas, 1.0)
     return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))

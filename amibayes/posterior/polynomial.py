@@ -181,6 +181,8 @@ class Around:
         for _ in range(ROUNDS):
             z, value = self.drawn(centre, scatter, WIDER, FIRST_DRAWS * n_dim, np.inf)
             x = centre + z @ scatter.T
+            if len(x) < LEAST_EFFECTIVE * n_dim:  # far wider than the prior
+                return None
             log_weight = value + self.prior.prior.log_density(x) + 0.5 * (z * z).sum(1) / WIDER**2
             weight, power = tempered(log_weight, LEAST_EFFECTIVE * n_dim)
             centre, scatter = _moments(x, weight)
@@ -200,6 +202,8 @@ class Around:
         x = first.draw(self.rng, TAIL_DRAWS * n_dim)
         log_prior = self.prior.prior.log_density(x)
         x, log_prior = x[np.isfinite(log_prior)], log_prior[np.isfinite(log_prior)]
+        if len(x) < LEAST_EFFECTIVE * n_dim:
+            return first
         value = self.log_prob(physical(x, self.prior.parameters))
         log_weight = value + log_prior - first.log_density(x)
         weight, _ = tempered(log_weight, LEAST_EFFECTIVE * n_dim)

@@ -11,6 +11,7 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import NoisePosterior
+from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.support.atomic_files import sha256
 
@@ -90,18 +91,27 @@ def in_errors_json(noise: ExtraNoise, stated: Observables) -> Json:
 
 
 def systematics_json(noise: ExtraNoise) -> list[Json]:
-    """Floors of calibration errors that were taken for certain, file by file."""
-    return [
-        {
-            "path": f.source,
-            "vis2_relative": f.vis2,
-            "visibility": f.visibility,
-            "closure_phase_deg": float(np.degrees(f.closure_phase_rad)),
-            "instrument": f.instrument or None,
-            "reference": f.reference or None,
+    """Floors of calibration errors, file by file, and how many times as large they were found."""
+    out = []
+    for f in noise.floors:
+        share = share_of(noise.channels, f.source)
+        times = {
+            f"{key}_{part}_times": float(np.sqrt(getattr(found, part)))
+            for key, found in (("vis2", share.vis2), ("closure_phase", share.closure_phase))
+            for part in ("offset", "slope")
         }
-        for f in noise.floors
-    ]
+        out.append(
+            {
+                "path": f.source,
+                "vis2_relative": f.vis2,
+                "visibility": f.visibility,
+                "closure_phase_deg": float(np.degrees(f.closure_phase_rad)),
+                "instrument": f.instrument or None,
+                "reference": f.reference or None,
+                **times,
+            }
+        )
+    return out
 
 
 def noise_interval(found: NoisePosterior, unit: float) -> Json:

@@ -11,10 +11,11 @@ from helpers import NIRISS_HOLES
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.data.systematics import Systematics, n_exposures, systematics_of, table
-from amibayes.likelihood.channel_noise import noise_with_channels
-from amibayes.likelihood.extra_noise import NoisePrior
+from amibayes.likelihood.channel_noise import ChannelShare, Correlation, noise_with_channels
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.report.common import systematics_json
 
 
 def exposures(n: int, insname: str = "PIONIER_Pnat", channels: int = 1) -> Observables:
@@ -79,9 +80,10 @@ def test_channels_share_the_floor_so_that_their_mean_keeps_it() -> None:
     matrix = noise.covariance.dense()
     at = np.flatnonzero(data.vis2.row == data.vis2.row[0])
     block = matrix[np.ix_(at, at)]
-    # Half of the floor is an offset, half a slope, whose mean is none.
+    # Half of the floor is an offset, half a slope, whose mean is none; and curves beside it.
     assert block.mean() == pytest.approx(0.01**2 / 8 + 0.5 * 0.03**2, rel=1e-6)
-    assert np.diag(block).mean() == pytest.approx(0.01**2 + 0.03**2, rel=0.02)
+    curves = 0.5 * 0.03**2 * (1 / 4 + 1 / 16)
+    assert np.diag(block).mean() == pytest.approx(0.01**2 + 0.03**2 + curves, rel=1e-6)
     assert noise.floor
 
 
@@ -105,3 +107,11 @@ def test_an_additive_visibility_error_is_what_is_left_near_a_null() -> None:
     # V² of (V + ε)² errs by 2Vε.
     expected = 0.01**2 + (0.03 * value) ** 2 + 4.0 * value * 0.02**2
     np.testing.assert_allclose(variance, expected, rtol=1e-9)
+
+
+def test_result_has_how_much_larger_than_their_floor_errors_were_found() -> None:
+    floors = tuple(Systematics(name, 0.02, 0.0, 0.01) for name in ("a", "b"))
+    shares = (ChannelShare(vis2=Correlation(offset=4.0, slope=2.25), source="a"),)
+    first, second = systematics_json(ExtraNoise(channels=shares, floors=floors))
+    assert (first["vis2_offset_times"], first["vis2_slope_times"]) == (2.0, 1.5)
+    assert first["closure_phase_offset_times"] == second["vis2_offset_times"] == 1.0
