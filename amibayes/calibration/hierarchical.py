@@ -16,7 +16,7 @@ from scipy.sparse import coo_array, csr_array
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.scatter_likelihood import AT_ONCE, Group, Population, population_of
-from amibayes.calibration.scatter_posterior import sample_tau, tau_posterior
+from amibayes.calibration.scatter_posterior import ScatterGrid, sample_tau
 from amibayes.calibration.transfer import Transfer
 from amibayes.calibration.weighted import TransferFunction, shared_changes
 from amibayes.support.shared_results import shared
@@ -33,8 +33,8 @@ def _posterior_of(
     """
 
     def made() -> tuple[tuple[FloatArray, FloatArray, FloatArray], Any]:
-        found = sample_tau(population, rng), *tau_posterior(population)
-        return found, rng.bit_generator.state
+        grid = ScatterGrid.of(population)
+        return (sample_tau(grid, rng), *grid.posterior), rng.bit_generator.state
 
     found, after = shared(made, "scatter between calibrators", population, rng.bit_generator.state)
     rng.bit_generator.state = after

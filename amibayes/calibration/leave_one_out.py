@@ -15,7 +15,7 @@ import numpy as np
 
 from amibayes.calibration.matching import Keys
 from amibayes.calibration.scatter_likelihood import Group, Population, population_of
-from amibayes.calibration.scatter_posterior import tau_posterior
+from amibayes.calibration.scatter_posterior import ScatterGrid
 from amibayes.calibration.transfer import Diameter, Transfer, on_one_branch, transfer_of
 from amibayes.data.observables import Observables
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -205,7 +205,7 @@ def leave_out(
     if len(others) == 1:
         tau, weight = np.zeros((1, 2)), np.ones(1)
     else:
-        tau, weight = tau_posterior(population_of(both[1:], keys, common))
+        tau, weight = ScatterGrid.of(population_of(both[1:], keys, common)).posterior
     names = dict.fromkeys(n for t in both if t.shared is not None for n in t.shared.names)
     nothing = np.zeros(len(keys))
     changes = [[nothing if t.shared is None else t.shared.change(n) for t in both] for n in names]

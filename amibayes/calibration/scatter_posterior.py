@@ -9,6 +9,7 @@ import numpy as np
 
 from amibayes.calibration.scatter_likelihood import Population
 from amibayes.errors import RunError
+from amibayes.support.ensemble_moves import leaps_of
 from amibayes.units import FloatArray, IntArray
 
 LOWEST, HIGHEST = 0.01, 3.0
@@ -32,21 +33,8 @@ CHECK_EVERY = 100
 MAX_STEPS = 8000
 
 
-def tau_posterior(population: Population) -> tuple[FloatArray, FloatArray]:
-    """Scatters between calibrators (m, 2) and their posterior (m,), on a grid.
-
-    Where moments are enough. Nodes that do not count are left out; a kind that is absent has
-    scatter 0.
-    """
-    found = Proposals.of(population)
-    tau, weight = np.zeros((found.weight.size, 2)), found.weight.ravel()
-    tau[:, found.present] = found.nodes * found.scale
-    used = weight > NEGLIGIBLE * weight.max()
-    return tau[used], weight[used] / weight[used].sum()
-
-
 @dataclass(frozen=True, eq=False)
-class Proposals:
+class ScatterGrid:
     """The posterior on a grid, of scatters in units of their prior's scale, to draw from.
 
     Parameters
@@ -66,7 +54,7 @@ class Proposals:
     weight: FloatArray
 
     @classmethod
-    def of(cls, population: Population) -> Proposals:
+    def of(cls, population: Population) -> ScatterGrid:
         """Lay the grid where the posterior is, by one that covers the prior.
 
         The prior's tail is no bound: of errors that are far too small the data tell a scatter of
@@ -76,23 +64,23 @@ class Proposals:
         ends = [(LOWEST, HIGHEST)] * len(present)
         while True:
             found = cls.over(population, present, ends)
-            beyond = [_used(w)[-1] == NODES - 1 for w in found._of_axes()]
-            if not any(beyond):
+            spans = found._spans()
+            if all(last < NODES - 1 for _, last in spans):
                 break
             ends = [
-                (low, FURTHER * high if b else high)
-                for (low, high), b in zip(ends, beyond, strict=True)
+                (low, FURTHER * high if last == NODES - 1 else high)
+                for (low, high), (_, last) in zip(ends, spans, strict=True)
             ]
         ends = [
-            (axis[max(_used(w)[0] - 1, 0)], axis[_used(w)[-1] + 1])
-            for axis, w in zip(found.axes, found._of_axes(), strict=True)
+            (axis[max(first - 1, 0)], axis[last + 1])
+            for axis, (first, last) in zip(found.axes, spans, strict=True)
         ]
         return cls.over(population, present, ends)
 
     @classmethod
     def over(
         cls, population: Population, present: IntArray, ends: list[tuple[float, float]]
-    ) -> Proposals:
+    ) -> ScatterGrid:
         """Lay the grid between ends of each axis."""
         axes = [np.geomspace(*end, NODES) for end in ends]
         found = cls(population, present, axes, np.ones([NODES] * len(present)))
@@ -101,11 +89,22 @@ class Proposals:
         weight = np.exp(log_p - log_p.max()).reshape(found.weight.shape)
         return replace(found, weight=weight / weight.sum())
 
-    def _of_axes(self) -> list[FloatArray]:
-        """Highest weight of each node of each axis, in units of the highest of all."""
-        axes = range(self.weight.ndim)
-        others = [tuple(k for k in axes if k != axis) for axis in axes]
-        return [self.weight.max(axis=other) / self.weight.max() for other in others]
+    def _spans(self) -> list[tuple[int, int]]:
+        """First and last node of each axis that count."""
+        counts = self.weight > NEGLIGIBLE * self.weight.max()
+        used = [np.unique(at) for at in np.nonzero(counts)]
+        return [(int(at[0]), int(at[-1])) for at in used]
+
+    @property
+    def posterior(self) -> tuple[FloatArray, FloatArray]:
+        """Scatters between calibrators (m, 2) and their posterior (m,), for moments.
+
+        Nodes that do not count are left out; a kind that is absent has scatter 0.
+        """
+        tau, weight = np.zeros((self.weight.size, 2)), self.weight.ravel()
+        tau[:, self.present] = self.nodes * self.scale
+        used = weight > NEGLIGIBLE * weight.max()
+        return tau[used], weight[used] / weight[used].sum()
 
     @property
     def scale(self) -> FloatArray:
@@ -124,16 +123,16 @@ class Proposals:
         tau[:, self.present] = relative * self.scale
         return self.population.log_prob(tau)
 
-    def draw(self, n: int, rng: np.random.RandomState) -> FloatArray:
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
         """Scatters (n, d): even within cells, a few from the prior."""
         cell = rng.choice(self.weight.size, n, p=self.weight.ravel())
         place = np.unravel_index(cell, self.weight.shape)
-        part = rng.random_sample((n, len(self.axes)))
+        part = rng.random((n, len(self.axes)))
         drawn = [
             edge[at] + share * np.diff(edge)[at]
             for edge, at, share in zip(self._edges(), place, part.T, strict=True)
         ]
-        from_prior = rng.random_sample(n) < FROM_PRIOR
+        from_prior = rng.random(n) < FROM_PRIOR
         prior = np.abs(rng.standard_normal((n, len(self.axes))))
         return np.where(from_prior[:, None], prior, np.stack(drawn, axis=1))
 
@@ -159,12 +158,7 @@ class Proposals:
         ]
 
 
-def _used(weight: FloatArray) -> IntArray:
-    """Nodes that count."""
-    return np.flatnonzero(weight > NEGLIGIBLE)
-
-
-def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:
+def sample_tau(grid: ScatterGrid, rng: np.random.Generator) -> FloatArray:
     """Draw τ from its posterior with emcee, (n, 2); NaN for a kind that is absent.
 
     Proposals come out of the posterior on a grid: a walker forgets its place in a step or two.
@@ -174,17 +168,11 @@ def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:
     RunError
         Where the chain is shorter than 50 autocorrelation times.
     """
-    grid = Proposals.of(population)
-
-    def leap(old: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
-        new = grid.draw(len(old), random)
-        return new, grid.log_density(old) - grid.log_density(new)
-
     # emcee wants the state of numpy's older generator; it is seeded from ours.
     older = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))
-    start = grid.draw(N_WALKERS, older)
+    start = grid.draw(older, N_WALKERS)
     sampler = emcee.EnsembleSampler(
-        *start.shape, grid.log_prob, vectorize=True, moves=emcee.moves.MHMove(leap)
+        *start.shape, grid.log_prob, vectorize=True, moves=emcee.moves.MHMove(leaps_of(grid))
     )
     state = emcee.State(start, random_state=older.get_state())
     time = np.inf
@@ -199,4 +187,4 @@ def sample_tau(population: Population, rng: np.random.Generator) -> FloatArray:
     return tau
 
 
-__all__ = ["Proposals", "sample_tau", "tau_posterior"]
+__all__ = ["ScatterGrid", "sample_tau"]

@@ -133,7 +133,7 @@ def lattice_waves(
     likelihood: Likelihood, grid: Grid
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
     """Yield positions (m,) of one half plane with cosine and sine of a point's fringes."""
-    places = np.stack([grid.east_mas, grid.north_mas])
+    places = grid.places
     for index in grid.half_plane(len(likelihood.samples)):
         cosine, sine = np.empty((2, len(likelihood.samples), len(index)))
         east, north = places[:, index]

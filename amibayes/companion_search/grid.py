@@ -52,6 +52,11 @@ class Grid:
         return np.asarray(self.rows * self.step_mas, dtype=float)
 
     @property
+    def places(self) -> FloatArray:
+        """East and north offsets, (2, n)."""
+        return np.stack([self.east_mas, self.north_mas])
+
+    @property
     def half_width(self) -> int:
         """Number of lattice points from the star to the edge of the map."""
         return int(self.outer_mas / self.step_mas)

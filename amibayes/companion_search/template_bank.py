@@ -360,7 +360,7 @@ class TemplateBank:
 
         ``drift`` is how far east and north, mas, the companion has moved at each sample.
         """
-        places = np.stack([self.grid.east_mas, self.grid.north_mas])
+        places = self.grid.places
         for index in self.grid.half_plane(len(self._samples)):
             east, north = places[:, index]
             if drift is not None:

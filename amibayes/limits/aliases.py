@@ -98,7 +98,7 @@ def _best_inward(
     own = bank.templates_at(*places.T).astype(np.float32)
     radius, grid = np.hypot(*places.T)[:, None], bank.grid
     best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
-    each, every = np.arange(len(places)), np.stack([grid.east_mas, grid.north_mas])
+    each, every = np.arange(len(places)), grid.places
     for index, templates in bank.chunks():
         match = own.T @ templates.astype(np.float32)
         east, north = every[:, index]

@@ -19,7 +19,7 @@ import numpy as np
 from amibayes.calibration.hierarchical import predictive
 from amibayes.calibration.matching import keys_of
 from amibayes.calibration.scatter_likelihood import population_of
-from amibayes.calibration.scatter_posterior import tau_posterior
+from amibayes.calibration.scatter_posterior import ScatterGrid
 from amibayes.calibration.transfer import transfer_of
 from amibayes.companion_search.search import search
 from amibayes.data.closure import closure_matrix, kernel_basis
@@ -371,7 +371,8 @@ def calibrated_covariance(
     for stars in drawn:
         seen = [transfer_of(photons.with_data(star), keys, (0.0, 0.0)) for star in stars]
         population = population_of(seen, keys, seen[0].seen)
-        response = predictive(population, *tau_posterior(population), len(keys))[1].toarray()
+        tau, weight = ScatterGrid.of(population).posterior
+        response = predictive(population, tau, weight, len(keys))[1].toarray()
         total += response[np.ix_(keys.key, keys.key)] * np.outer(keys.sign, keys.sign)
     return np.asarray(noise + total / REALISATIONS)
 

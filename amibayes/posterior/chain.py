@@ -20,7 +20,7 @@ from amibayes.posterior.laplace import physical, sampled
 from amibayes.posterior.modes import Region
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
 from amibayes.support import request
-from amibayes.support.ensemble_moves import along_others
+from amibayes.support.ensemble_moves import Leaps, along_others
 from amibayes.units import FloatArray
 
 N_WALKERS = 32
@@ -40,10 +40,6 @@ GOOD_RHAT = 1.02
 
 N_TRIALS = 20_000
 """Draws of the prior among which walkers without a start find one: half a second."""
-
-
-Leaps = Callable[[FloatArray, np.random.RandomState], tuple[FloatArray, FloatArray]]
-"""Places (n, n_dim) proposed for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
 
 
 @dataclass(frozen=True, eq=False)

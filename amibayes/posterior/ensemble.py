@@ -18,7 +18,6 @@ from amibayes.posterior.chain import (
     MAX_STEPS,
     N_WALKERS,
     EnsembleSampler,
-    Leaps,
     burn_in,
     long_enough,
     longest,
@@ -35,6 +34,7 @@ from amibayes.posterior.polynomial import PolynomialLogProb, polynomial_log_prob
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import ModelPrior
 from amibayes.support.arguments import checks_arguments, one_of
+from amibayes.support.ensemble_moves import Leaps, leaps_of
 from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.support.optional import optional_package
@@ -239,9 +239,9 @@ def sample(
     if grid is not None:
         leaps = leaps_within(grid, region)
     elif (quick := _quick(result, everything, rng)) is not None:
-        leaps = quick.leaps
+        leaps = leaps_of(quick.around)
     else:
-        leaps = mode_mixture(result.likelihood, modes_to_sample(result), prior, rng)
+        leaps = leaps_of(mode_mixture(result.likelihood, modes_to_sample(result), prior, rng))
     walkers = EnsembleSampler(start, region, leaps, path, resume, max_steps, progress)
     chain = walkers.run(quick or result.likelihood.log_prob, everything, rng)
     return _posterior(chain, result, prior, grid)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from scipy.special import logsumexp
@@ -23,6 +22,7 @@ from amibayes.posterior.nuisance import StarAlone, star_alone
 from amibayes.posterior.polynomial import Around
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior, log_mean
+from amibayes.support.ensemble_moves import Proposal
 from amibayes.units import FloatArray, IntArray
 
 N_DRAWS = 20_000
@@ -113,18 +113,6 @@ def leaps_within(grid: GridPosterior, region: Region) -> IndependenceProposal | 
     return IndependenceProposal(grid.within(inside))
 
 
-class Proposal(Protocol):
-    """Places in the sampled coordinates (ln contrast), and their density."""
-
-    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
-        """Draws (n, n_dim)."""
-        ...
-
-    def log_density(self, x: FloatArray) -> FloatArray:
-        """ln of the density at x (n, n_dim), (n,)."""
-        ...
-
-
 class Unnoticed:
     """A companion as the prior has it, beside the star as the data then have it.
 
@@ -178,7 +166,7 @@ class Unnoticed:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Proposals in given shares; called, it is one for `emcee.moves.MHMove`.
+    """Proposals in given shares.
 
     Parameters
     ----------
@@ -199,13 +187,6 @@ class Mixture:
         """ln of the density at x (n, n_dim), (n,)."""
         parts = [p.log_density(x) for p in self.parts]
         return np.asarray(logsumexp(parts, axis=0, b=self.share[:, None]))
-
-    def __call__(
-        self, walkers: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose places (n, n_dim) for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
-        places = self.draw(random, len(walkers))
-        return places, self.log_density(walkers) - self.log_density(places)
 
 
 WORTH = 0.05

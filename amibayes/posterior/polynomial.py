@@ -90,18 +90,9 @@ class PolynomialLogProb:
             out[~near] = self.exact(theta[~near])
         return out
 
-    def leaps(
-        self, walkers: FloatArray, random: np.random.RandomState
-    ) -> tuple[FloatArray, FloatArray]:
-        """Propose places (n, n_dim) for walkers (n, n_dim), and ln q(old)/q(new), (n,).
-
-        For `emcee.moves.MHMove`: from a t distribution of the posterior's mean and covariance.
-        """
-        places = self._around.draw(random, len(walkers))
-        return places, self._around.log_density(walkers) - self._around.log_density(places)
-
     @cached_property
-    def _around(self) -> HeavyTailed:
+    def around(self) -> HeavyTailed:
+        """A t distribution of the posterior's mean and covariance, to draw from."""
         return HeavyTailed(self.centre, np.asarray(np.linalg.inv(self.unit), dtype=float))
 
 

@@ -2,7 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Protocol
+
 import emcee
+import numpy as np
+
+from amibayes.units import FloatArray
+
+Leaps = Callable[[FloatArray, np.random.RandomState], tuple[FloatArray, FloatArray]]
+"""Places (n, n_dim) proposed for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
+
+
+class Proposal(Protocol):
+    """Places in the sampled coordinates, and their density."""
+
+    def draw(self, rng: np.random.Generator | np.random.RandomState, n: int) -> FloatArray:
+        """Draws (n, n_dim)."""
+        ...
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """ln of the density at x (n, n_dim), (n,)."""
+        ...
+
+
+def leaps_of(proposal: Proposal) -> Leaps:
+    """Proposals that do not start from where a walker is, for `emcee.moves.MHMove`."""
+
+    def leaps(walkers: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+        places = proposal.draw(random, len(walkers))
+        return places, proposal.log_density(walkers) - proposal.log_density(places)
+
+    return leaps
 
 
 def along_others() -> list[tuple[emcee.moves.Move, float]]:

@@ -17,7 +17,7 @@ from amibayes.calibration import Calibration, calibrate
 from amibayes.calibration.hierarchical import predictive
 from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.scatter_likelihood import population_of
-from amibayes.calibration.scatter_posterior import Proposals, sample_tau, tau_posterior
+from amibayes.calibration.scatter_posterior import ScatterGrid, sample_tau
 from amibayes.calibration.transfer import Transfer, transfer_of, uniform_disc, wrapped
 from amibayes.calibration.weighted import clipped, weighted_response
 from amibayes.data.closure import canonical, closure_matrix, kernel_basis
@@ -425,14 +425,15 @@ def test_sampled_scatter_against_a_grid(tau: float, rng: np.random.Generator) ->
     values = 0.8 + 0.01 * np.hypot(1, tau) * rng.normal(size=(4, 21))
     stars = transfers(values, np.full((4, 21), 0.01))
     population = population_of(stars, keys, np.ones(21, dtype=bool))
-    draws = sample_tau(population, np.random.default_rng(1))
+    proposals = ScatterGrid.of(population)
+    draws = sample_tau(proposals, np.random.default_rng(1))
     weight, grid = grid_moments(population, np.linspace(1e-6, 0.03 * max(tau, 2.0), 20_000))
     for power in (1, 2):
         expected = weight @ grid[:, 0] ** power
         # 20 walkers x 100 steps / 2: 1000 independent draws, of relative width < 1.
         np.testing.assert_allclose((draws[:, 0] ** power).mean(), expected, rtol=0.15)
     assert np.isnan(draws[:, 1]).all()
-    value, covariance = predictive(population, *tau_posterior(population), 21)
+    value, covariance = predictive(population, *proposals.posterior, 21)
     mean, inverse = population.groups[0].response(grid)
     np.testing.assert_allclose(value, weight @ mean[..., 0], rtol=1e-4)
     spread = weight @ (mean[..., 0] - value) ** 2
@@ -448,8 +449,8 @@ def test_proposals_of_scatter_have_the_density_that_is_stated(rng: np.random.Gen
     values = 0.8 + 0.02 * rng.normal(size=(4, 21))
     stars = transfers(values, np.full((4, 21), 0.01))
     population = population_of(stars, keys_of(vis2_keys(7)), np.ones(21, dtype=bool))
-    proposals = Proposals.of(population)
-    drawn = proposals.draw(20_000, np.random.RandomState(3))[:, 0]
+    proposals = ScatterGrid.of(population)
+    drawn = proposals.draw(np.random.RandomState(3), 20_000)[:, 0]
     fine = np.linspace(0.0, 6.0, 60_001)
     density = np.exp(proposals.log_density(fine[:, None]))
     share = np.cumsum(density) * (fine[1] - fine[0])

@@ -14,7 +14,7 @@ from amibayes.calibration import calibrate
 from amibayes.calibration.leave_one_out import leave_out
 from amibayes.calibration.matching import keys_of
 from amibayes.calibration.scatter_likelihood import population_of
-from amibayes.calibration.scatter_posterior import sample_tau, tau_posterior
+from amibayes.calibration.scatter_posterior import ScatterGrid, sample_tau
 from amibayes.calibration.transfer import transfer_of
 from amibayes.companion_search.optimise import refine
 from amibayes.data.observables import Observables
@@ -143,8 +143,9 @@ def test_scatter_on_a_grid_is_that_of_the_chain(rng) -> None:
     keys = keys_of(stars[0])
     seen = [transfer_of(s, keys, (0.0, 0.0)) for s in stars]
     population = population_of(seen, keys, seen[0].seen)
-    tau, weight = tau_posterior(population)
-    chain = sample_tau(population, rng)
+    grid = ScatterGrid.of(population)
+    tau, weight = grid.posterior
+    chain = sample_tau(grid, rng)
     np.testing.assert_allclose(weight @ tau, chain.mean(axis=0), rtol=0.05)
     spread = np.sqrt(weight @ tau**2 - (weight @ tau) ** 2)
     np.testing.assert_allclose(spread, chain.std(axis=0), rtol=0.15)

@@ -93,12 +93,12 @@ def audit(path: str | Path | OIFits) -> Audit:
     return Audit(oifits, tuple(sorted(found, key=lambda f: f.severity != "error")))
 
 
-SAID = ("phase-in-radians",)
-"""Likely faults that spoil an analysis: said beside the errors."""
+ALSO_WARNED_OF = ("phase-in-radians",)
+"""Likely faults that spoil an analysis: a search warns of them beside the errors."""
 
 
 def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
-    """What an audit calls an error, and `SAID`, one line for each kind, of data read already.
+    """What an audit calls an error, and `ALSO_WARNED_OF`, one line a kind, of data read already.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
     found += [f for check in geometry.DATA_CHECKS for f in check(oifits, [observables])]
     groups: dict[str, list[Finding]] = {}
     for finding in found:
-        if finding.severity == "error" or finding.code in SAID:
+        if finding.severity == "error" or finding.code in ALSO_WARNED_OF:
             groups.setdefault(finding.code, []).append(finding)
     return tuple(_line(group) for group in groups.values())
 
