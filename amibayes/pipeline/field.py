@@ -25,6 +25,12 @@ from amibayes.companion_search.search import search
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import systematics_of
+from amibayes.detection.outlying_rows import (
+    OutlyingRow,
+    may_be_left_out,
+    outlying_rows,
+    without_rows,
+)
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -52,16 +58,59 @@ class FieldSearch:
     noise : ExtraNoise
         The most likely, beyond the stated errors.
     warnings : tuple of str
-        On the edges of the field.
+        On the edges of the field, and of rows that were left out.
+    observables : Observables
+        Of all kinds, without the rows that were left out.
+    left_out : tuple of OutlyingRow
+        Rows that the fit to all others is far from explaining.
     """
 
     result: SearchResult
     noise: ExtraNoise
     warnings: tuple[str, ...]
+    observables: Observables
+    left_out: tuple[OutlyingRow, ...] = ()
+
+
+MAX_LEFT_OUT = 4
+"""Rows that are left out in all: each costs a search."""
 
 
 def search_field(observables: Observables, options: SearchOptions) -> FieldSearch:
-    """Search the field; the default one is widened where something around it fits better."""
+    """Search the field; the default one is widened where something around it fits better.
+
+    A few rows that the best fit to all others is far from explaining are left out, one after the
+    other. Where leaving out so few does not end it, or one of them is explained in the end, the
+    model is what is wrong: all data are searched as they are.
+    """
+    whole = found = _search_field(observables, options)
+    if options.keep_outliers or options.robust:
+        return whole
+    left_out: tuple[OutlyingRow, ...] = ()
+    used = observables.only(options.observables)
+    for _ in range(MAX_LEFT_OUT + 1):
+        outlying = outlying_rows(used, found.result.likelihood, found.result.theta)
+        more = [row for row in outlying if row not in left_out]
+        if not more:
+            break
+        left_out = (*left_out, more[0])
+        if not may_be_left_out(used, left_out):
+            return whole
+        found = _search_field(without_rows(observables, left_out), options)
+    if not left_out or set(outlying) != set(left_out):
+        return whole
+    return replace(found, left_out=outlying, warnings=(*map(_told, outlying), *found.warnings))
+
+
+def _told(row: OutlyingRow) -> str:
+    return (
+        f"{row} was left out: it is {row.deviation:.0f} errors away from what fits all other data "
+        "(--keep-outliers takes it in)"
+    )
+
+
+def _search_field(observables: Observables, options: SearchOptions) -> FieldSearch:
+    """Search all of the data."""
     likelihood = Likelihood(observables.only(options.observables))
     if options.separation_mas is None:
         refuse_no_length(likelihood)
@@ -88,7 +137,7 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
         warnings += wider
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
-    return FieldSearch(result, noise, tuple(warnings))
+    return FieldSearch(result, noise, tuple(warnings), observables)
 
 
 def _with_its_disc(

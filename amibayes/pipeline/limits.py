@@ -15,6 +15,7 @@ from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, draws_needed, reachable
+from amibayes.detection.outlying_rows import OutlyingRow
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.analytic import analytic_limit
@@ -88,6 +89,10 @@ class MeasuredLimit:
     noise : ExtraNoise
     significance : Significance or None
     limit : Limit
+    data : Observables
+        That it was measured from, of all kinds.
+    left_out : tuple of OutlyingRow
+        What was left out of them.
     """
 
     observables: Kinds
@@ -95,6 +100,8 @@ class MeasuredLimit:
     noise: ExtraNoise
     significance: Significance | None
     limit: Limit
+    data: Observables
+    left_out: tuple[OutlyingRow, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -169,7 +176,7 @@ def measure_limits(
         ready = run.keep("data", lambda: prepare(targets, calibrators, options.search, rng, run))
         limits, notes = _all_limits(ready, options, seeds[5:], run)
         models, beside = beside_models(
-            ready.observables, limits[0], options.search, np.random.default_rng(seeds[4]), run
+            limits[0].data, limits[0], options.search, np.random.default_rng(seeds[4]), run
         )
     return LimitsReport(
         options,
@@ -195,7 +202,7 @@ def beside_models(
     """Compare models of the sky where they were asked for, and limits beside a stated disc."""
     if search.models is None:
         return None, None
-    found = FieldSearch(main.result, main.noise, ())
+    found = FieldSearch(main.result, main.noise, (), data)
     search = replace(search, observables=main.observables)
     grid = main.result.grid
     prior = default_prior(main.result.likelihood, grid.inner_mas, grid.outer_mas)
@@ -288,8 +295,16 @@ def _one_limit(
             )  # fmt: skip
     with run.stage(f"limits {name}"):
         limit = _limit(found, tested, options, streams[1], run)
-    measured = MeasuredLimit(search.observables, found.result, found.noise, tested, limit)
-    notes = search_warnings(data, found.result, found.noise, tested, None)
+    measured = MeasuredLimit(
+        search.observables,
+        found.result,
+        found.noise,
+        tested,
+        limit,
+        found.observables,
+        found.left_out,
+    )
+    notes = search_warnings(found.observables, found.result, found.noise, tested, None)
     return measured, [*found.warnings, *notes]
 
 

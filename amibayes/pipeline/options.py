@@ -109,6 +109,8 @@ class SearchOptions:
         instrument, for files of few exposures, or share of V² and degrees of closure phase.
     robust : bool
         Student-t residuals: data that fit nothing lose their weight.
+    keep_outliers : bool
+        Use all rows, those too that the best fit to all others is far from explaining.
     file_noise : bool, optional
         Fit that noise to every file by itself; by default where there are several.
     posterior, limits : bool
@@ -160,6 +162,7 @@ class SearchOptions:
     bootstrap: int = 0
     systematics: Literal["table", "none"] | tuple[float, float] = "table"
     robust: bool = False
+    keep_outliers: bool = False
     file_noise: bool | None = None
     posterior: bool = True
     limits: bool = True

@@ -11,6 +11,7 @@ from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.outlying_rows import OutlyingRow
 from amibayes.detection.verdict import Verdict
 from amibayes.extraction.charge import CubeMigration
 from amibayes.likelihood.averaged_noise import NoisePosterior
@@ -52,6 +53,7 @@ class SearchReport(Shown):
     models: ModelComparison | None = None
     limits_beside: LimitsBeside | None = None
     charge_migration: CubeMigration | None = None
+    left_out: tuple[OutlyingRow, ...] = ()
     timing_s: dict[str, float] = field(default_factory=dict)
 
     def rows(self) -> Rows:

@@ -101,8 +101,8 @@ def search_companion(
         found = run.keep("search", lambda: _searched(ready, options, run))
         tests = _tested(ready, found, options, rng, run)
         limits = run.keep("limits", lambda: _limits(found, tests, options, rng["limits"], run))
-        posterior = _inferred(ready, found, options, rng, run, (chain, resume))
-        models, beside = run.keep("models", lambda: _compared(ready, found, options, rng, run))
+        posterior = _inferred(found, options, rng, run, (chain, resume))
+        models, beside = run.keep("models", lambda: _compared(found, options, rng, run))
     report = _report(options, ready, found, tests, limits, posterior)
     return replace(
         with_models(report, models, beside),
@@ -113,11 +113,11 @@ def search_companion(
 
 
 def _compared(
-    ready: Prepared, found: Found, options: SearchOptions, rng: Streams, run: Run
+    found: Found, options: SearchOptions, rng: Streams, run: Run
 ) -> tuple[ModelComparison | None, LimitsBeside | None]:
     """Compare models of the sky, and measure limits beside a disc; None where not asked for."""
     prior = _prior(found.result, options)
-    models = compare_stage(ready.observables, found, prior, options, rng["models"], run)
+    models = compare_stage(found.observables, found, prior, options, rng["models"], run)
     return models, limits_stage(models, found, options, rng["models"], run)
 
 
@@ -134,7 +134,7 @@ def _streams(seed: int) -> Streams:
 class Found(FieldSearch):
     """The search stage: the field, and a second companion where one was asked for."""
 
-    two: TwoCompanions | None
+    two: TwoCompanions | None = None
 
 
 def _searched(ready: Prepared, options: SearchOptions, run: Run) -> Found:
@@ -144,7 +144,7 @@ def _searched(ready: Prepared, options: SearchOptions, run: Run) -> Found:
     if 2 in _counts(options):
         with run.stage("second companion"):
             two = search_second(field.result)
-    return Found(field.result, field.noise, field.warnings, two)
+    return Found(field.result, field.noise, field.warnings, field.observables, field.left_out, two)
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams,
     verdict, splits = run.keep_stage(
         "verdict",
         lambda: verdict_of(
-            found.result, first, ready.observables, options, rng["verdict"], run.executor,
+            found.result, first, found.observables, options, rng["verdict"], run.executor,
             ready.exchangeable,
         ),
     )  # fmt: skip
@@ -221,7 +221,6 @@ class Inference:
 
 
 def _inferred(
-    ready: Prepared,
     found: Found,
     options: SearchOptions,
     rng: Streams,
@@ -232,11 +231,11 @@ def _inferred(
     result, two = noise_averaged(
         found.result,
         found.two,
-        ready.observables.only(options.observables),
+        found.observables.only(options.observables),
         extra_noise=options.extra_noise,
         per_file=options.file_noise is not False,
         channels=found.noise.channels,
-        prior=noise_prior(ready.observables.only(options.observables), options),
+        prior=noise_prior(found.observables.only(options.observables), options),
     )
     prior, counts = _prior(result, options), _counts(options)
     grid = samples = evidence = resampled = None
@@ -295,12 +294,13 @@ def _report(
         options=options,
         targets=(),
         calibrators=(),
-        observables=ready.observables,
+        observables=found.observables,
         calibration=ready.calibration,
         references=ready.references,
         vetting=ready.vetting,
         result=found.result,
         noise=found.noise,
+        left_out=found.left_out,
         significance=tests.first,
         second_significance=tests.second,
         verdict=tests.verdict,
@@ -318,7 +318,7 @@ def _report(
 
 def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference) -> tuple[str, ...]:
     warnings = search_warnings(
-        ready.observables, found.result, found.noise, tests.first, posterior.samples
+        found.observables, found.result, found.noise, tests.first, posterior.samples
     )
     told = tests.verdict is not None and tests.verdict.statement == "inconsistent data"
     splits = [] if told else consistency_warnings(tests.splits)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
+from amibayes.detection.outlying_rows import OutlyingRow
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -40,8 +42,8 @@ def inputs_json(targets: Sequence[str], calibrators: Sequence[str]) -> list[Json
     return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
 
 
-def data_json(result: SearchResult) -> Json:
-    """Describe the data that were fitted, and the field."""
+def data_json(result: SearchResult, left_out: Sequence[OutlyingRow]) -> Json:
+    """Describe the data that were fitted, what was left out of them, and the field."""
     used = result.likelihood.observables
     freedom = used.freedom
     return {
@@ -49,6 +51,7 @@ def data_json(result: SearchResult) -> Json:
         "n_closure_phases": used.n_closure_phases,
         **({} if used.phase_name == "closure phase" else {"phases": used.phase_name}),
         "n_independent": used.n_independent,
+        "left_out": [asdict(row) for row in left_out],
         "covariance": used.covariance_kind,
         "n_integrations": used.n_integrations,
         "degrees_of_freedom": None if freedom is None else freedom.degrees,

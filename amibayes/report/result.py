@@ -65,7 +65,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "request": request,
         "options": report.options.to_json(),
         "inputs": inputs_json(report.targets, report.calibrators),
-        "data": data_json(report.result),
+        "data": data_json(report.result, report.left_out),
         "fit": _fit(result),
         "significance": _significance(result, report.significance, report.options.alpha),
         "modes": _modes(report),

@@ -290,6 +290,7 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "noise_prior": arguments.noise_prior,
         "systematics": arguments.systematics,
         "robust": arguments.robust,
+        "keep_outliers": arguments.keep_outliers,
         "file_noise": arguments.file_noise,
     }
 
@@ -379,5 +380,11 @@ def add_data(group: argparse._ActionsContainer) -> None:
         action="store_true",
         help="Student-t residuals: outliers lose their weight, in search, null draws, limits and "
         "posterior",
+    )
+    group.add_argument(
+        "--keep-outliers",
+        action="store_true",
+        help="use the few baselines or triangles of single exposures, too, that the best fit to "
+        "all others is far from explaining",
     )
     add_target(group)

@@ -1,0 +1,142 @@
+"""Rows of a file that the best fit of all others does not explain by far.
+
+A row is one baseline, or one triangle, of one exposure with all its channels. A fringe that was
+lost, or a calibration that failed, spoils one of them; extra noise for all then hides a companion,
+or one at a wrong place explains the row. Light that the model lacks is seen in many rows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amibayes.data.observables import Measurements, Observables
+from amibayes.data.systematics import calibration_errors
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.units import BoolArray, FloatArray
+
+Kind = Literal["vis2", "cp"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+OUTLYING = 5.0
+"""Deviation, in errors or in what is typical of the rows, from which on a row is outlying: one of
+two million by chance where channels err together, fewer where they do not."""
+
+LEAST_ROWS = 8
+"""Rows of one kind and instrument from which on it is known what is typical of them."""
+
+MOST = 0.05
+"""Share of the rows of one kind and instrument that may be left out; one in any case."""
+
+
+@dataclass(frozen=True)
+class OutlyingRow:
+    """A row of one table.
+
+    Parameters
+    ----------
+    kind : {"vis2", "cp"}
+    setup, row : int
+        As in `amibayes.data.observables.Measurements`.
+    path : str
+        The file.
+    stations : tuple of str
+    mjd : float
+    deviation : float
+        Root mean square over its channels, in units of the stated errors with the calibration
+        errors known of the instrument, or of the median row where that deviates by more.
+    """
+
+    kind: Kind
+    setup: int
+    row: int
+    path: str
+    stations: tuple[str, ...]
+    mjd: float
+    deviation: float = field(compare=False)
+
+    def __str__(self) -> str:
+        name = "V2" if self.kind == "vis2" else "closure phase"
+        return f"{name} {'-'.join(self.stations)} at MJD {self.mjd:.4f}"
+
+
+def outlying_rows(
+    data: Observables, likelihood: Likelihood, theta: FloatArray
+) -> tuple[OutlyingRow, ...]:
+    """Find the rows that a fit does not explain, those that deviate most first.
+
+    Parameters
+    ----------
+    data : Observables
+        With the stated errors; rows that the fit was not made from may be among them.
+    likelihood : Likelihood
+        Of the fit: its model.
+    theta : (n_dim,) float array
+        The fit.
+    """
+    data = data.unflagged()
+    difference = Likelihood(data, likelihood.model).difference(np.atleast_2d(theta))[:, 0]
+    variance = data.covariance.variance + calibration_errors(data) ** 2
+    square, n = difference**2 / variance, data.n_vis2
+    found = [*_of_kind(data, "vis2", square[:n]), *_of_kind(data, "cp", square[n:])]
+    return tuple(sorted(found, key=lambda row: -row.deviation))
+
+
+def _of_kind(data: Observables, kind: Kind, square: FloatArray) -> Iterator[OutlyingRow]:
+    table, instrument = _table(data, kind), _instruments(data)
+    for insname in np.unique(instrument).tolist():
+        here = np.flatnonzero(instrument[table.setup] == insname)
+        key = np.column_stack([table.setup[here], table.row[here]])
+        rows, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        if len(rows) < LEAST_ROWS:
+            continue
+        which = which.ravel()
+        mean = np.bincount(which, square[here]) / np.bincount(which)
+        deviation = np.sqrt(mean / max(1.0, float(np.median(mean))))
+        for k in np.flatnonzero(deviation > OUTLYING):
+            (j, row), at = rows[k].tolist(), here[first[k]]
+            stations = tuple(data.setups[j].stations[s] for s in table.stations[at])
+            mjd, away = float(table.mjd[at]), float(deviation[k])
+            yield OutlyingRow(kind, j, row, data.setups[j].source, stations, mjd, away)
+
+
+def _instruments(data: Observables) -> NDArray[np.str_]:
+    """Instrument of each setup."""
+    return np.array([setup.insname for setup in data.setups])
+
+
+def may_be_left_out(data: Observables, rows: Sequence[OutlyingRow]) -> bool:
+    """Whether rows are so few that the others still are most of what an instrument gave."""
+    instrument = _instruments(data)
+    groups = Counter((row.kind, instrument[row.setup]) for row in rows)
+    for (kind, insname), count in groups.items():
+        table = _table(data, kind)
+        here = (instrument[table.setup] == insname) & ~table.flag
+        total = len(np.unique(np.column_stack([table.setup, table.row])[here], axis=0))
+        if count > max(1.0, MOST * total):
+            return False
+    return True
+
+
+def without_rows(data: Observables, rows: Sequence[OutlyingRow]) -> Observables:
+    """The data without some rows."""
+    vis2, closure = (_others(data, kind, rows) for kind in KINDS)
+    return data.select(vis2, closure)
+
+
+def _others(data: Observables, kind: Kind, rows: Sequence[OutlyingRow]) -> BoolArray:
+    """Mask of the entries (n,) of a kind that are in none of the rows."""
+    table, keep = _table(data, kind), np.ones(len(_table(data, kind)), dtype=bool)
+    for row in rows:
+        if row.kind == kind:
+            keep &= (table.setup != row.setup) | (table.row != row.row)
+    return keep
+
+
+def _table(data: Observables, kind: Kind) -> Measurements:
+    return data.vis2 if kind == "vis2" else data.closure_phase
