@@ -135,20 +135,38 @@ def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
     probabilities count, the smallest times their number. That of all data together would refuse
     a model for misfits that noise within its prior explains, but that no part asks for.
     """
+    parts = _parts(result, shape)
+    return min(1.0, len(parts) * min(part.p for part in parts))
+
+
+@dataclass(frozen=True)
+class _Part:
+    """χ² of one kind of observable of one file, its degrees of freedom and probability."""
+
+    kind: str
+    source: str
+    chi2: float
+    dof: float
+    p: float
+
+
+def _parts(result: SearchResult, shape: float) -> list[_Part]:
+    """Kinds of observables of files, as the best fit leaves them."""
     likelihood = result.likelihood
     difference = likelihood.difference(np.atleast_2d(result.theta))[:, 0]
     covariance, share = likelihood.noise.covariance, result.ndof / likelihood.n_independent
     nodes, weights = np.polynomial.hermite_e.hermegauss(41)
     factors, weights = np.exp(shape * nodes), weights / weights.sum()
-    masks = [f.of_kind(kind) for f in files_of(likelihood.observables) for kind in ("vis2", "cp")]
     found = []
-    for at in (np.flatnonzero(mask) for mask in masks):
-        if not len(at):
-            continue
-        chi2, rank = chi2_of_part(covariance, at, difference)
-        each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
-        found.append(float(weights @ each))
-    return min(1.0, len(found) * min(found))
+    for file in files_of(likelihood.observables):
+        for kind in NAMES:
+            at = np.flatnonzero(file.of_kind(kind))
+            if not len(at):
+                continue
+            chi2, rank = chi2_of_part(covariance, at, difference)
+            each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
+            found.append(_Part(kind, file.source, chi2, share * rank, float(weights @ each)))
+    return found
 
 
 def within_calibration(test: BankStatistic) -> bool:
@@ -190,9 +208,12 @@ def _apart(split: Consistency) -> str:
 
 def _rejected(result: SearchResult, fit: float, structure: Significance) -> str:
     if fit <= structure.probability:
+        worst = min(_parts(result, 0.0), key=lambda part: part.p)
+        several = len(files_of(result.likelihood.observables)) > 1
+        where = f" in {worst.source}" if several else ""
         return (
-            f"χ² is {result.chi2_binary:.4g} for {result.ndof} degrees of freedom with the best "
-            "companion and as much noise as its prior allows"
+            f"χ² of {NAMES[worst.kind]}{where} is {worst.chi2:.4g} for {worst.dof:.0f} degrees of "
+            "freedom with the best companion and as much noise as its prior allows"
         )
     return (
         "what the best fit leaves still holds structure: one more component would gain more than "
