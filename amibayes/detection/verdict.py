@@ -11,9 +11,9 @@ import numpy as np
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
-from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import note_of
+from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import BankStatistic
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
 from amibayes.likelihood.residuals import files_of

@@ -11,9 +11,10 @@ from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import alternative
-from amibayes.detection.consistency import Consistency, consistency
+from amibayes.detection.consistency import consistency
 from amibayes.detection.false_alarm import Significance, draws_needed, significance
 from amibayes.detection.randomised import Randomised, randomised
+from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.detection.verdict import (
     SHAPE,
@@ -24,7 +25,7 @@ from amibayes.detection.verdict import (
 )
 from amibayes.detection.whiteness import correlated
 from amibayes.parallel import Executor, Journal, Progress, spawn
-from amibayes.pipeline.field import noise_prior
+from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions
 from amibayes.support.options import NULL_DRAWS
 
@@ -136,9 +137,8 @@ def structure(
 
 
 def verdict_of(
-    result: SearchResult,
+    found: FieldSearch,
     tested: Significance,
-    stated: Observables,
     options: SearchOptions,
     rng: np.random.Generator,
     executor: Executor | None = None,
@@ -148,12 +148,14 @@ def verdict_of(
 
     ``calibrators`` are those that are exchangeable, with their diameters.
     """
+    result, stated = found.result, found.observables
     splits: tuple[Consistency, ...] = ()
     if tested.detected:
         data = stated.only(options.observables) if options.extra_noise else None
         splits = consistency(
             result,
             rng,
+            noise=found.noise,
             stated=data,
             prior=noise_prior(stated, options),
             calibrators=calibrators,
@@ -163,7 +165,7 @@ def verdict_of(
     rest = structure(test, options, rng, executor)
     structured = rest.probability > options.alpha or not within_calibration(test)
     shape = SHAPE if options.extra_noise else 0.0
-    found = verdict(result, tested, rest, splits, structured=structured, shape=shape)
-    if found.statement == "companion" and (other := alternative(result)) is not None:
-        found = without_companion(found, other, result)
-    return found, splits
+    said = verdict(result, tested, rest, splits, structured=structured, shape=shape)
+    if said.statement == "companion" and (other := alternative(result)) is not None:
+        said = without_companion(said, other, result)
+    return said, splits

@@ -9,9 +9,9 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
-from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.outlying_rows import OutlyingRow
+from amibayes.detection.splits import Consistency
 from amibayes.detection.verdict import Verdict
 from amibayes.extraction.charge import CubeMigration
 from amibayes.likelihood.averaged_noise import NoisePosterior

@@ -14,8 +14,8 @@ from amibayes.companion_search.second_companion import TwoCompanions, search_sec
 from amibayes.companion_search.with_extra_noise import noise_averaged
 from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.limits import LimitsBeside
-from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.splits import Consistency
 from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.likelihood import single_likelihood
@@ -167,7 +167,7 @@ def _tested(ready: Prepared, found: Found, options: SearchOptions, rng: Streams,
     verdict, splits = run.keep_stage(
         "verdict",
         lambda: verdict_of(
-            found.result, first, found.observables, options, rng["verdict"], run.executor,
+            found, first, options, rng["verdict"], run.executor,
             ready.exchangeable,
         ),
     )  # fmt: skip

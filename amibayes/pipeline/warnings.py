@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
-from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance, draws_needed
+from amibayes.detection.splits import Consistency
 from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes

@@ -18,7 +18,7 @@ from amibayes.calibration.scatter_posterior import ScatterGrid, sample_tau
 from amibayes.calibration.transfer import transfer_of
 from amibayes.companion_search.optimise import refine
 from amibayes.data.observables import Observables
-from amibayes.detection.consistency import OTHERS, compare_calibrators
+from amibayes.detection.calibrator_consistency import OTHERS, compare_calibrators
 from amibayes.detection.verdict import _apart
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.likelihood.likelihood import Likelihood

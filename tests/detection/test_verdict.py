@@ -16,9 +16,9 @@ from scipy.stats import chi2
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables, join
-from amibayes.detection.consistency import Consistency
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import note_of
+from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, verdict, within_calibration
 from amibayes.likelihood.likelihood import Likelihood
@@ -80,9 +80,9 @@ def searched(
     data: Observables, rng: np.random.Generator
 ) -> tuple[SearchResult, Verdict, tuple[Consistency, ...]]:
     """The fit and the verdict as the main job gives them."""
-    result = search_field(data, OPTIONS).result
-    tested = false_alarm(result, OPTIONS, rng)
-    return result, *verdict_of(result, tested, data, OPTIONS, rng)
+    found = search_field(data, OPTIONS)
+    tested = false_alarm(found.result, OPTIONS, rng)
+    return found.result, *verdict_of(found, tested, OPTIONS, rng)
 
 
 def told(data: Observables, rng: np.random.Generator) -> tuple[Verdict, tuple[Consistency, ...]]:
