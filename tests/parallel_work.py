@@ -81,3 +81,9 @@ def sleep_after_saying_who(task: tuple[Path, int]) -> int:
 
 def whether_interrupts_are_blocked(x: int) -> bool:
     return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+
+
+def slow_process(_: object) -> int:
+    """Take longer than a fork, and say which process did it."""
+    time.sleep(0.2)
+    return os.getpid()

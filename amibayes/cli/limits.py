@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amibayes.cli.options import batch, common, data_options
+from amibayes.cli.options import batch, common, data_options, workers
+from amibayes.cli.options.drawing import draw
 from amibayes.errors import UsageError
 from amibayes.support.options import (
     LIMITS_NULL_DRAWS,
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     data_options.add_data(data)
     common.add_image_options(parser)
-    common.add_parallel_options(parser)
+    workers.add_parallel_options(parser, of_one=True)
     common.add_output_options(parser, "limits")
 
 
@@ -170,7 +171,7 @@ def _measure(
     journals = Journals(folder / JOURNAL, request, resume=arguments.resume)
     with (
         journals.telling(),
-        common.executor_of(arguments) as executor,
+        workers.executor_of_one(arguments) as executor,
         common.stages_of(arguments) as progress,
     ):
         report = measure_limits(
@@ -196,7 +197,7 @@ def _write(
     from amibayes.support.atomic_files import write_json
 
     if not arguments.no_pictures:
-        data_options.draw(arguments, save_limits_pictures, report, folder)
+        draw(arguments, save_limits_pictures, report, folder)
     write_limits_table(folder / TABLE, report)
     # Last: where it is, the run is finished.
     write_json(folder / RESULT, content)

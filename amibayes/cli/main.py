@@ -127,7 +127,9 @@ def run_command(words: list[str]) -> int:
         The command and its arguments.
     """
     from amibayes.support.atomic_files import output_locks
+    from amibayes.support.memory import keep_memory
 
+    keep_memory()
     command = next((word for word in words if word in COMMANDS), None)
     arguments = build_parser(command).parse_args(words, argparse.Namespace(words=words))
     run = importlib.import_module(f"amibayes.cli.{arguments.command}").run

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amibayes.cli.options import batch, common, data_options
+from amibayes.cli.options import batch, common, data_options, workers
+from amibayes.cli.options.drawing import Drawing
 from amibayes.support.options import EVIDENCE_METHODS, OBSERVABLES, SAMPLERS
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="go on with a run that was cut off; with --batch, leave finished targets",
     )
     common.add_seed_option(stages)
-    common.add_parallel_options(parser)
+    workers.add_parallel_options(parser, of_one=True)
     common.add_output_options(parser, "search")
 
 
@@ -121,11 +122,12 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     if arguments.resume and not arguments.overwrite:
         refuse_other(folder / RESULT, asked, folder / JOURNAL)
     journals = Journals(folder / JOURNAL, asked, resume=arguments.resume)
-    with journals.telling(folder / CHAIN):
-        report = _search(arguments, options, folder, journals)
-    for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
-        (folder / stale).unlink(missing_ok=True)
-    content = _write(arguments, report, folder, asked)
+    with Drawing(arguments, folder) as drawing:
+        with journals.telling(folder / CHAIN):
+            report = _search(arguments, options, folder, journals, drawing)
+        for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
+            (folder / stale).unlink(missing_ok=True)
+        content = _write(arguments, report, folder, asked, drawing)
     journals.remove()
     return report, folder, content
 
@@ -147,12 +149,16 @@ def request(arguments: argparse.Namespace) -> str:
 
 
 def _search(
-    arguments: argparse.Namespace, options: SearchOptions, folder: Path, journals: Journals
+    arguments: argparse.Namespace,
+    options: SearchOptions,
+    folder: Path,
+    journals: Journals,
+    drawing: Drawing,
 ) -> SearchReport:
     from amibayes.pipeline.search import search_companion
 
     with (
-        common.executor_of(arguments) as executor,
+        workers.executor_of_one(arguments) as executor,
         common.stages_of(arguments) as progress,
     ):
         return search_companion(
@@ -165,6 +171,7 @@ def _search(
             announce=progress.stage,
             progress=progress.update,
             executor=executor,
+            early=drawing.begin,
         )
 
 
@@ -186,19 +193,20 @@ def _options(arguments: argparse.Namespace) -> SearchOptions:
 
 
 def _write(
-    arguments: argparse.Namespace, report: SearchReport, folder: Path, request: str
+    arguments: argparse.Namespace,
+    report: SearchReport,
+    folder: Path,
+    request: str,
+    drawing: Drawing,
 ) -> dict[str, object]:
     """Write everything but the chain; the result last: where it is, the run is finished."""
     from amibayes.kpfits import write_observables
-    from amibayes.plots.pictures import save_pictures
     from amibayes.report import captioned, explorer_data, result_json, search_page, write_page
     from amibayes.support.atomic_files import write_json
 
     if report.calibration is not None:
         write_observables(folder / CALIBRATED, report.observables)
-    drawn = (
-        [] if arguments.no_pictures else data_options.draw(arguments, save_pictures, report, folder)
-    )
+    drawn = drawing.finish(report)
     content = result_json(report, request)
     figures = captioned(folder, [path.name for path in drawn])
     words = common.command_line(arguments)

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 from amibayes import __version__
 from amibayes.cli.options.common import (
     add_output_options,
-    add_parallel_options,
     add_seed_option,
     configure_logging,
-    executor_of,
     finish,
     positive_float,
     progress_of,
 )
+from amibayes.cli.options.workers import add_parallel_options, executor_of
 from amibayes.errors import UsageError
 from amibayes.support.terminal import shortened
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amibayes.cli.options import common
+from amibayes.cli.options import common, workers
 
 RESULT, PAGE, JOURNAL = "validation.json", "validation.html", "journal"
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     size.add_argument("--full", action="store_true", help="3002 stars, a day of one core")
     common.add_seed_option(parser)
-    common.add_parallel_options(parser)
+    workers.add_parallel_options(parser)
     parser.add_argument(
         "--resume", action="store_true", help="go on from the trials that are finished"
     )
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.out, [RESULT, PAGE, *pngs], overwrite=arguments.overwrite or arguments.resume
     )
     with (
-        common.executor_of(arguments) as executor,
+        workers.executor_of(arguments) as executor,
         common.progress_of(arguments, "validate", unit="star") as progress,
     ):
         validation = validate(

@@ -7,6 +7,7 @@ the same to the last bit for any number of workers, and after any interruption.
 
 from amibayes.parallel.apart import run_apart
 from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
+from amibayes.parallel.forked import CAN_FORK, Beside, ForkExecutor, at_hand
 from amibayes.parallel.job import (
     Executor,
     SerialExecutor,
@@ -21,8 +22,11 @@ from amibayes.parallel.processes import ProcessExecutor
 from amibayes.parallel.progress import Progress, StageBars, progress_bar, stage_bars
 
 __all__ = [
+    "CAN_FORK",
+    "Beside",
     "DaskExecutor",
     "Executor",
+    "ForkExecutor",
     "Journal",
     "Journals",
     "MPIExecutor",
@@ -30,6 +34,7 @@ __all__ = [
     "Progress",
     "SerialExecutor",
     "StageBars",
+    "at_hand",
     "child_seeds",
     "open_executor",
     "progress_bar",

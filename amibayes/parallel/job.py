@@ -11,6 +11,7 @@ import numpy as np
 
 from amibayes.errors import UsageError
 from amibayes.parallel.cluster import DaskExecutor, MPIExecutor
+from amibayes.parallel.forked import CAN_FORK, ForkExecutor
 from amibayes.parallel.journal import Journal
 from amibayes.parallel.processes import Lost, ProcessExecutor
 from amibayes.parallel.progress import Progress
@@ -59,7 +60,9 @@ class SerialExecutor:
 
 
 @contextmanager
-def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
+def open_executor(
+    workers: int = 1, scheduler: str | None = None, *, forked: bool = False
+) -> Iterator[Executor]:
     """Choose where a job runs, and end its workers afterwards.
 
     Parameters
@@ -69,6 +72,8 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
     scheduler : str, optional
         Address of a running dask scheduler (``tcp://host:8786``), or ``mpi`` for the
         ranks that this program was started with.
+    forked : bool
+        Fork the processes for each job, where the system can: for jobs of seconds.
 
     Raises
     ------
@@ -77,14 +82,14 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
     RunError
         Where the scheduler cannot be reached or its package is missing.
     """
-    executor = _choose(workers, scheduler)
+    executor = _choose(workers, scheduler, forked=forked)
     try:
         yield executor
     finally:
         executor.close()
 
 
-def _choose(workers: int, scheduler: str | None) -> Executor:
+def _choose(workers: int, scheduler: str | None, *, forked: bool) -> Executor:
     if scheduler == "mpi":
         return MPIExecutor()
     if scheduler is not None:
@@ -97,7 +102,9 @@ def _choose(workers: int, scheduler: str | None) -> Executor:
         return DaskExecutor(scheduler)
     if workers < 1:
         raise UsageError(f"{workers} is below one", source="--workers")
-    return SerialExecutor() if workers == 1 else ProcessExecutor(workers)
+    if workers == 1:
+        return SerialExecutor()
+    return ForkExecutor(workers) if forked and CAN_FORK else ProcessExecutor(workers)
 
 
 def run_job(

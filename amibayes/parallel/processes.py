@@ -13,12 +13,14 @@ import pickle
 import signal
 import threading
 import traceback
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any
 
 from amibayes.errors import RunError
@@ -27,14 +29,15 @@ from amibayes.parallel.threads import run_in_worker
 ATTEMPTS = 3
 """How many workers a piece may lose before the run gives up."""
 
+TIDY_S = 1.0
+"""How long a forked process may take to leave before it is killed."""
+
 Lost = Callable[[int, RunError], Any]
 """Called with the index of a piece that has cost too many workers, and the error."""
 
-_SPAWN = multiprocessing.get_context("spawn")
-
 
 @contextmanager
-def _without_interrupt() -> Iterator[None]:
+def _without_interrupt(*, forked: bool) -> Iterator[None]:
     """Hold Ctrl-C back: a process that starts meanwhile never hears it, this one afterwards.
 
     A worker cannot ignore it by itself before it has started up, which takes a second.
@@ -42,8 +45,9 @@ def _without_interrupt() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    # Started with the first process otherwise, and it lets every signal through again.
-    resource_tracker.ensure_running()
+    if not forked:
+        # Started with the first process otherwise, and it lets every signal through again.
+        resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -51,17 +55,21 @@ def _without_interrupt() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-class _Worker:
-    """One process and this end of its pipe."""
+class Worker:
+    """One process and this end of its pipe; forked where it is given a function."""
 
-    def __init__(self) -> None:
-        self.connection, theirs = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_work, args=(theirs,), daemon=True)
-        with _without_interrupt():
+    def __init__(self, function: Callable[[Any], Any] | None = None) -> None:
+        forked = function is not None
+        context: Any = multiprocessing.get_context("fork" if forked else "spawn")
+        self.connection, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, function), daemon=True)
+        with _without_interrupt(forked=forked), warnings.catch_warnings():
+            # Of threads that a child does not have: none of ours holds a lock that it needs.
+            warnings.filterwarnings("ignore", ".*fork", DeprecationWarning)
             self.process.start()
         theirs.close()  # or the end of the worker would not be the end of the pipe
         self.piece: int | None = None
-        self._knows: Any = None
+        self._knows, self._forked = function, forked
 
     def give(self, function: Callable[[Any], Any], index: int, piece: Any) -> None:
         """Hand over a piece, and the function only where it is a new one."""
@@ -70,16 +78,20 @@ class _Worker:
         self._knows = function
 
     def end(self) -> None:
+        """End the process, whatever it is doing; a forked one may tidy up, it may draw pictures."""
         self.connection.close()
+        if self._forked:
+            self.process.terminate()
+            self.process.join(TIDY_S)
         self.process.kill()
         self.process.join()
 
 
-def _work(connection: Connection) -> None:
+def _work(connection: Connection, function: Any) -> None:
     """Compute what comes through the pipe until its other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
+    signal.signal(signal.SIGTERM, _leave)
     _end_with_parent()
-    function: Any = None
     while True:
         try:
             new_function, piece = connection.recv()
@@ -90,6 +102,11 @@ def _work(connection: Connection) -> None:
         except Exception as error:  # noqa: BLE001 - travels to the parent, which raises it
             answer = False, _noted(error)
         _send(connection, answer)
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    """Go, and remove on the way out what is half written."""
+    raise SystemExit
 
 
 def _noted(error: Exception) -> Exception:
@@ -142,7 +159,7 @@ class ProcessExecutor:
                 remedy='in a script, start the work below if __name__ == "__main__":',
             )
         self._n = workers
-        self._workers: list[_Worker] = []
+        self._workers: list[Worker] = []
 
     def map(
         self, function: Callable[[Any], Any], pieces: Sequence[Any], lost: Lost | None = None
@@ -168,7 +185,7 @@ class ProcessExecutor:
         """End the workers."""
         self._end(list(self._workers))
 
-    def _end(self, workers: list[_Worker]) -> None:
+    def _end(self, workers: list[Worker]) -> None:
         for worker in workers:
             self._workers.remove(worker)
             worker.end()
@@ -176,7 +193,7 @@ class ProcessExecutor:
     def _hand_out(self, job: _Job) -> None:
         """Give every idle worker a piece, never far ahead of the consumer."""
         while job.todo and job.todo[0] < job.next + 2 * self._n:
-            worker = self._idle()
+            worker = self._idle(job)
             if worker is None:
                 return
             index = job.todo.popleft()
@@ -185,16 +202,20 @@ class ProcessExecutor:
             except ConnectionError:
                 self._lose(worker, job)
 
-    def _idle(self) -> _Worker | None:
+    def _idle(self, job: _Job) -> Worker | None:
         idle = next((worker for worker in self._workers if worker.piece is None), None)
         if idle is None and len(self._workers) < self._n:
-            idle = _start()
+            idle = self._started(job.function)
             self._workers.append(idle)
         return idle
 
+    def _started(self, function: Callable[[Any], Any]) -> Worker:
+        """Start a worker, which gets its functions with its pieces."""
+        return start()
+
     def _collect(self, job: _Job) -> None:
         """Wait until a worker has sent something or ended."""
-        busy: dict[Any, _Worker] = {w.connection: w for w in self._workers if w.piece is not None}
+        busy: dict[Any, Worker] = {w.connection: w for w in self._workers if w.piece is not None}
         for connection in wait(list(busy)) if busy else []:
             worker = busy[connection]
             try:
@@ -208,7 +229,7 @@ class ProcessExecutor:
             job.done[worker.piece] = answer
             worker.piece = None
 
-    def _lose(self, worker: _Worker, job: _Job) -> None:
+    def _lose(self, worker: Worker, job: _Job) -> None:
         """Take a dead worker's piece back, unless it has cost too many already."""
         self._end([worker])
         assert worker.piece is not None
@@ -222,9 +243,16 @@ class ProcessExecutor:
         job.done[worker.piece] = job.instead(worker.piece, error)
 
 
-def _start() -> _Worker:
+def start(function: Callable[[Any], Any] | None = None) -> Worker:
+    """Start a worker; fork it where it is given a function, which it then has.
+
+    Raises
+    ------
+    RunError
+        Where the system has no room for another process.
+    """
     try:
-        return _Worker()
+        return Worker(function)
     except OSError as error:
         raise RunError(
             f"a worker process cannot be started: {error.strerror}", remedy="fewer --workers"

@@ -16,6 +16,11 @@ def _pools(n_modules: int) -> ThreadpoolController:
     return ThreadpoolController()
 
 
+def know_pools() -> None:
+    """Look for libraries with threads now: processes that are forked afterwards need not."""
+    _pools(len(sys.modules))
+
+
 def run_here(function: Callable[[Any], Any], piece: Any) -> Any:
     """Compute a piece in this process, and give its threads back afterwards."""
     with _pools(len(sys.modules)).limit(limits=1):

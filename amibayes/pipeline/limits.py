@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,14 @@ from amibayes.limits.analytic import analytic_limit
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
-from amibayes.parallel import Executor, Journals, Progress
+from amibayes.parallel import (
+    Executor,
+    ForkExecutor,
+    Journals,
+    Progress,
+    SerialExecutor,
+    run_job,
+)
 from amibayes.pipeline.false_alarm import false_alarm
 from amibayes.pipeline.field import FieldSearch, search_field
 from amibayes.pipeline.models import compare_stage, limits_stage, models_warnings
@@ -89,10 +98,8 @@ class MeasuredLimit:
     noise : ExtraNoise
     significance : Significance or None
     limit : Limit
-    data : Observables
-        That it was measured from, of all kinds.
-    left_out : tuple of OutlyingRow
-        What was left out of them.
+    data, left_out : Observables, tuple of OutlyingRow
+        What it was measured from, of all kinds, and what was left out of that.
     """
 
     observables: Kinds
@@ -223,29 +230,80 @@ def _refuse(options: LimitsOptions) -> None:
         raise UsageError("uses closure phases alone", source="--criterion closure-phase")
 
 
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """One choice of observables: its options, random numbers and run, and its search once done."""
+
+    search: SearchOptions
+    seed: np.random.SeedSequence
+    run: Run
+    found: FieldSearch | None = None
+
+    @property
+    def name(self) -> str:
+        return NAMES[self.search.observables]
+
+    def searched(self, data: Observables) -> FieldSearch:
+        """Search the field, unless that is done."""
+        return self.found or self.run.keep_stage(
+            "search", lambda: search_field(data, self.search), f"search {self.name}"
+        )
+
+
 def _all_limits(
     ready: Prepared,
     options: LimitsOptions,
     seeds: Sequence[np.random.SeedSequence],
     run: Run,
 ) -> tuple[tuple[MeasuredLimit, ...], list[str]]:
-    """Measure the main limit, then the others over the field and with the disc of the main one."""
-    limits: list[MeasuredLimit] = []
-    warnings: list[str] = []
-    for kinds, seed in zip(_kinds(ready.observables, options), seeds, strict=False):
-        search = replace(options.search, observables=kinds)
-        if limits:
-            search = _alike(search, limits[0].result)
-        try:
-            limit, notes = _one_limit(ready.observables, search, options, seed, run)
-        except DataError as error:
-            if not limits:
-                raise
-            warnings.append(f"no limit from {' + '.join(kinds)} alone: {error.what}")
-            continue
-        limits.append(limit)
-        warnings += notes if len(limits) == 1 else []
-    return tuple(limits), warnings
+    """Measure the main limit, and the others over the field and with the disc of the main one.
+
+    They need its search only: where processes can be forked all are then measured at a time.
+    """
+    data = ready.observables
+    choices = [
+        _Choice(replace(options.search, observables=kinds), seed, run.under("-".join(kinds)))
+        for kinds, seed in zip(_kinds(data, options), seeds, strict=False)
+    ]
+    main = choices[0].searched(data)
+    alike = [replace(c, search=_alike(c.search, main.result)) for c in choices[1:]]
+    choices = [replace(choices[0], found=main), *alike]
+    with _at_once(run, choices) as (executor, choices):
+        work = partial(_measured, data, options, choices)
+        done = list(run_job(work, range(len(choices)), executor))
+    for _, _, seconds in done:
+        run.seconds.update(seconds)
+    limits = tuple(limit for limit, _, _ in done if limit is not None)
+    return limits, [note for _, notes, _ in done for note in notes]
+
+
+@contextmanager
+def _at_once(run: Run, choices: list[_Choice]) -> Iterator[tuple[Executor, list[_Choice]]]:
+    """Open a process for each choice, which has no workers itself, and tells nothing meanwhile.
+
+    Where the workers are others the choices are measured here, one after the other.
+    """
+    if len(choices) == 1 or not isinstance(run.executor, ForkExecutor):
+        yield SerialExecutor(), choices
+        return
+    executor = ForkExecutor(len(choices), first_here=False)
+    with run.stage("limits"), closing(executor):
+        yield executor, [replace(c, run=c.run.alone()) for c in choices]
+
+
+def _measured(
+    data: Observables, options: LimitsOptions, choices: list[_Choice], index: int
+) -> tuple[MeasuredLimit | None, list[str], dict[str, float]]:
+    """Measure one limit; give it, what is to be told of it, and the seconds of its stages."""
+    choice = choices[index]
+    try:
+        limit, notes = _one_limit(data, choice, options)
+    except DataError as error:
+        if index == 0:
+            raise
+        kinds = " + ".join(choice.search.observables)
+        return None, [f"no limit from {kinds} alone: {error.what}"], choice.run.seconds
+    return limit, notes if index == 0 else [], choice.run.seconds
 
 
 def _kinds(data: Observables, options: LimitsOptions) -> list[Kinds]:
@@ -275,18 +333,13 @@ def _alike(search: SearchOptions, main: SearchResult) -> SearchOptions:
 
 
 def _one_limit(
-    data: Observables,
-    search: SearchOptions,
-    options: LimitsOptions,
-    seed: np.random.SeedSequence,
-    run: Run,
+    data: Observables, choice: _Choice, options: LimitsOptions
 ) -> tuple[MeasuredLimit, list[str]]:
-    name = NAMES[search.observables]
-    run = run.under("-".join(search.observables))
-    streams = [np.random.default_rng(k) for k in seed.spawn(2)]
+    run, name = choice.run, choice.name
+    streams = [np.random.default_rng(k) for k in choice.seed.spawn(2)]
 
-    found = run.keep_stage("search", lambda: search_field(data, search), f"search {name}")
-    tested, search = None, _with_draws(found.result, search)
+    found = choice.searched(data)
+    tested, search = None, _with_draws(found.result, choice.search)
     if search.null_draws != 0:
         with run.stage(f"null searches {name}"):
             tested = false_alarm(
@@ -295,15 +348,8 @@ def _one_limit(
             )  # fmt: skip
     with run.stage(f"limits {name}"):
         limit = _limit(found, tested, options, streams[1], run)
-    measured = MeasuredLimit(
-        search.observables,
-        found.result,
-        found.noise,
-        tested,
-        limit,
-        found.observables,
-        found.left_out,
-    )
+    what = search.observables, found.result, found.noise, tested, limit
+    measured = MeasuredLimit(*what, found.observables, found.left_out)
     notes = search_warnings(found.observables, found.result, found.noise, tested, None)
     return measured, [*found.warnings, *notes]
 

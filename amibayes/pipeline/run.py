@@ -87,6 +87,10 @@ class Run:
         """Open the journal of a job, where finished pieces are kept."""
         return None if self.journals is None else self.journals.of(job)
 
+    def alone(self) -> Run:
+        """Give the same run without workers, that tells nothing: of a process beside others."""
+        return replace(self, announce=silent, progress=None, executor=None)
+
     def under(self, part: str) -> Run:
         """Give the same run with journals of a part of their own."""
         if self.journals is None:

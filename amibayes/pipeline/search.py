@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,6 +61,7 @@ def search_companion(
     announce: Announce = silent,
     progress: Progress | None = None,
     executor: Executor | None = None,
+    early: Callable[[SearchReport], None] | None = None,
 ) -> SearchReport:
     """Find and measure a companion, with its false-alarm probability: the main job.
 
@@ -70,10 +71,8 @@ def search_companion(
         OIFITS files or image cubes. Targets are fitted together; without calibrators they
         are taken as calibrated.
     options : SearchOptions, optional
-    chain : path, optional
-        HDF5 file for the chain of the posterior.
-    resume : bool
-        Go on from ``chain``.
+    chain, resume : optional
+        HDF5 file for the chain of the posterior, and whether to go on from it.
     journals : Journals, optional
         Keep finished null draws and injections, so that a run that was cut off goes on.
     announce : callable
@@ -82,6 +81,8 @@ def search_companion(
         Called with (done, expected) within the longer stages.
     executor : Executor, optional
         Where null draws and limits are computed; the result does not depend on it.
+    early : callable, optional
+        Called with what there is of the report before the posterior begins.
 
     Raises
     ------
@@ -101,11 +102,21 @@ def search_companion(
         found = run.keep("search", lambda: _searched(ready, options, run))
         tests = _tested(ready, found, options, rng, run)
         limits = run.keep("limits", lambda: _limits(found, tests, options, rng["limits"], run))
+        if early is not None and options.posterior:
+            ended = _report(options, ready, found, tests, limits, Inference())
+            early(_named(ended, targets, calibrators, run))
         posterior = _inferred(found, options, rng, run, (chain, resume))
         models, beside = run.keep("models", lambda: _compared(found, options, rng, run))
-    report = _report(options, ready, found, tests, limits, posterior)
+    report = with_models(_report(options, ready, found, tests, limits, posterior), models, beside)
+    return _named(report, targets, calibrators, run)
+
+
+def _named(
+    report: SearchReport, targets: Sequence[str | Path], calibrators: Sequence[str | Path], run: Run
+) -> SearchReport:
+    """Put in the names of the files, and how long the stages took."""
     return replace(
-        with_models(report, models, beside),
+        report,
         targets=tuple(str(p) for p in targets),
         calibrators=tuple(str(p) for p in calibrators),
         timing_s=run.seconds,
@@ -213,10 +224,10 @@ def _limits(
 class Inference:
     """The posterior stage; None where a part is unwanted."""
 
-    samples: Posterior | None
-    grid: GridPosterior | None
-    evidence: Evidence | None
-    noise: dict[str, NoisePosterior] | None
+    samples: Posterior | None = None
+    grid: GridPosterior | None = None
+    evidence: Evidence | None = None
+    noise: dict[str, NoisePosterior] | None = None
     resampled: Bootstrap | None = None
 
 

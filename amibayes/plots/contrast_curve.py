@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import Companion
 from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
+from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.limits import NAMES, LimitsReport
 from amibayes.plots.style import (
     BLACK,
@@ -268,11 +270,21 @@ def limits_picture_names(method: str) -> list[str]:
     return ["limits.png", "completeness.png"] if method == "injection" else ["limits.png"]
 
 
-def save_limits_pictures(report: LimitsReport, folder: Path) -> None:
-    """Draw the curves of all limits, and the completeness map of the main one."""
-    save(limits_picture(report), folder / "limits.png")
-    if report.main.limit.cells() is not None:
-        save(completeness_picture(report.main.limit), folder / "completeness.png")
+def save_limits_pictures(
+    report: LimitsReport, folder: Path, executor: Executor | None = None
+) -> None:
+    """Draw the curves of all limits, and the completeness map of the main one.
+
+    Both at a time where there are workers.
+    """
+    names = ["limits.png"] + ["completeness.png"] * (report.main.limit.cells() is not None)
+    list((executor or SerialExecutor()).map(partial(_save_picture, report, folder), names))
+
+
+def _save_picture(report: LimitsReport, folder: Path, name: str) -> None:
+    curves = name == "limits.png"
+    figure = limits_picture(report) if curves else completeness_picture(report.main.limit)
+    save(figure, folder / name)
 
 
 def limits_picture(report: LimitsReport) -> Figure:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -11,8 +12,10 @@ from matplotlib.figure import Figure
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import ModelComparison
 from amibayes.detection.residuals_by_file import file_residuals
+from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
+from amibayes.plots import models
 from amibayes.plots.calibration import calibrator_plot
 from amibayes.plots.contrast_curve import Curve, completeness_picture, limits_plot
 from amibayes.plots.corner_plot import corner_plot, trace_plot
@@ -25,13 +28,6 @@ from amibayes.plots.maps import (
     probability_maps,
     save_maps_fits,
     sky_map,
-)
-from amibayes.plots.models import (
-    model_corner,
-    model_images,
-    model_odds,
-    model_residuals,
-    model_visibilities,
 )
 from amibayes.plots.null_plot import null_plot
 from amibayes.plots.residual_corr import correlation_plot
@@ -47,14 +43,7 @@ MAPS = "maps.fits"
 class Stages:
     """What a run holds, known before it begins: which pictures there will be.
 
-    Parameters
-    ----------
-    several : bool
-        Whether several files are fitted together.
-    calibrated : bool
-        Whether calibrators were given.
-    significance, posterior, limits, models : bool
-        Whether these stages are run.
+    Several files that are fitted together, calibrators, and these stages.
     """
 
     several: bool = False
@@ -130,20 +119,34 @@ def picture_names(options: SearchOptions, *, calibrated: bool, several: bool = F
     return [*(p.file for p in PICTURES if p.when(run)), MAPS]
 
 
-def save_pictures(report: SearchReport, folder: Path) -> list[Path]:
-    """Draw every picture of a report into a folder."""
-    drawn = []
-    for picture in pictures_of(report):
-        save(picture.draw(report), folder / picture.file)
-        drawn.append(folder / picture.file)
+def save_pictures(
+    report: SearchReport, folder: Path, executor: Executor | None = None
+) -> list[Path]:
+    """Draw every picture of a report into a folder, and give their files."""
+    draw_files(report, files := picture_files(report, folder), executor or SerialExecutor())
     save_maps_fits(folder / MAPS, report.result, _probabilities(report))
-    return drawn
+    return files
+
+
+def picture_files(report: SearchReport, folder: Path) -> list[Path]:
+    """List the files of the pictures that a report has."""
+    return [folder / picture.file for picture in pictures_of(report)]
+
+
+def draw_files(report: SearchReport, files: Sequence[Path], executor: Executor) -> None:
+    """Draw some of them, several at a time where there are workers."""
+    list(executor.map(partial(_save_picture, report), files))
+
+
+def _save_picture(report: SearchReport, path: Path) -> None:
+    # A path travels between processes, what draws a picture does not.
+    picture = next(p for p in PICTURES if p.name == path.stem)
+    save(picture.draw(report), path)
 
 
 def pictures_of(report: SearchReport) -> list[Picture]:
     """List the pictures that a report has."""
-    run = Stages.of(report)
-    return [picture for picture in PICTURES if picture.when(run)]
+    return [picture for picture in PICTURES if picture.when(Stages.of(report))]
 
 
 def _probabilities(report: SearchReport) -> dict[str, FloatArray]:
@@ -356,7 +359,7 @@ PICTURES = (
         "The best fit of each model without its star, on one scale, north up and east left, "
         "with the beam in the lower left corner.",
         "models",
-        _of_models(model_images),
+        _of_models(models.model_images),
         lambda run: run.models,
     ),
     Picture(
@@ -365,7 +368,7 @@ PICTURES = (
         "Evidence of each model below that of the most probable one, and what data simulated "
         "from each model are taken for.",
         "models",
-        _of_models(model_odds),
+        _of_models(models.model_odds),
         lambda run: run.models,
     ),
     Picture(
@@ -374,7 +377,7 @@ PICTURES = (
         "Squared visibilities against the position angle of the baseline, and closure phases, "
         "with the best fit of each model.",
         "models",
-        _of_models(model_visibilities),
+        _of_models(models.model_visibilities),
         lambda run: run.models,
     ),
     Picture(
@@ -382,7 +385,7 @@ PICTURES = (
         "Residuals of each model",
         "What the best fit of each model leaves, in units of the errors.",
         "models",
-        _of_models(model_residuals),
+        _of_models(models.model_residuals),
         lambda run: run.models,
     ),
     Picture(
@@ -390,7 +393,7 @@ PICTURES = (
         "Posterior of the most probable model",
         "Marginal distributions of its parameters, one by one and in pairs; fluxes as logarithms.",
         "models",
-        _of_models(model_corner),
+        _of_models(models.model_corner),
         lambda run: run.models,
     ),
 )

@@ -13,8 +13,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 
 from amibayes.support.atomic_files import atomic_path
 
@@ -22,6 +24,9 @@ WIDTH_IN = 6.4
 """Type of 10 to 11 points on this width can still be read on a telephone."""
 
 DPI = 160
+
+COMPRESSION = 3
+"""Of PNG files, out of 9: half of the time of the usual 6, for files that are 5 % larger."""
 
 BLACK, GREY, LIGHT_GREY = "#000000", "#6e6e6e", "#c8c8c8"
 PALE = "#fff3a0"
@@ -98,6 +103,7 @@ def save(figure: Figure, path: str | Path) -> None:
     RunError
         Where the file cannot be written.
     """
+    _plain_numbers(figure)
     # Every drawing would lay out anew and move the axes a little further: the figure keeps this.
     if (engine := figure.get_layout_engine()) is not None:
         ticks = _ticks(figure)
@@ -108,13 +114,36 @@ def save(figure: Figure, path: str | Path) -> None:
             engine.execute(figure)
         figure.set_layout_engine("none")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
+        figure.savefig(
+            temporary,
+            format="png",
+            dpi=DPI,
+            metadata={"Software": None},
+            pil_kwargs={"compress_level": COMPRESSION},
+        )
+
+
+def _plain_numbers(figure: Figure) -> None:
+    """Write numbers of axes as text, where no power of ten stands beside them.
+
+    As mathematics, which such a power needs, they look the same and take a fifth of the time of
+    all pictures.
+    """
+    for axis in _axes(figure):
+        numbers = axis.get_major_formatter()
+        if isinstance(numbers, ScalarFormatter):
+            numbers.format_ticks(axis.get_majorticklocs().tolist())
+            if not numbers.get_offset():
+                numbers.set_useMathText(False)
 
 
 def _ticks(figure: Figure) -> list[list[float]]:
     """Where the ticks of every axis are."""
-    axes = [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
-    return [np.asarray(axis.get_majorticklocs(), dtype=float).tolist() for axis in axes]
+    return [np.asarray(axis.get_majorticklocs(), dtype=float).tolist() for axis in _axes(figure)]
+
+
+def _axes(figure: Figure) -> list[Axis]:
+    return [axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)]
 
 
 def marker_of(index: int) -> tuple[str, str]:

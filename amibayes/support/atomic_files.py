@@ -47,9 +47,6 @@ def atomic_path(path: str | Path, *, lasting: bool = True) -> Iterator[Path]:
         # Made with the mode of any new file: asking for the umask would change it for a moment,
         # for all threads.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except OSError as error:
-        raise cannot_write(final, error) from error
-    try:
         yield temporary
         if lasting:
             _flush(temporary)
@@ -59,7 +56,8 @@ def atomic_path(path: str | Path, *, lasting: bool = True) -> Iterator[Path]:
     except OSError as error:
         raise cannot_write(final, error) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # it is not there, or where it was to be is no folder
+            temporary.unlink()
 
 
 def _flush(path: Path) -> None:

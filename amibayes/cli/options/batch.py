@@ -16,7 +16,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from amibayes.cli.options import common
+from amibayes.cli.options import common, workers
 from amibayes.errors import AmibayesError, DataError, UsageError, fault_of
 from amibayes.support.atomic_files import output_locks
 from amibayes.support.interrupts import ending
@@ -340,7 +340,7 @@ def _carry_out(arguments: argparse.Namespace, jobs: list[Job]) -> Iterator[tuple
         return Outcome(job.name, "failed", error.command_line, facts=job.facts)
 
     with (
-        common.executor_of(arguments) as executor,
+        workers.executor_of(arguments) as executor,
         common.progress_of(arguments, "targets", unit="target", scale=size) as progress,
     ):
         pieces = [jobs[part] for part in parts]

@@ -23,7 +23,7 @@ from amibayes.support.options import (
 
 if TYPE_CHECKING:
     from amibayes.extraction.reading import ImageOptions
-    from amibayes.parallel import Executor, Progress, StageBars
+    from amibayes.parallel import Progress, StageBars
     from amibayes.posterior.priors import PriorSetting
 
 
@@ -158,30 +158,6 @@ def add_seed_option(parser: argparse._ActionsContainer) -> None:
         metavar="N",
         help="seed of all random numbers (default: %(default)s)",
     )
-
-
-def add_parallel_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers`` and ``--scheduler``: where the work is done, not what comes out."""
-    group = parser.add_argument_group("where the work is done").add_mutually_exclusive_group()
-    group.add_argument(
-        "--workers",
-        type=positive_integer,
-        default=1,
-        metavar="N",
-        help="processes on this machine (default: %(default)s); the result does not depend on it",
-    )
-    group.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="a dask scheduler, tcp://host:port, or mpi for the ranks of this run",
-    )
-
-
-def executor_of(arguments: argparse.Namespace) -> AbstractContextManager[Executor]:
-    """Open the workers that ``--workers`` or ``--scheduler`` ask for."""
-    from amibayes.parallel import open_executor
-
-    return open_executor(arguments.workers, arguments.scheduler)
 
 
 OF_THE_RUN = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +27,6 @@ def add_picture_option(group: argparse._ActionsContainer) -> None:
         action="store_true",
         help="write no pictures, which take most of the time of a short run",
     )
-
-
-def draw(arguments: argparse.Namespace, save: Callable[..., Any], *of: object) -> Any:
-    """Let pictures be drawn: here, or for a target of a table in a process of their own."""
-    if not getattr(arguments, "in_batch", False):
-        return save(*of)
-    from amibayes.parallel import run_apart
-
-    return run_apart(save, *of)
 
 
 def add_calibration(group: argparse._ActionsContainer) -> None:
