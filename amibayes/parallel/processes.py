@@ -25,6 +25,7 @@ from typing import Any
 
 from amibayes.errors import RunError
 from amibayes.parallel.threads import run_in_worker
+from amibayes.support.memory import keep_memory
 
 ATTEMPTS = 3
 """How many workers a piece may lose before the run gives up."""
@@ -92,6 +93,7 @@ def _work(connection: Connection, function: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     signal.signal(signal.SIGTERM, _leave)
     _end_with_parent()
+    keep_memory()
     while True:
         try:
             new_function, piece = connection.recv()
