@@ -42,7 +42,7 @@ def inputs_json(targets: Sequence[str], calibrators: Sequence[str]) -> list[Json
     return [{"path": path, "sha256": sha256(path), "role": role} for path, role in files]
 
 
-def data_json(result: SearchResult, left_out: Sequence[OutlyingRow]) -> Json:
+def data_json(result: SearchResult, left_out: Sequence[OutlyingRow] = ()) -> Json:
     """Describe the data that were fitted, what was left out of them, and the field."""
     used = result.likelihood.observables
     freedom = used.freedom
