@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -57,20 +56,11 @@ def flag_by_rule(observables: Observables, rules: Sequence[str]) -> Observables:
             (observables.closure_phase, closure, observables.errors[1]),
         ):
             flag |= _fulfils(rule, m, error, observables)
-    keep = ~vis2[~observables.vis2.flag], ~closure[~observables.closure_phase.flag]
-    used = np.concatenate(keep)
-    if not used.any():
+    if vis2.all() and closure.all():
         raise DataError(
             f"nothing is left by {', '.join(rules)}", source=observables.source, remedy="flag less"
         )
-    return replace(
-        observables,
-        vis2=replace(observables.vis2, flag=vis2),
-        closure_phase=replace(observables.closure_phase, flag=closure),
-        covariance=observables.covariance.select(np.flatnonzero(used)),
-        scatter=None if observables.scatter is None else observables.scatter[used][:, used],
-        shared=None if observables.shared is None else observables.shared.select(used),
-    )
+    return observables.flagged(vis2, closure)
 
 
 def _fulfils(rule: str, m: Measurements, error: FloatArray, observables: Observables) -> BoolArray:

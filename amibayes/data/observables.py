@@ -231,6 +231,19 @@ class Observables:
             shared=None if self.shared is None else self.shared.select(used),
         )
 
+    def flagged(self, vis2: BoolArray, closure_phase: BoolArray) -> Observables:
+        """The same with entries flagged where the masks are true, besides those that are."""
+        vis2, closure = vis2 | self.vis2.flag, closure_phase | self.closure_phase.flag
+        used = np.concatenate([~vis2[~self.vis2.flag], ~closure[~self.closure_phase.flag]])
+        return replace(
+            self,
+            vis2=replace(self.vis2, flag=vis2),
+            closure_phase=replace(self.closure_phase, flag=closure),
+            covariance=self.covariance.select(np.flatnonzero(used)),
+            scatter=None if self.scatter is None else self.scatter[used][:, used],
+            shared=None if self.shared is None else self.shared.select(used),
+        )
+
     def with_data(self, data: FloatArray) -> Observables:
         """The same with other values (n_data,): V², then closure phases in radians."""
         vis2, closure = np.split(np.asarray(data), [self.n_vis2])

@@ -124,18 +124,19 @@ def may_be_left_out(data: Observables, rows: Sequence[OutlyingRow]) -> bool:
 
 
 def without_rows(data: Observables, rows: Sequence[OutlyingRow]) -> Observables:
-    """The data without some rows."""
-    vis2, closure = (_others(data, kind, rows) for kind in KINDS)
-    return data.select(vis2, closure)
+    """The data with some rows flagged."""
+    vis2, closure = (_inside(data, kind, rows) for kind in KINDS)
+    return data.flagged(vis2, closure)
 
 
-def _others(data: Observables, kind: Kind, rows: Sequence[OutlyingRow]) -> BoolArray:
-    """Mask of the entries (n,) of a kind that are in none of the rows."""
-    table, keep = _table(data, kind), np.ones(len(_table(data, kind)), dtype=bool)
+def _inside(data: Observables, kind: Kind, rows: Sequence[OutlyingRow]) -> BoolArray:
+    """Mask of the entries (n,) of a kind that are in one of the rows."""
+    table = _table(data, kind)
+    found = np.zeros(len(table), dtype=bool)
     for row in rows:
         if row.kind == kind:
-            keep &= (table.setup != row.setup) | (table.row != row.row)
-    return keep
+            found |= (table.setup == row.setup) & (table.row == row.row)
+    return found
 
 
 def _table(data: Observables, kind: Kind) -> Measurements:

@@ -60,7 +60,7 @@ class FieldSearch:
     warnings : tuple of str
         On the edges of the field, and of rows that were left out.
     observables : Observables
-        Of all kinds, without the rows that were left out.
+        Of all kinds, with the rows that were left out flagged.
     left_out : tuple of OutlyingRow
         Rows that the fit to all others is far from explaining.
     """
