@@ -9,14 +9,16 @@ from typing import Literal, get_args
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
+from amibayes.data.observables import Observables
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import note_of
 from amibayes.detection.splits import Consistency
-from amibayes.detection.statistic import BankStatistic
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
+from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.residuals import files_of
+from amibayes.units import FloatArray
 
 Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
 
@@ -29,6 +31,11 @@ NAMES = {"vis2": "V²", "cp": "closure phases"}
 WITHIN = (
     "; what the fit leaves holds structure, smaller than the calibration errors known of the "
     "instrument"
+)
+
+SMALL = (
+    "it changes the data by less than the calibration errors known of the instrument: one that "
+    "lasted for a night may look like it (compare nights and calibrators)"
 )
 
 
@@ -103,6 +110,10 @@ def verdict(
     left = WITHIN if small and not structured else ""
     if tested.detected:
         note = note_of(result)
+        if not note and within_calibration(
+            result.likelihood.observables, change_by_companion(result)
+        ):
+            note = SMALL
         left += f"; but {note}" if note else ""
         return Verdict("companion", _found(tested) + left, p_model, note)
     return Verdict("no companion", _nothing(tested) + left, p_model)
@@ -169,8 +180,8 @@ def _parts(result: SearchResult, shape: float) -> list[_Part]:
     return found
 
 
-def within_calibration(test: BankStatistic) -> bool:
-    """Whether one more component changes the data by less than calibration errors known of them.
+def within_calibration(observables: Observables, change: FloatArray) -> bool:
+    """Whether a component changes the data by less than calibration errors known of them.
 
     Errors that hold for whole nights (diameters of calibrators, drifts) repeat from exposure to
     exposure as the light of a companion does: no null draw and no randomisation has them. Only
@@ -179,14 +190,20 @@ def within_calibration(test: BankStatistic) -> bool:
 
     Parameters
     ----------
-    test : BankStatistic
-        Of one more component.
+    observables : Observables
+        Unflagged.
+    change : (n_data,) float array
+        By the component, of V² and closure phases in radians.
     """
-    errors = calibration_errors(test.likelihood.observables)
-    if not (errors > 0.0).all():
-        return False
-    change = test.change_by(test.strongest)[:, 0] / errors
-    return bool(np.mean(change**2) < 1.0)
+    errors = calibration_errors(observables)
+    return bool((errors > 0.0).all() and np.mean((change / errors) ** 2) < 1.0)
+
+
+def change_by_companion(result: SearchResult) -> FloatArray:
+    """Difference (n_data,) that the companion makes to what the star alone fits best."""
+    likelihood, alone = result.likelihood, single_likelihood(result.likelihood)
+    star = alone.predict(np.atleast_2d(result.single_theta))[:, 0]
+    return likelihood.wrapped(likelihood.predict(np.atleast_2d(result.theta))[:, 0] - star)
 
 
 def _apart(split: Consistency) -> str:

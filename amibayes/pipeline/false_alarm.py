@@ -163,7 +163,9 @@ def verdict_of(
         )
     test = statistic_of(result, stated_errors=not options.extra_noise, beside=True)
     rest = structure(test, options, rng, executor)
-    structured = rest.probability > options.alpha or not within_calibration(test)
+    change = test.change_by(test.strongest)[:, 0]
+    within = within_calibration(result.likelihood.observables, change)
+    structured = rest.probability > options.alpha or not within
     shape = SHAPE if options.extra_noise else 0.0
     said = verdict(result, tested, rest, splits, structured=structured, shape=shape)
     if said.statement == "companion" and (other := alternative(result)) is not None:

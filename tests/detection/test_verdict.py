@@ -10,6 +10,7 @@ import interferometer
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from interferometer import four_telescopes
 from scipy.special import j0, j1
 from scipy.stats import chi2
 
@@ -20,7 +21,15 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import note_of
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import statistic_of
-from amibayes.detection.verdict import SHAPE, Verdict, fit_probability, verdict, within_calibration
+from amibayes.detection.verdict import (
+    SHAPE,
+    SMALL,
+    Verdict,
+    change_by_companion,
+    fit_probability,
+    verdict,
+    within_calibration,
+)
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
@@ -175,8 +184,25 @@ def test_structure_counts_where_it_exceeds_the_calibration_errors_of_the_table(
     data = observed(niriss(), points((0.0, 150.0, 0.05), (120.0, -90.0, second)), rng)
     data = replace(data, setups=(replace(data.setups[0], insname=insname),))
     test = statistic_of(search_field(data, OPTIONS).result, beside=True)
-    assert within_calibration(test) is within
+    change = test.change_by(test.strongest)[:, 0]
+    assert within_calibration(test.likelihood.observables, change) is within
     assert test.strongest[0, 2] < 2.0 * second or second < 0.01
+
+
+@pytest.mark.parametrize(("contrast", "noted"), [(0.008, True), (0.1, False)])
+def test_a_companion_within_the_calibration_errors_is_noted(contrast: float, noted: bool) -> None:
+    """Of PIONIER, 3 % of V² and half a degree, in 24 exposures with errors of 1 % and 0.3°."""
+    sheet = four_telescopes(24, vis2_error=0.01, closure_error_deg=0.3)
+    model, theta = BinaryModel(diameter_mas=0.5), np.array([5.0, -4.0, contrast])
+    data = simulated(sheet, theta, np.random.default_rng(5), model)
+    options = SearchOptions(separation_mas=(2.0, 12.0), diameter=0.5, null_draws=2000, alpha=0.01)
+    found = search_field(data, options)
+    size = np.abs(change_by_companion(found.result)[: data.n_vis2])
+    assert size.max() == pytest.approx(4.0 * contrast, rel=0.4)  # 2c on either side of the star's
+    tested = false_alarm(found.result, options, np.random.default_rng(6))
+    said, _ = verdict_of(found, tested, options, np.random.default_rng(7))
+    assert said.statement == "companion"
+    assert (said.note == SMALL) is noted
 
 
 @pytest.mark.parametrize(
