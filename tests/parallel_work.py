@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from amibayes.errors import DataError
+from amibayes.support.atomic_files import atomic_path
 
 
 def noisy_product(seed: np.random.SeedSequence) -> dict[str, Any]:
@@ -87,3 +88,11 @@ def slow_process(_: object) -> int:
     """Take longer than a fork, and say which process did it."""
     time.sleep(0.2)
     return os.getpid()
+
+
+def write_without_end(path: Path) -> None:
+    """Begin a file, say so by another one beside it, and go on writing."""
+    with atomic_path(path) as temporary:
+        temporary.write_text("begun")
+        path.with_suffix(".begun").touch()
+        time.sleep(60.0)

@@ -25,6 +25,7 @@ from typing import Any
 
 from amibayes.errors import RunError
 from amibayes.parallel.threads import run_in_worker
+from amibayes.support.atomic_files import HALF_WRITTEN
 from amibayes.support.memory import keep_memory
 
 ATTEMPTS = 3
@@ -92,6 +93,7 @@ def _work(connection: Connection, function: Any) -> None:
     """Compute what comes through the pipe until its other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to stop
     signal.signal(signal.SIGTERM, _leave)
+    HALF_WRITTEN.clear()  # those of the parent
     _end_with_parent()
     keep_memory()
     while True:
@@ -107,8 +109,10 @@ def _work(connection: Connection, function: Any) -> None:
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
-    """Go, and remove on the way out what is half written."""
-    raise SystemExit
+    """Remove what is half written, and go at once: an exception may be lost in a callback."""
+    for path in tuple(HALF_WRITTEN):
+        path.unlink(missing_ok=True)
+    os._exit(0)
 
 
 def _noted(error: Exception) -> Exception:

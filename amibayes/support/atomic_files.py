@@ -43,6 +43,7 @@ def atomic_path(path: str | Path, *, lasting: bool = True) -> Iterator[Path]:
     """
     final = Path(path)
     temporary = final.with_name(TEMPORARY.format(final.stem, secrets.token_hex(4), final.suffix))
+    HALF_WRITTEN.add(temporary)
     try:
         # Made with the mode of any new file: asking for the umask would change it for a moment,
         # for all threads.
@@ -58,6 +59,11 @@ def atomic_path(path: str | Path, *, lasting: bool = True) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it is not there, or where it was to be is no folder
             temporary.unlink()
+        HALF_WRITTEN.discard(temporary)
+
+
+HALF_WRITTEN: set[Path] = set()
+"""Temporary files of this process: one that must end at once removes them."""
 
 
 def _flush(path: Path) -> None:

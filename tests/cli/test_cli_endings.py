@@ -124,7 +124,7 @@ def test_other_endings(error, said, monkeypatch, capsys) -> None:
         (0, (), "stage-data.pickle"),
         pytest.param(200_000, (), "stage-integrate.pickle", marks=pytest.mark.slow),
         pytest.param(700_000, (), "posterior.h5", marks=pytest.mark.slow),
-        pytest.param(100_000, ("--no-posterior",), ".png", marks=pytest.mark.slow),
+        pytest.param(200_000, ("--no-posterior",), ".png", marks=pytest.mark.slow),
         pytest.param(700_000, ("--no-posterior",), "report.html", marks=pytest.mark.slow),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -87,6 +88,17 @@ def test_a_call_beside_this_process() -> None:
     left = Beside(work.slow_process, 1)
     left.end()
     left.end()
+
+
+def test_what_a_process_was_writing_goes_with_it(tmp_path: Path) -> None:
+    beside = Beside(work.write_without_end, tmp_path / "a.png")
+    begun = tmp_path / "a.begun"
+    waited = time.monotonic() + 10.0
+    while not begun.exists() and time.monotonic() < waited:
+        time.sleep(0.01)
+    assert len(list(tmp_path.iterdir())) == 2
+    beside.end()
+    assert list(tmp_path.iterdir()) == [begun]
 
 
 def test_cores_at_hand_are_used_where_the_system_forks() -> None:
