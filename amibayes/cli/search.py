@@ -122,7 +122,7 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     if arguments.resume and not arguments.overwrite:
         refuse_other(folder / RESULT, asked, folder / JOURNAL)
     journals = Journals(folder / JOURNAL, asked, resume=arguments.resume)
-    with Drawing(arguments, folder) as drawing:
+    with Drawing(arguments, folder, journals.path / "pictures") as drawing:
         with journals.telling(folder / CHAIN):
             report = _search(arguments, options, folder, journals, drawing)
         for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):

@@ -222,23 +222,22 @@ class Observables:
     def select(self, vis2: BoolArray, closure_phase: BoolArray) -> Observables:
         """The entries where the masks are true; the covariance follows."""
         used = np.concatenate([vis2[~self.vis2.flag], closure_phase[~self.closure_phase.flag]])
-        return replace(
-            self,
-            vis2=self.vis2.select(vis2),
-            closure_phase=self.closure_phase.select(closure_phase),
-            covariance=self.covariance.select(np.flatnonzero(used)),
-            scatter=None if self.scatter is None else self.scatter[used][:, used],
-            shared=None if self.shared is None else self.shared.select(used),
-        )
+        vis2_left, closure_left = self.vis2.select(vis2), self.closure_phase.select(closure_phase)
+        return self._of_part(vis2_left, closure_left, used)
 
     def flagged(self, vis2: BoolArray, closure_phase: BoolArray) -> Observables:
         """The same with entries flagged where the masks are true, besides those that are."""
         vis2, closure = vis2 | self.vis2.flag, closure_phase | self.closure_phase.flag
         used = np.concatenate([~vis2[~self.vis2.flag], ~closure[~self.closure_phase.flag]])
+        tables = replace(self.vis2, flag=vis2), replace(self.closure_phase, flag=closure)
+        return self._of_part(*tables, used)
+
+    def _of_part(self, vis2: Measurements, closure: Measurements, used: BoolArray) -> Observables:
+        """Other tables, with the errors of those unflagged data (n_data,) that they use."""
         return replace(
             self,
-            vis2=replace(self.vis2, flag=vis2),
-            closure_phase=replace(self.closure_phase, flag=closure),
+            vis2=vis2,
+            closure_phase=closure,
             covariance=self.covariance.select(np.flatnonzero(used)),
             scatter=None if self.scatter is None else self.scatter[used][:, used],
             shared=None if self.shared is None else self.shared.select(used),

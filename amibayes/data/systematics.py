@@ -92,14 +92,20 @@ def tabulated(data: Observables, sources: Iterable[str]) -> tuple[Systematics, .
     return tuple(f for f in found if f is not None and f.vis2 + f.closure_phase_rad > 0.0)
 
 
-def calibration_errors(data: Observables) -> FloatArray:
-    """Calibration errors that the table gives for unflagged data, (n_data,), whatever their number.
+def calibration_errors(
+    data: Observables, choice: str | tuple[float, float] = "table"
+) -> FloatArray:
+    """Calibration errors of unflagged data, (n_data,), whatever the number of exposures.
 
-    Standard deviations, V² then closure phases in radians; 0 for files without an entry.
+    Standard deviations, V² then closure phases in radians; 0 for files without an entry in the
+    table, or with ``choice`` "none". Numbers are those of every file, as in `systematics_of`.
     """
     data = data.unflagged()
     out = np.zeros(data.covariance.size)
-    for floor in tabulated(data, dict.fromkeys(s.source for s in data.setups)):
+    floors = systematics_of(data, choice)
+    if choice == "table":
+        floors = tabulated(data, dict.fromkeys(s.source for s in data.setups))
+    for floor in floors:
         own = np.array([s.source == floor.source for s in data.setups])
         value = np.abs(data.vis2.value)
         vis2 = np.hypot(floor.vis2 * value, 2.0 * np.sqrt(value) * floor.visibility)

@@ -238,7 +238,9 @@ def compare(
     each = own or [_selected(data, model, mask, noise) for mask in masks]
     made = [_Part.of(one, theta, mask) for one, mask in zip(each, masks, strict=True)]
     ratio, gain = _apart(made, likelihood.difference(np.atleast_2d(theta)))
-    gaussian = all(np.isinf(one.degrees) for one in each)
+    # A stated covariance may have V² and closure phases share errors: these are drawn together.
+    together = not own and _share_errors(likelihood, masks)
+    gaussian = all(np.isinf(one.degrees) for one in each) and not together
     above = made_draws = 0
     for n in pieces_of(simulations, len(theta) if gaussian else len(data.data)):
         if gaussian:
@@ -255,6 +257,13 @@ def compare(
         if above >= ENOUGH:
             break
     return Consistency(split, tuple(parts), float(gain[0]), (1 + above) / (1 + made_draws))
+
+
+def _share_errors(likelihood: Likelihood, masks: Sequence[BoolArray]) -> bool:
+    """Whether data of one part have errors in common with those of another."""
+    size = abs(likelihood.noise.covariance.whitening)
+    touched = sum((size @ mask.astype(float) > 0.0).astype(int) for mask in masks)
+    return bool(np.max(touched) > 1)
 
 
 def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, FloatArray]:

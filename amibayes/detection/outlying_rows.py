@@ -47,6 +47,9 @@ class OutlyingRow:
         The file.
     stations : tuple of str
     mjd : float
+        NaN where it is not known.
+    phase : str
+        What phases are called, see `amibayes.data.observables.Observables.phase_name`.
     deviation : float
         Root mean square over its channels, in units of the stated errors with the calibration
         errors known of the instrument, or of the median row where that deviates by more.
@@ -57,16 +60,21 @@ class OutlyingRow:
     row: int
     path: str
     stations: tuple[str, ...]
-    mjd: float
+    mjd: float = field(compare=False)
+    phase: str = field(compare=False)
     deviation: float = field(compare=False)
 
     def __str__(self) -> str:
-        name = "V2" if self.kind == "vis2" else "closure phase"
-        return f"{name} {'-'.join(self.stations)} at MJD {self.mjd:.4f}"
+        name = "V2" if self.kind == "vis2" else self.phase
+        date = f" at MJD {self.mjd:.4f}" if np.isfinite(self.mjd) else ""
+        return f"{name} {'-'.join(self.stations)}{date}"
 
 
 def outlying_rows(
-    data: Observables, likelihood: Likelihood, theta: FloatArray
+    data: Observables,
+    likelihood: Likelihood,
+    theta: FloatArray,
+    systematics: str | tuple[float, float] = "table",
 ) -> tuple[OutlyingRow, ...]:
     """Find the rows that a fit does not explain, those that deviate most first.
 
@@ -78,10 +86,12 @@ def outlying_rows(
         Of the fit: its model.
     theta : (n_dim,) float array
         The fit.
+    systematics : "table", "none" or (vis2, degrees)
+        Calibration errors: those of the table of instruments, however many exposures there are.
     """
     data = data.unflagged()
     difference = Likelihood(data, likelihood.model).difference(np.atleast_2d(theta))[:, 0]
-    variance = data.covariance.variance + calibration_errors(data) ** 2
+    variance = data.covariance.variance + calibration_errors(data, systematics) ** 2
     square, n = difference**2 / variance, data.n_vis2
     found = [*_of_kind(data, "vis2", square[:n]), *_of_kind(data, "cp", square[n:])]
     return tuple(sorted(found, key=lambda row: -row.deviation))
@@ -102,7 +112,9 @@ def _of_kind(data: Observables, kind: Kind, square: FloatArray) -> Iterator[Outl
             (j, row), at = rows[k].tolist(), here[first[k]]
             stations = tuple(data.setups[j].stations[s] for s in table.stations[at])
             mjd, away = float(table.mjd[at]), float(deviation[k])
-            yield OutlyingRow(kind, j, row, data.setups[j].source, stations, mjd, away)
+            yield OutlyingRow(
+                kind, j, row, data.setups[j].source, stations, mjd, data.phase_name, away
+            )
 
 
 def _instruments(data: Observables) -> NDArray[np.str_]:

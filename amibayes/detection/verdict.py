@@ -225,7 +225,7 @@ def _apart(split: Consistency) -> str:
 
 def _rejected(result: SearchResult, fit: float, structure: Significance) -> str:
     if fit <= structure.probability:
-        worst = min(_parts(result, 0.0), key=lambda part: part.p)
+        worst = min(_parts(result, 0.0), key=lambda part: (part.p, -part.chi2 / part.dof))
         several = len(files_of(result.likelihood.observables)) > 1
         where = f" in {worst.source}" if several else ""
         return (

@@ -7,12 +7,14 @@ none.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from amibayes.errors import RunError
 from amibayes.parallel.processes import Lost, ProcessExecutor, Worker, start
 from amibayes.parallel.threads import know_pools, run_here
 
@@ -28,8 +30,13 @@ written to is copied."""
 
 
 def at_hand() -> int:
-    """Number of processes that a run of seconds takes unasked: the cores that it may use."""
-    return min(len(os.sched_getaffinity(0)), MOST_AT_HAND) if CAN_FORK else 1
+    """Number of processes that a run of seconds takes unasked: the cores that it may use.
+
+    One inside a worker process, whose siblings use them.
+    """
+    if not CAN_FORK or multiprocessing.parent_process() is not None:
+        return 1
+    return min(len(os.sched_getaffinity(0)), MOST_AT_HAND)
 
 
 class ForkExecutor(ProcessExecutor):
@@ -60,6 +67,11 @@ class ForkExecutor(ProcessExecutor):
                 yield from (run_here(function, piece) for piece in pieces[1:])
                 return
         know_pools()
+        try:
+            self._workers.append(start(function))
+        except RunError:  # no room for a process, which nobody may have asked for
+            yield from (run_here(function, piece) for piece in pieces[here:])
+            return
         instead = None if lost is None else lambda k, error: lost(k + here, error)
         try:
             yield from super().map(function, pieces[here:], instead)

@@ -164,7 +164,7 @@ class ProcessExecutor:
                 "a worker process cannot start workers",
                 remedy='in a script, start the work below if __name__ == "__main__":',
             )
-        self._n = workers
+        self.workers = workers
         self._workers: list[Worker] = []
 
     def map(
@@ -198,7 +198,7 @@ class ProcessExecutor:
 
     def _hand_out(self, job: _Job) -> None:
         """Give every idle worker a piece, never far ahead of the consumer."""
-        while job.todo and job.todo[0] < job.next + 2 * self._n:
+        while job.todo and job.todo[0] < job.next + 2 * self.workers:
             worker = self._idle(job)
             if worker is None:
                 return
@@ -210,8 +210,13 @@ class ProcessExecutor:
 
     def _idle(self, job: _Job) -> Worker | None:
         idle = next((worker for worker in self._workers if worker.piece is None), None)
-        if idle is None and len(self._workers) < self._n:
-            idle = self._started(job.function)
+        if idle is None and len(self._workers) < self.workers:
+            try:
+                idle = self._started(job.function)
+            except RunError:
+                if self._workers:  # fewer of them do it, too
+                    return None
+                raise
             self._workers.append(idle)
         return idle
 

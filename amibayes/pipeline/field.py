@@ -89,10 +89,14 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     left_out: tuple[OutlyingRow, ...] = ()
     used = observables.only(options.observables)
     for _ in range(MAX_LEFT_OUT + 1):
-        outlying = outlying_rows(used, found.result.likelihood, found.result.theta)
+        outlying = outlying_rows(
+            used, found.result.likelihood, found.result.theta, options.systematics
+        )
         more = [row for row in outlying if row not in left_out]
         if not more:
             break
+        if len(left_out) == MAX_LEFT_OUT:
+            return whole
         left_out = (*left_out, more[0])
         if not may_be_left_out(used, left_out):
             return whole
@@ -103,9 +107,10 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
 
 
 def _told(row: OutlyingRow) -> str:
+    """Say what was left out."""
     return (
-        f"{row} was left out: it is {row.deviation:.0f} errors away from what fits all other data "
-        "(--keep-outliers takes it in)"
+        f"{row} was left out: it is {row.deviation:.0f} times as far from what fits all other data "
+        "as its errors, or as others are (--keep-outliers takes it in)"
     )
 
 

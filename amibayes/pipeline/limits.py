@@ -266,6 +266,7 @@ def _all_limits(
         for kinds, seed in zip(_kinds(data, options), seeds, strict=False)
     ]
     main = choices[0].searched(data)
+    data = main.observables  # the same rows for all
     alike = [replace(c, search=_alike(c.search, main.result)) for c in choices[1:]]
     choices = [replace(choices[0], found=main), *alike]
     with _at_once(run, choices) as (executor, choices):
@@ -279,14 +280,16 @@ def _all_limits(
 
 @contextmanager
 def _at_once(run: Run, choices: list[_Choice]) -> Iterator[tuple[Executor, list[_Choice]]]:
-    """Open a process for each choice, which has no workers itself, and tells nothing meanwhile.
+    """Open processes for the choices, which have no workers themselves, and tell nothing meanwhile.
 
-    Where the workers are others the choices are measured here, one after the other.
+    Where the workers are others, or more than choices, these are measured here, one after the
+    other.
     """
-    if len(choices) == 1 or not isinstance(run.executor, ForkExecutor):
+    workers = run.executor.workers if isinstance(run.executor, ForkExecutor) else 0
+    if not 1 < workers <= len(choices):
         yield SerialExecutor(), choices
         return
-    executor = ForkExecutor(len(choices), first_here=False)
+    executor = ForkExecutor(workers, first_here=False)
     with run.stage("limits"), closing(executor):
         yield executor, [replace(c, run=c.run.alone()) for c in choices]
 
@@ -320,7 +323,8 @@ def _kinds(data: Observables, options: LimitsOptions) -> list[Kinds]:
 
 def _alike(search: SearchOptions, main: SearchResult) -> SearchOptions:
     """Keep to the main limit's field; what one kind of data cannot fit is held at its value."""
-    search = replace(search, separation_mas=(main.grid.inner_mas, main.grid.outer_mas))
+    field = main.grid.inner_mas, main.grid.outer_mas
+    search = replace(search, separation_mas=field, keep_outliers=True)
     if "vis2" in search.observables:
         return search
     return replace(

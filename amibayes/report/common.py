@@ -51,7 +51,7 @@ def data_json(result: SearchResult, left_out: Sequence[OutlyingRow] = ()) -> Jso
         "n_closure_phases": used.n_closure_phases,
         **({} if used.phase_name == "closure phase" else {"phases": used.phase_name}),
         "n_independent": used.n_independent,
-        "left_out": [asdict(row) for row in left_out],
+        "left_out": left_out_json(left_out),
         "covariance": used.covariance_kind,
         "n_integrations": used.n_integrations,
         "degrees_of_freedom": None if freedom is None else freedom.degrees,
@@ -61,6 +61,16 @@ def data_json(result: SearchResult, left_out: Sequence[OutlyingRow] = ()) -> Jso
         "targets": list(dict.fromkeys(s.target for s in used.setups if s.target)),
         "separation_mas": [result.grid.inner_mas, result.grid.outer_mas],
     }
+
+
+def left_out_json(rows: Sequence[OutlyingRow]) -> list[Json]:
+    """List the rows that were left out."""
+    listed = []
+    for row in rows:
+        one = asdict(row) | {"mjd": number(row.mjd)}
+        del one["phase"]
+        listed.append(one)
+    return listed
 
 
 def channel_correlation_json(noise: ExtraNoise) -> Json:

@@ -11,6 +11,7 @@ from interferometer import common_errors, four_telescopes
 from scipy import stats
 
 from amibayes.companion_search.optimise import refine
+from amibayes.data.blocks import Block, BlockCovariance
 from amibayes.data.observables import Observables, join
 from amibayes.data.systematics import Systematics
 from amibayes.detection.consistency import (
@@ -19,6 +20,7 @@ from amibayes.detection.consistency import (
     _epochs,
     _kinds,
     _Part,
+    _share_errors,
     compare,
 )
 from amibayes.likelihood.channel_noise import ChannelShare, Correlation, noise_with_channels
@@ -150,3 +152,18 @@ def test_gains_within_their_floor_make_no_disagreement(
         found.append(compare(likelihood, theta, "observables", parts, rng, 400, None, extra).p)
     below = int((np.array(found) < 0.05).sum())
     assert stats.binom.sf(below - 1, 60, 0.05) > 1e-4
+
+
+def test_kinds_that_share_errors_are_drawn_together(rng: np.random.Generator) -> None:
+    """A stated covariance may have V² and closure phases share errors."""
+    sheet = niriss()
+    assert not _share_errors(Likelihood(sheet), list(_kinds(sheet).values()))
+    whole, n = np.diag(sheet.covariance.variance), sheet.n_vis2
+    sigma = np.sqrt(np.diag(whole))
+    whole[0, n] = whole[n, 0] = 0.3 * sigma[0] * sigma[n]
+    block = Block(np.arange(len(whole)), whole)
+    shared = replace(sheet, covariance=BlockCovariance(len(whole), [block]))
+    likelihood = Likelihood(shared)
+    assert _share_errors(likelihood, list(_kinds(shared).values()))
+    found = compare(likelihood, np.array(TRUTH), "observables", _kinds(shared), rng, 200)
+    assert 0.0 < found.p <= 1.0

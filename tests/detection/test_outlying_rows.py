@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.field import search_field
 from amibayes.pipeline.options import SearchOptions
+from amibayes.report.common import left_out_json
 from amibayes.units import MAS
 
 Visibility = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -102,6 +104,30 @@ def test_deviation_is_that_of_the_row() -> None:
     value = wrong.vis2.value[at]
     error = np.sqrt(0.01**2 + (0.03 * value) ** 2 + (2.0 * np.sqrt(value) * 0.005) ** 2)
     assert again.deviation == pytest.approx(np.sqrt(np.mean((z / error) ** 2)), rel=1e-6)
+    assert outlying_rows(named, likelihood, theta, "none") == (row,)
+    assert outlying_rows(named, likelihood, theta, (0.5, 1.0)) == ()
+
+
+def test_rows_without_a_date_are_left_out() -> None:
+    """One row at most as long as it is one: a date that is not a number equals no other."""
+    clean = observed(sky((5.0, -4.0, 0.05)), 1)
+    nowhen = {
+        name: replace(t, mjd=np.full(len(t), np.nan))
+        for name, t in (("vis2", clean.vis2), ("closure_phase", clean.closure_phase))
+    }
+    found = search_field(spoilt(replace(clean, **nowhen), "vis2", 5), OPTIONS)
+    assert len(found.left_out) == 1
+    assert "MJD" not in str(found.left_out[0])
+    assert json.dumps(left_out_json(found.left_out), allow_nan=False)
+
+
+def test_more_spoilt_rows_than_may_be_are_all_kept() -> None:
+    """Six of some hundred rows, of five outlying at a time none is left out."""
+    data = observed(sky((5.0, -4.0, 0.05)), 2)
+    rows = np.unique(np.column_stack([data.vis2.setup, data.vis2.row]), axis=0, return_index=True)
+    for entry in rows[1][:: max(1, len(rows[1]) // 6)][:6]:
+        data = spoilt(data, "vis2", int(entry))
+    assert search_field(data, OPTIONS).left_out == ()
 
 
 def test_few_rows_only() -> None:
@@ -109,7 +135,7 @@ def test_few_rows_only() -> None:
     data = observed(sky(), 4)
     total = len(np.unique(np.column_stack([data.vis2.setup, data.vis2.row]), axis=0))
     rows = [
-        OutlyingRow("vis2", int(s), int(r), "", (), 0.0, 9.0)
+        OutlyingRow("vis2", int(s), int(r), "", (), 0.0, "closure phase", 9.0)
         for s, r in zip(data.vis2.setup, data.vis2.row, strict=True)
     ]
     rows = list(dict.fromkeys(rows))

@@ -63,7 +63,9 @@ def killed_and_resumed(star: Path, out: Path, kills: int, seed: int) -> dict[str
     for k, pieces in enumerate(sorted(rng.choice(np.arange(1, 28), kills, replace=False))):
         before = finished_pieces(out)
         more = ("--workers", "2") if k % 2 else ()
-        workers = kill_after(resumed(star, out, *more), out, max(int(pieces), before + 1))
+        # The first piece of a job is made before its processes are forked.
+        least = before + (3 if more else 1)
+        workers = kill_after(resumed(star, out, *more), out, max(int(pieces), least))
         assert finished_pieces(out) > before
         assert not (out / "limits.json").exists()
         if more:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
+
+from amibayes.errors import RunError
 
 if TYPE_CHECKING:
     from amibayes.parallel import Beside, Executor
@@ -51,10 +53,12 @@ class Drawing:
     ----------
     arguments : argparse.Namespace
     folder : path
+    apart : path
+        Where pictures wait for the end of the run: until then those of an older one stay.
     """
 
-    def __init__(self, arguments: argparse.Namespace, folder: Path) -> None:
-        self._arguments, self._folder = arguments, folder
+    def __init__(self, arguments: argparse.Namespace, folder: Path, apart: Path) -> None:
+        self._arguments, self._folder, self._apart = arguments, folder, apart
         self._beside: Beside | None = None
         self._begun: list[Path] = []
 
@@ -77,8 +81,11 @@ class Drawing:
         from amibayes.parallel import Beside
         from amibayes.plots.pictures import picture_files, save_pictures
 
-        self._begun = picture_files(report, self._folder)
-        self._beside = Beside(partial(save_pictures, report), self._folder)
+        self._apart.mkdir(parents=True, exist_ok=True)
+        # Where the system has no room for a process they are drawn here in the end.
+        with suppress(RunError):
+            self._beside = Beside(partial(save_pictures, report), self._apart)
+            self._begun = picture_files(report, self._folder)
 
     def finish(self, report: SearchReport) -> list[Path]:
         """Draw what is left; give the files of all pictures."""
@@ -94,4 +101,7 @@ class Drawing:
             draw_files(report, [path for path in files if path not in self._begun], executor)
         if self._beside.result() is None:  # a process that was killed, for want of memory say
             save_pictures(report, self._folder)
+            return files
+        for path in self._apart.iterdir():
+            path.replace(self._folder / path.name)
         return files
