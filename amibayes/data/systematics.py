@@ -102,9 +102,8 @@ def calibration_errors(
     """
     data = data.unflagged()
     out = np.zeros(data.covariance.size)
-    floors = systematics_of(data, choice)
-    if choice == "table":
-        floors = tabulated(data, dict.fromkeys(s.source for s in data.setups))
+    sources = dict.fromkeys(s.source for s in data.setups)
+    floors = tabulated(data, sources) if choice == "table" else systematics_of(data, choice)
     for floor in floors:
         own = np.array([s.source == floor.source for s in data.setups])
         value = np.abs(data.vis2.value)

@@ -33,6 +33,7 @@ from amibayes.detection.splits import (
     gain_of,
 )
 from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.chi2 import touched
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import files_of
@@ -261,9 +262,8 @@ def compare(
 
 def _share_errors(likelihood: Likelihood, masks: Sequence[BoolArray]) -> bool:
     """Whether data of one part have errors in common with those of another."""
-    size = abs(likelihood.noise.covariance.whitening)
-    touched = sum((size @ mask.astype(float) > 0.0).astype(int) for mask in masks)
-    return bool(np.max(touched) > 1)
+    both = (np.logical_and(*touched(likelihood.noise.covariance, mask)) for mask in masks)
+    return any(shared.any() for shared in both)
 
 
 def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, FloatArray]:

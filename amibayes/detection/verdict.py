@@ -96,14 +96,17 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    fit = fit_probability(result, shape=shape)
+    parts = _parts(result, shape)
+    fit = _smallest(parts)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     for split in apart:
         if split.split != "observables":
             return Verdict("inconsistent data", _apart(split), p_model)
     if p_model < alpha:
-        return Verdict("model rejected", _rejected(result, fit, structure), p_model)
+        return Verdict(
+            "model rejected", _rejected(parts, result.likelihood.degrees, fit, structure), p_model
+        )
     for split in apart:
         return Verdict("inconsistent data", _apart(split), p_model)
     small = 2.0 * structure.probability < alpha
@@ -146,8 +149,7 @@ def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
     probabilities count, the smallest times their number. That of all data together would refuse
     a model for misfits that noise within its prior explains, but that no part asks for.
     """
-    parts = _parts(result, shape)
-    return min(1.0, len(parts) * min(part.p for part in parts))
+    return _smallest(_parts(result, shape))
 
 
 @dataclass(frozen=True)
@@ -159,6 +161,11 @@ class _Part:
     chi2: float
     dof: float
     p: float
+
+
+def _smallest(parts: Sequence[_Part]) -> float:
+    """The smallest probability of several, times their number."""
+    return min(1.0, len(parts) * min(part.p for part in parts))
 
 
 def _parts(result: SearchResult, shape: float) -> list[_Part]:
@@ -223,11 +230,15 @@ def _apart(split: Consistency) -> str:
     )
 
 
-def _rejected(result: SearchResult, fit: float, structure: Significance) -> str:
+def _rejected(parts: Sequence[_Part], degrees: float, fit: float, structure: Significance) -> str:
     if fit <= structure.probability:
-        worst = min(_parts(result, 0.0), key=lambda part: (part.p, -part.chi2 / part.dof))
-        several = len(files_of(result.likelihood.observables)) > 1
-        where = f" in {worst.source}" if several else ""
+
+        def chance(part: _Part) -> tuple[float, float]:
+            """By χ² as it is; probabilities may be 0."""
+            return chi2_survival(part.chi2, part.dof, degrees), -part.chi2 / part.dof
+
+        worst = min(parts, key=chance)
+        where = f" in {worst.source}" if len({part.source for part in parts}) > 1 else ""
         return (
             f"χ² of {NAMES[worst.kind]}{where} is {worst.chi2:.4g} for {worst.dof:.0f} degrees of "
             "freedom with the best companion and as much noise as its prior allows"

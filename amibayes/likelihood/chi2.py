@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.special import gammaincc, gammaln, ndtri_exp
 
 from amibayes.data.covariance import Covariance
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
@@ -87,16 +87,21 @@ def deviance(chi2: FloatArray, n: int, degrees: float) -> FloatArray:
     return np.asarray((degrees + n) * np.log1p(chi2 / (degrees - 2.0)))
 
 
+def touched(covariance: Covariance, at: IntArray | BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Which whitened data (rank,) some data touch, by index or mask, and which ones all others."""
+    outside = np.ones(covariance.size)
+    outside[at] = 0.0
+    size = abs(covariance.whitening)
+    return size @ (1.0 - outside) > 0.0, size @ outside > 0.0
+
+
 def chi2_of_part(covariance: Covariance, at: IntArray, difference: FloatArray) -> tuple[float, int]:
     """χ² of the data ``at`` some places, and the number of independent ones among them.
 
     Where they share no error with other data this is a part of the whitened data: a covariance
     of their own, whose cost goes with the cube of the data that share errors, is not made.
     """
-    outside = np.ones(covariance.size)
-    outside[at] = 0.0
-    size = abs(covariance.whitening)
-    inside, beyond = size @ (1.0 - outside) > 0.0, size @ outside > 0.0
+    inside, beyond = touched(covariance, at)
     if not (inside & beyond).any():
         # No error is shared with other data: their part of the whitened data is all of it.
         return float((covariance.whiten(difference)[inside] ** 2).sum()), int(inside.sum())

@@ -88,17 +88,15 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
         return whole
     left_out: tuple[OutlyingRow, ...] = ()
     used = observables.only(options.observables)
-    for _ in range(MAX_LEFT_OUT + 1):
+    while True:
         outlying = outlying_rows(
             used, found.result.likelihood, found.result.theta, options.systematics
         )
         more = [row for row in outlying if row not in left_out]
         if not more:
             break
-        if len(left_out) == MAX_LEFT_OUT:
-            return whole
         left_out = (*left_out, more[0])
-        if not may_be_left_out(used, left_out):
+        if len(left_out) > MAX_LEFT_OUT or not may_be_left_out(used, left_out):
             return whole
         found = _search_field(without_rows(observables, left_out), options)
     if not left_out or set(outlying) != set(left_out):

@@ -17,7 +17,6 @@ from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, draws_needed, reachable
-from amibayes.detection.outlying_rows import OutlyingRow
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.analytic import analytic_limit
@@ -93,22 +92,26 @@ class MeasuredLimit:
     Parameters
     ----------
     observables : tuple of {"vis2", "cp"}
-    result : SearchResult
-        Of the search whose limit it is.
-    noise : ExtraNoise
+    found : FieldSearch
+        The search whose limit it is.
     significance : Significance or None
     limit : Limit
-    data, left_out : Observables, tuple of OutlyingRow
-        What it was measured from, of all kinds, and what was left out of that.
     """
 
     observables: Kinds
-    result: SearchResult
-    noise: ExtraNoise
+    found: FieldSearch
     significance: Significance | None
     limit: Limit
-    data: Observables
-    left_out: tuple[OutlyingRow, ...] = ()
+
+    @property
+    def result(self) -> SearchResult:
+        """Of the search."""
+        return self.found.result
+
+    @property
+    def noise(self) -> ExtraNoise:
+        """That the search fitted."""
+        return self.found.noise
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,7 +186,7 @@ def measure_limits(
         ready = run.keep("data", lambda: prepare(targets, calibrators, options.search, rng, run))
         limits, notes = _all_limits(ready, options, seeds[5:], run)
         models, beside = beside_models(
-            limits[0].data, limits[0], options.search, np.random.default_rng(seeds[4]), run
+            limits[0], options.search, np.random.default_rng(seeds[4]), run
         )
     return LimitsReport(
         options,
@@ -200,7 +203,6 @@ def measure_limits(
 
 
 def beside_models(
-    data: Observables,
     main: MeasuredLimit,
     search: SearchOptions,
     rng: np.random.Generator,
@@ -209,12 +211,11 @@ def beside_models(
     """Compare models of the sky where they were asked for, and limits beside a stated disc."""
     if search.models is None:
         return None, None
-    found = FieldSearch(main.result, main.noise, (), data)
     search = replace(search, observables=main.observables)
     grid = main.result.grid
     prior = default_prior(main.result.likelihood, grid.inner_mas, grid.outer_mas)
-    models = compare_stage(data, found, prior, search, rng, run)
-    return models, limits_stage(models, found, search, rng, run)
+    models = compare_stage(main.found, prior, search, rng, run)
+    return models, limits_stage(models, main.found, search, rng, run)
 
 
 def _refuse(options: LimitsOptions) -> None:
@@ -352,8 +353,7 @@ def _one_limit(
             )  # fmt: skip
     with run.stage(f"limits {name}"):
         limit = _limit(found, tested, options, streams[1], run)
-    what = search.observables, found.result, found.noise, tested, limit
-    measured = MeasuredLimit(*what, found.observables, found.left_out)
+    measured = MeasuredLimit(search.observables, found, tested, limit)
     notes = search_warnings(found.observables, found.result, found.noise, tested, None)
     return measured, [*found.warnings, *notes]
 

@@ -10,7 +10,6 @@ from amibayes.companion_search.field import default_separation
 from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES, extended_names
 from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
-from amibayes.data.observables import Observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions
@@ -21,7 +20,6 @@ from amibayes.support.options import NULL_DRAWS, SAMPLERS
 
 
 def compare_stage(
-    observables: Observables,
     found: FieldSearch,
     prior: Prior,
     options: SearchOptions,
@@ -34,7 +32,7 @@ def compare_stage(
     """
     if options.models is None:
         return None
-    used = observables.only(options.observables)
+    used = found.observables.only(options.observables)
     fitted = options.extra_noise and not options.robust
     noise = NoiseSetting(
         found.noise,

@@ -128,7 +128,7 @@ def _compared(
 ) -> tuple[ModelComparison | None, LimitsBeside | None]:
     """Compare models of the sky, and measure limits beside a disc; None where not asked for."""
     prior = _prior(found.result, options)
-    models = compare_stage(found.observables, found, prior, options, rng["models"], run)
+    models = compare_stage(found, prior, options, rng["models"], run)
     return models, limits_stage(models, found, options, rng["models"], run)
 
 

@@ -47,7 +47,7 @@ def limits_report_json(report: LimitsReport, request: str = "") -> Json:
         "seed": report.options.search.seed,
         "request": request,
         "inputs": inputs_json(report.targets, report.calibrators),
-        "data": data_json(main.result, main.left_out),
+        "data": data_json(main.result, main.found.left_out),
         "noise": {
             "extra_vis2": main.noise.vis2,
             "extra_closure_phase_deg": float(np.degrees(main.noise.closure_phase_rad)),
