@@ -30,7 +30,7 @@ from trials import keep_answer, known_answers
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from amibayes import Observables, analytic_limit, significance, statistic_of
-from amibayes.detection.binomial import clopper_pearson
+from amibayes.detection.tails import clopper_pearson
 from amibayes.simulation.observe import ramp_path
 from benchmarks.charge_migration import MOVING, PLAIN, calibrated, n_integrations, visit
 from benchmarks.statements import errors_of, searched

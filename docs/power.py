@@ -21,8 +21,8 @@ from pages import put_table
 from amibayes import BinaryModel, Likelihood, Observables, TemplateBank, load_instrument
 from amibayes.companion_search.grid import make_grid
 from amibayes.data.point_source import point_source
-from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.statistic import make_statistic
+from amibayes.detection.tails import clopper_pearson
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import BLACK, BLUE, VERMILLION, new_figure, styled
 from amibayes.units import FloatArray, offset

@@ -27,6 +27,9 @@ WORTH, NEARLY_ALL = 0.5, 0.7
 """Parts of the data's number above which combinations of a group are not worth their making, and
 those of all groups."""
 
+Roots = tuple[tuple[IntArray, FloatArray], ...]
+"""Rows of data that are correlated with each other, and a root of their covariance, (n, n)."""
+
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -92,6 +95,28 @@ class Reduction:
         held = rng.standard_normal((len(self.label) - len(self.bases), n))
         left = [rng.chisquare(d, n) if d > 0.0 else np.zeros(n) for d in self.degrees]
         return np.concatenate([held, np.sqrt(left)])
+
+    def roots(self, roots: Roots) -> Roots:
+        """Roots of the covariance of the rows, from those of the data that are correlated.
+
+        Of groups by themselves. What combinations have more of the variance, the rest has less.
+        """
+        found: list[tuple[IntArray, FloatArray]] = []
+        first = 0
+        for k, (rows, basis) in enumerate(zip(self.rows, self.bases, strict=True)):
+            covariance = np.eye(basis.shape[1])
+            for own, root in roots:
+                at = np.minimum(np.searchsorted(rows, own), len(rows) - 1)
+                held = np.where((rows[at] == own)[:, None], basis[at], 0.0)
+                covariance += (root.T @ held).T @ (root.T @ held) - held.T @ held
+            here = np.arange(first, first + len(covariance))
+            lower = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(here)))
+            found.append((here, np.asarray(lower, dtype=float)))
+            first += len(here)
+            if self.degrees[k]:
+                rest = max(len(rows) - float(np.trace(covariance)), 0.0) / self.degrees[k]
+                found.append((np.array([k - len(self.bases)]), np.array([[np.sqrt(rest)]])))
+        return tuple(found)
 
     def added(self, noise: FloatArray, signal: FloatArray) -> FloatArray:
         """Data of noise and signal, (n_rows, n) each.

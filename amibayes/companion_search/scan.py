@@ -12,6 +12,7 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.observables import Observables
+from amibayes.likelihood.channel_rows import ChannelRows
 from amibayes.units import FloatArray, IntArray
 
 SWEEPS = 8
@@ -103,7 +104,9 @@ class ScaleGroups:
         return np.asarray(np.clip(square / count, mean / MAX_UNEQUAL, mean * MAX_UNEQUAL))
 
 
-def scale_groups(data: Observables, n_nuisance: int, smooth: IntArray | None = None) -> ScaleGroups:
+def scale_groups(
+    data: Observables, n_nuisance: int, rows: ChannelRows | None = None
+) -> ScaleGroups:
     """Group the whitened data by file and kind.
 
     Parameters
@@ -113,10 +116,10 @@ def scale_groups(data: Observables, n_nuisance: int, smooth: IntArray | None = N
         where the covariance was estimated: its scale was measured.
     n_nuisance : int
         Parameters of the fit without a companion.
-    smooth : (n_data,) int array, optional
-        Rows of errors that are smooth over the channels (`ChannelRows.level`): where there are
-        enough of a level they have a scale of their own, so that the statistic does not depend
-        on how large these errors are.
+    rows : ChannelRows, optional
+        Those of errors that are smooth over the channels: where there are enough of a level they
+        have a scale of their own, so that the statistic does not depend on how large these errors
+        are.
     """
     whitening = data.covariance.whitening
     share = max(1.0 - n_nuisance / max(whitening.shape[0], 1), 1e-6)
@@ -127,8 +130,8 @@ def scale_groups(data: Observables, n_nuisance: int, smooth: IntArray | None = N
     kind = np.arange(len(setup)) >= data.n_vis2
     of_datum = 2 * sources[setup] + kind
     label = _connected(whitening, of_datum)
-    if smooth is not None:
-        split = label + (label.max() + 1) * smooth
+    if rows is not None:
+        split = label + (label.max() + 1) * rows.level
         enough = np.bincount(split)[split] >= MIN_DATA
         label = np.unique(np.where(enough, split, label), return_inverse=True)[1]
     count = np.bincount(label)

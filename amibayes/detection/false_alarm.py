@@ -11,13 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.detection.binomial import clopper_pearson
+from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.randomised import Randomised
 from amibayes.detection.statistic import Statistic
 from amibayes.detection.tails import (
     MIN_PROBABILITY,
     TAIL_FRACTION,
     Tail,
+    clopper_pearson,
     extreme_value_survival,
     pareto_survival,
     tail_of,
@@ -57,6 +58,8 @@ class Significance(Shown):
         The statistic of the data at every position of the bank.
     randomised : Randomised, optional
         The check that owes nothing to the model of the noise.
+    exposures : ExposureNoise, optional
+        What exposures share of the noise, in null draws too.
     """
 
     statistic: float
@@ -68,6 +71,7 @@ class Significance(Shown):
     test: Statistic | None = None
     field: FloatArray | None = None
     randomised: Randomised | None = None
+    exposures: ExposureNoise | None = None
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
@@ -199,6 +203,7 @@ def significance(
         tail_of(null, observed, rng) if extrapolate else None,
         alpha,
         test,
+        exposures=test.exposures,
     )
 
 

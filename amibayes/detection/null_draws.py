@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.treatments import ErrorTreatment, Ratio
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.support.shared_results import shared
@@ -35,6 +36,7 @@ def null_draws(
     n: int,
     rng: np.random.Generator,
     *,
+    exposures: ExposureNoise | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
     journal: Journal | None = None,
@@ -49,11 +51,13 @@ def null_draws(
     n : int
     rng : numpy.random.Generator
         Its seed decides the draws: targets with one seed have common random numbers.
+    exposures : ExposureNoise, optional
+        What exposures share of the noise.
     executor, progress, journal : optional, see `amibayes.parallel.run_job`
     """
     sizes = pieces_of(n, bank.n_rows)
     pieces = list(zip(spawn(rng, len(sizes)), sizes, strict=True))
-    where, search = executor or SerialExecutor(), (bank, treatment.of_nulls, ratio)
+    where, search = executor or SerialExecutor(), (bank, treatment.of_nulls, ratio, exposures)
 
     def drawn() -> FloatArray:
         work = partial(_piece, *search)
@@ -63,12 +67,26 @@ def null_draws(
     return shared(drawn, "null draws", search, pieces)
 
 
+def noise_of_rows(
+    treatment: ErrorTreatment,
+    exposures: ExposureNoise | None,
+    normals: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Noise of data sets (n_rows, n) of a bank, out of independent unit normals."""
+    if exposures is not None:
+        normals = exposures.shared(normals, rng)
+    return treatment.noise_of(normals, rng)
+
+
 def _piece(
     bank: TemplateBank,
     treatment: ErrorTreatment,
     ratio: Ratio,
+    exposures: ExposureNoise | None,
     piece: tuple[np.random.SeedSequence, int],
 ) -> dict[str, FloatArray]:
     rng, size = np.random.default_rng(piece[0]), piece[1]
-    found = treatment.search_simulated(bank, treatment.noise_of(bank.normals(size, rng), rng))
+    noise = noise_of_rows(treatment, exposures, bank.normals(size, rng), rng)
+    found = treatment.search_simulated(bank, noise)
     return {"statistic": ratio(found.gain, found.chi2)}

@@ -16,9 +16,9 @@ import numpy as np
 from scipy.special import gammaln
 
 from amibayes.data.observables import Measurements, Observables, exposure_labels
-from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.null_draws import pieces_of
 from amibayes.detection.statistic import Statistic
+from amibayes.detection.tails import clopper_pearson
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, spawn
 from amibayes.units import FloatArray, IntArray
 

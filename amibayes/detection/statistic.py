@@ -17,7 +17,8 @@ from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult, null_likelihood
 from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.detection.null_draws import null_draws
+from amibayes.detection.exposure_noise import ExposureNoise, exposure_noise
+from amibayes.detection.null_draws import noise_of_rows, null_draws
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.treatments import (
     ErrorTreatment,
@@ -80,6 +81,11 @@ class Statistic(Protocol):
     @property
     def label(self) -> str:
         """What its values are called."""
+        ...
+
+    @property
+    def exposures(self) -> ExposureNoise | None:
+        """What exposures share of the noise; None where they are independent."""
         ...
 
     def hits(self, white: FloatArray) -> Hits:
@@ -166,6 +172,8 @@ class BankStatistic:
         What is made of a gain in χ².
     residual : (n_data,) float array
         Data less the fit, V² then closure phases in radians.
+    exposures : ExposureNoise, optional
+        What exposures share of the noise; by default they are independent.
     """
 
     likelihood: Likelihood
@@ -174,6 +182,7 @@ class BankStatistic:
     treatment: ErrorTreatment
     ratio: Ratio
     residual: FloatArray
+    exposures: ExposureNoise | None = None
 
     @property
     def observed(self) -> FloatArray:
@@ -208,7 +217,7 @@ class BankStatistic:
 
     def noise(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Noise of data sets (n_data, n) out of unit normals; ``rng`` for what else is drawn."""
-        return self.treatment.noise_of(normals, rng)
+        return noise_of_rows(self.treatment, self.exposures, normals, rng)
 
     def hits_in(self, noise: FloatArray, signal: FloatArray | None = None) -> Hits:
         """Search data sets of `noise` (n_data, n) and of a whitened signal each."""
@@ -262,7 +271,7 @@ class BankStatistic:
         executor, progress, journal : optional, see `amibayes.parallel.run_job`
         """
         return null_draws(
-            self.bank, self.treatment, self.ratio, n, rng,
+            self.bank, self.treatment, self.ratio, n, rng, exposures=self.exposures,
             executor=executor, progress=progress, journal=journal,
         )  # fmt: skip
 
@@ -307,7 +316,12 @@ def statistic_of(
         projected out, of the data and of the null sets.
     """
     likelihood, whitening = null_likelihood(result)
-    return make_statistic(
+    exposures = None
+    if whitening is None and not stated_errors:
+        exposures = exposure_noise(likelihood, result.single_theta)
+    if exposures is not None:
+        likelihood = likelihood.with_noise(exposures.noise)
+    made = make_statistic(
         likelihood,
         result.grid,
         result.single_theta,
@@ -315,6 +329,9 @@ def statistic_of(
         whitening=whitening,
         beside=result.theta if beside else None,
     )
+    if exposures is None:
+        return made
+    return replace(made, exposures=exposures.of_bank(made.bank))
 
 
 def make_statistic(
@@ -365,7 +382,7 @@ def _treatment(
         return bank, Rotations(null)
     if stated_errors:
         return bank, KnownErrors()
-    groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.smooth_rows)
+    groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.rows)
     least = 1.0 if likelihood.noise.floor else 0.0
     reduced = bank.reduced(groups.label)
     if reduced.reduction is not None:

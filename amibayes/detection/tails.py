@@ -1,4 +1,4 @@
-"""Laws for the null distribution past its draws: generalised Pareto and extreme value."""
+"""Probabilities that were counted in draws: their intervals, and laws past the last draw."""
 
 from __future__ import annotations
 
@@ -108,3 +108,11 @@ def _pareto(null: FloatArray, fraction: float) -> tuple[float, float, float]:
     mean, variance = (excess - threshold).mean(), (excess - threshold).var(ddof=1)
     ratio = float(mean * mean / max(variance, 1e-300))
     return threshold, 0.5 * (1.0 - ratio), 0.5 * float(mean) * (1.0 + ratio)
+
+
+def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Exact binomial interval of a probability (Clopper & Pearson 1934)."""
+    rest = 0.5 * (1.0 - level)
+    low = stats.beta.ppf(rest, successes, trials - successes + 1) if successes else 0.0
+    high = stats.beta.isf(rest, successes + 1, trials - successes) if successes < trials else 1.0
+    return float(low), float(high)

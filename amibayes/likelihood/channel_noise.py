@@ -281,7 +281,7 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     for rho in COMMON:
         variance = 1.0 - rho + (rho + sure) * length
         product = rest / (1.0 - rho) + single + (along / variance[:, None]).T @ along
-        chi2, n_fitted, information = _fitted(product)
+        chi2, n_fitted, information = linear_fit(product)
         count = len(both) - n_fitted
         if count == 0:  # the fit passes through all data: they say nothing of their noise
             return np.zeros(len(COMMON))
@@ -290,10 +290,13 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     return np.array(found)
 
 
-def _fitted(product: FloatArray) -> tuple[float, int, float]:
+def linear_fit(product: FloatArray) -> tuple[float, int, float]:
     """χ² after a linear fit, number of parameters that it tells, and ln of their information.
 
-    From the products of residual and slopes (1 + n_dim, 1 + n_dim).
+    Parameters
+    ----------
+    product : (1 + n_dim, 1 + n_dim) float array
+        Products of whitened residual and slopes.
     """
     slopes = product[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(slopes), 1e-300))

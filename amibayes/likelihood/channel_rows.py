@@ -36,6 +36,10 @@ class ChannelLayout:
     amplitude : (rank,) float array
         Root mean square in the group of the change by a coherent error of the visibility, in
         errors.
+    datum, place : (rank,) int array
+        First of the data that a row is made of, and which of the combinations of these it is.
+    stated : (rank,) bool array
+        Rows whose data are of several channels or kinds: their correlations are stated.
     vis2 : (rank,) bool array
         Rows of V².
     source : (rank,) int array
@@ -49,6 +53,9 @@ class ChannelLayout:
     weight: FloatArray
     unit: FloatArray
     amplitude: FloatArray
+    datum: IntArray
+    place: IntArray
+    stated: BoolArray
     vis2: BoolArray
     source: IntArray
     names: tuple[str, ...]
@@ -162,6 +169,13 @@ class ChannelRows:
 OFFSET, SLOPE = 1, 2
 
 
+def independent_rows(n: int) -> ChannelRows:
+    """Whitened data (n,) as they are."""
+    one = np.ones(n)
+    unit = csr_array((one, (np.arange(n), np.arange(n))), shape=(n, n))
+    return ChannelRows(unit, one, np.zeros(n, dtype=np.intp), np.zeros(n))
+
+
 def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
     """Variance of rows of channels in order, correlated by φ^|i−j| and of unit variance each."""
     if phi == 0.0:
@@ -267,15 +281,16 @@ def channel_layout(data: Observables) -> ChannelLayout:
         Unflagged, in independent channels. Data that a block correlates across channels, or
         across kinds, already have their correlations stated: they are groups of one.
     """
-    group, channel, weight, first = _labelled(data)
+    group, weight, first, place, stated = _labelled(data)
+    channel = np.concatenate([data.vis2.channel, data.closure_phase.channel])[first]
     order = np.lexsort((channel, group))
-    group, channel, weight = group[order], channel[order], weight[order]
+    group, channel, weight, first = group[order], channel[order], weight[order], first[order]
     begins = np.append(True, np.diff(group) != 0)[: len(group)]
     group = np.cumsum(begins) - 1
     gap = np.where(begins, np.inf, np.diff(channel, prepend=0).astype(float))
     count = np.maximum(np.bincount(group), 1)
     mean = np.bincount(group, weight**2) / count
-    slope = np.bincount(group, _amplitudes(data)[first][order] ** 2) / count
+    slope = np.bincount(group, _amplitudes(data)[first] ** 2) / count
     names = tuple(sorted({s.source for s in data.setups}))
     of_setup = np.array([names.index(s.source) for s in data.setups], dtype=np.intp)
     setup = np.concatenate([data.vis2.setup, data.closure_phase.setup])[first]
@@ -286,8 +301,11 @@ def channel_layout(data: Observables) -> ChannelLayout:
         weight / np.sqrt(mean[group]),
         np.sqrt(mean[group]),
         np.sqrt(slope[group]),
-        (first < data.n_vis2)[order],
-        of_setup[setup][order],
+        first,
+        place[order],
+        stated[order],
+        first < data.n_vis2,
+        of_setup[setup],
         names,
     )
 
@@ -313,8 +331,8 @@ def _pattern(data: Observables) -> FloatArray:
     return np.abs(data.vis2.value if expected is None else expected)
 
 
-def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-    """Group, channel, shape of the common error and first datum of each whitened row."""
+def _labelled(data: Observables) -> tuple[IntArray, FloatArray, IntArray, IntArray, BoolArray]:
+    """Group of each whitened row, shape of its common error, first datum, combination, stated."""
     n_vis2 = data.n_vis2
     setup, row, channel = (
         np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
@@ -327,6 +345,7 @@ def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArr
     vis2, strength = np.arange(len(sigma)) < n_vis2, np.log(shape / sigma)
     kinds = vis2.astype(np.intp)
     groups, firsts, weights = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
+    places, stated = [np.empty(0, np.intp)], [np.empty(0, bool)]
     used = 0
     for stack in data.covariance.stacks:
         inside, rank = stack.index, stack.shape[1]
@@ -341,5 +360,9 @@ def _labelled(data: Observables) -> tuple[IntArray, IntArray, FloatArray, IntArr
         used += 2 * own.size
         firsts.append(np.repeat(inside[:, 0], rank))
         weights.append(np.repeat(np.exp(strength[inside].mean(axis=1)), rank))
-    first = np.concatenate(firsts)
-    return np.concatenate(groups), channel[first], np.concatenate(weights), first
+        places.append(np.tile(np.arange(rank), len(inside)))
+        stated.append(np.repeat(~alike.all(axis=1), rank))
+    return (
+        np.concatenate(groups), np.concatenate(weights), np.concatenate(firsts),
+        np.concatenate(places), np.concatenate(stated),
+    )  # fmt: skip

@@ -21,7 +21,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelRows
 from amibayes.likelihood.chi2 import deviance, log_peak
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import FloatArray
 
 MAX_EXPONENT = 50.0
 """Gains in ln L are cut where their Δχ² would overflow; nothing is decided so far out."""
@@ -66,8 +66,8 @@ class NoiseModel(Protocol):
         ...
 
     @property
-    def smooth_rows(self) -> IntArray | None:
-        """`ChannelRows.level` of whitened rows, (n_independent,); None where none share."""
+    def rows(self) -> ChannelRows | None:
+        """How whitened data are turned; None where channels of an exposure share nothing."""
         ...
 
     def aligned(self, white: FloatArray) -> FloatArray:
@@ -144,11 +144,6 @@ class GaussianNoise:
     scatter: csr_array | None = None
     rows: ChannelRows | None = None
     floor: bool = False
-
-    @property
-    def smooth_rows(self) -> IntArray | None:
-        """`ChannelRows.level` of whitened rows, (n_independent,); None where none share."""
-        return None if self.rows is None else self.rows.level
 
     def aligned(self, white: FloatArray) -> FloatArray:
         """Whitened data (n_independent, …) turned to rows that stand for single channels."""
@@ -297,9 +292,9 @@ class FittedNoise:
         return self.fit.floor
 
     @property
-    def smooth_rows(self) -> IntArray | None:
+    def rows(self) -> ChannelRows | None:
         """Those of the fit."""
-        return self.fit.smooth_rows
+        return self.fit.rows
 
     def aligned(self, white: FloatArray) -> FloatArray:
         """As the fit does it."""

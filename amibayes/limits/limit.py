@@ -10,7 +10,7 @@ from astropy.table import QTable
 from scipy import stats
 
 from amibayes.data.tables import UNITS, quantity_table
-from amibayes.detection.binomial import clopper_pearson
+from amibayes.detection.tails import clopper_pearson
 from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.units import BoolArray, FloatArray, IntArray, contrast_to_delta_mag

@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
+from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.splits import Consistency
 from amibayes.detection.whiteness import correlated
@@ -229,6 +230,22 @@ def _correlated(result: SearchResult) -> list[str]:
     ]
 
 
+def _drifting(exposures: ExposureNoise) -> list[str]:
+    """Warn where exposures that follow each other err alike."""
+    named = {"V2": exposures.vis2, "closure phases": exposures.closure_phase}
+    told = {name: d for name, d in named.items() if d and d.share[0] > SURE_SHARE * d.share[1]}
+    return [
+        f"{name} of exposures that follow each other err alike, for hours: "
+        f"{drift.share[0]:.2f} +/- {drift.share[1]:.2f} of what channels share, if there is no "
+        "companion; the false-alarm probability and limits allow for it, errors of the fit do not"
+        for name, drift in told.items()
+    ]
+
+
+SURE_SHARE = 3.0
+"""A share of the noise, in its errors, that is said aloud."""
+
+
 def search_warnings(
     observables: Observables,
     result: SearchResult,
@@ -255,6 +272,8 @@ def search_warnings(
             f"{tested.alpha:g}: no detection is claimed or denied (give --null-draws "
             f"{draws_needed(tested.alpha)} or more)"
         )
+    if tested is not None and tested.exposures is not None:
+        found += _drifting(tested.exposures)
     found += _outliers(result, noise)
     found += _correlated(result)
     excluded = [] if posterior is None else _of_prior(result, posterior.prior)

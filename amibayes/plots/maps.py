@@ -18,8 +18,8 @@ from matplotlib.patheffects import withStroke
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.result import SearchResult
-from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.tails import clopper_pearson
 from amibayes.likelihood.chi2 import candid_n_sigma
 from amibayes.plots.style import (
     BLACK,

@@ -10,6 +10,7 @@ from amibayes import __version__
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.comparison.limits import LimitsBeside
+from amibayes.detection.exposure_noise import Drift, ExposureNoise
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
@@ -186,6 +187,7 @@ def _significance(result: SearchResult, tested: Significance | None, alpha: floa
             "threshold": tested.threshold(),
             "parametric": tested.parametric,
             "randomised": _randomised(tested),
+            "exposures": _exposures(tested.exposures),
             "extrapolation": None
             if tested.tail is None
             else {
@@ -207,6 +209,19 @@ def _randomised(weight: Significance) -> Json | None:
         "probability": check.probability,
         "interval": None if check.interval is None else list(check.interval),
     }
+
+
+def _exposures(shared: ExposureNoise | None) -> Json | None:
+    if shared is None:
+        return None
+    return {name: _drift(getattr(shared, name)) for name in ("vis2", "closure_phase")}
+
+
+def _drift(drift: Drift | None) -> Json | None:
+    if drift is None:
+        return None
+    share, error = drift.share
+    return {"share": share, "share_error": error, "hours": drift.hours}
 
 
 def _modes(report: SearchReport) -> list[Json]:

@@ -12,10 +12,10 @@ from scipy import stats
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.data.observables import Observables
-from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.false_alarm import Significance, draws_needed, reachable
 from amibayes.detection.randomised import Randomised, randomisation_of, randomised
 from amibayes.detection.statistic import BankStatistic, make_statistic
+from amibayes.detection.tails import clopper_pearson
 from amibayes.likelihood.likelihood import Likelihood
 
 GRID = make_grid(3.0, 12.0, 1.0)

@@ -10,10 +10,9 @@ from scipy import stats
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.search import search
-from amibayes.detection.binomial import clopper_pearson
 from amibayes.detection.false_alarm import Significance, significance
 from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
-from amibayes.detection.tails import extreme_value_survival, pareto_survival
+from amibayes.detection.tails import clopper_pearson, extreme_value_survival, pareto_survival
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box

@@ -198,7 +198,7 @@ def test_gains_that_change_across_the_band_are_no_companion() -> None:
         draw = gain * across[sheet.vis2.channel] + 0.01 * rng.standard_normal(len(rows.ravel()))
         likelihood = Likelihood(with_draw(sheet, draw))
         noise = noise_with_channels(likelihood.observables, (), floors)
-        assert set(np.unique(noise.smooth_rows)) == {0, OFFSET, SLOPE}
+        assert set(np.unique(noise.rows.level)) == {0, OFFSET, SLOPE}
         statistic = make_statistic(likelihood.with_noise(noise), grid, np.empty(0))
         null = statistic.draw_null(100, rng)
         out.append((1 + (null >= statistic.value).sum()) / 101.0)
