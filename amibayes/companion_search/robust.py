@@ -25,14 +25,15 @@ from amibayes.likelihood.student import (
     DEGREES,
     Robustness,
     StudentNoise,
+    StudentTerm,
     SymmetricWhitening,
     normal_moments,
     reweighted,
     scales,
+    student_terms,
     symmetric_whitening,
     weights_of,
 )
-from amibayes.likelihood.student_noise import StudentTerm, student_terms
 from amibayes.models.parameters import Box
 from amibayes.units import BoolArray, FloatArray
 

@@ -22,7 +22,7 @@ from amibayes.likelihood.extra_noise import (
 )
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
-from amibayes.likelihood.student_noise import averaged_student_noise
+from amibayes.likelihood.student import averaged_student_noise
 
 
 def search_with_noise(
@@ -126,9 +126,13 @@ def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
     return all(
         abs(x.value - y.value) <= max(SHARE_CONVERGED, SHARE_OF_ERROR * np.nan_to_num(y.error))
         and abs(np.log(x.offset / y.offset)) + abs(np.log(x.slope / y.slope)) <= GROWTH_CONVERGED
+        and abs(sum(x.lasting) - sum(y.lasting)) <= LASTING_CONVERGED
         for x, y in pairs
     )
 
+
+LASTING_CONVERGED = 0.05
+"""Change of the share that exposures have in common: half of what a hundred of them tell."""
 
 GROWTH_CONVERGED = 0.1
 """Change of ln of a floor's variance likewise: of twenty gains it is known to 0.3."""

@@ -33,6 +33,8 @@ from amibayes.data.blocks import Block, BlockCovariance, orthonormal
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
+from amibayes.likelihood.chi2 import linear_fit
+from amibayes.likelihood.exposure_rows import series_of, turned_rows
 from amibayes.likelihood.noise import GaussianNoise, NoiseModel, noise_of
 from amibayes.units import FloatArray, IntArray
 
@@ -59,6 +61,10 @@ class Correlation:
     offset, slope : float
         Variance of what the floor has in common to all channels, and in changes across them, in
         units of the floor's: more than 1 where residuals show more.
+    lasting : tuple of float
+        Share of what is common to the channels that exposures which follow each other have in
+        common too, for each of `amibayes.likelihood.exposure_rows.HOURS`; empty where no
+        baseline was observed twice in a night.
     """
 
     common: float = 0.0
@@ -67,6 +73,12 @@ class Correlation:
     error: float = float("nan")
     offset: float = 1.0
     slope: float = 1.0
+    lasting: tuple[float, ...] = ()
+
+    @property
+    def any(self) -> bool:
+        """Whether anything is shared, by channels or by exposures."""
+        return self.value > 0.0 or sum(self.lasting) > 0.0
 
 
 @dataclass(frozen=True)
@@ -205,10 +217,25 @@ def noise_with_channels(
     if not (shares or floors) or data.freedom is not None:
         return noise_of(data)
     layout = channel_layout(data)
-    if not (layout.any or floors):
+    lasting = any(sum(c.lasting) > 0.0 for s in shares for c in (s.vis2, s.closure_phase))
+    if not (layout.any or floors or lasting):
         return noise_of(data)
-    covariance = ChannelCovariance(data.covariance, channel_rows(layout, shares, floors))
-    return GaussianNoise(covariance, rows=covariance.rows, floor=bool(floors))
+    rows = exposure_rows(data, layout, shares, channel_rows(layout, shares, floors))
+    return GaussianNoise(ChannelCovariance(data.covariance, rows), rows=rows, floor=bool(floors))
+
+
+def exposure_rows(
+    data: Observables, layout: ChannelLayout, shares: Sequence[ChannelShare], rows: ChannelRows
+) -> ChannelRows:
+    """Turn rows that exposures share, as the shares of their files say, to independent ones."""
+    correlated = []
+    if any(share.vis2.lasting or share.closure_phase.lasting for share in shares):
+        for one in series_of(data, layout):
+            share = share_of(shares, one.source)
+            lasting = (share.vis2 if one.vis2 else share.closure_phase).lasting
+            if sum(lasting) > 0.0:
+                correlated.append((one, one.mean_correlation(lasting)))
+    return turned_rows(rows, correlated)[0] if correlated else rows
 
 
 def correlation_of(
@@ -288,21 +315,3 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
         logdet = log_step + n_rest * np.log1p(-rho) + np.log(variance).sum()
         found.append(count * np.log(max(chi2, 1e-300) / count) + logdet + information)
     return np.array(found)
-
-
-def linear_fit(product: FloatArray) -> tuple[float, int, float]:
-    """χ² after a linear fit, number of parameters that it tells, and ln of their information.
-
-    Parameters
-    ----------
-    product : (1 + n_dim, 1 + n_dim) float array
-        Products of whitened residual and slopes.
-    """
-    slopes = product[1:, 1:]
-    scale = np.sqrt(np.maximum(np.diag(slopes), 1e-300))
-    values, vectors = np.linalg.eigh(slopes / np.outer(scale, scale))
-    told = values > 1e-10
-    pull = vectors[:, told].T @ (product[1:, 0] / scale)
-    chi2 = float(product[0, 0] - (pull**2 / values[told]).sum())
-    information = float(np.log(values[told]).sum() + 2.0 * np.log(scale[scale > 1e-140]).sum())
-    return chi2, int(told.sum()), information

@@ -158,12 +158,15 @@ class ChannelRows:
         that changes evenly across them, 0 of all others.
     floor : (rank,) float array
         Variance by further errors, of several channels.
+    apart : ChannelRows, optional
+        The rows as they were before those that exposures share were turned.
     """
 
     rotation: csr_array
     sigma: FloatArray
     level: IntArray
     floor: FloatArray
+    apart: ChannelRows | None = None
 
 
 OFFSET, SLOPE = 1, 2

@@ -107,3 +107,21 @@ def chi2_of_part(covariance: Covariance, at: IntArray, difference: FloatArray) -
         return float((covariance.whiten(difference)[inside] ** 2).sum()), int(inside.sum())
     part = covariance.select(at)
     return float((part.whiten(difference[at]) ** 2).sum()), part.rank
+
+
+def linear_fit(product: FloatArray) -> tuple[float, int, float]:
+    """χ² after a linear fit, number of parameters that it tells, and ln of their information.
+
+    Parameters
+    ----------
+    product : (1 + n_dim, 1 + n_dim) float array
+        Products of whitened residual and slopes.
+    """
+    slopes = product[1:, 1:]
+    scale = np.sqrt(np.maximum(np.diag(slopes), 1e-300))
+    values, vectors = np.linalg.eigh(slopes / np.outer(scale, scale))
+    told = values > 1e-10
+    pull = vectors[:, told].T @ (product[1:, 0] / scale)
+    chi2 = float(product[0, 0] - (pull**2 / values[told]).sum())
+    information = float(np.log(values[told]).sum() + 2.0 * np.log(scale[scale > 1e-140]).sum())
+    return chi2, int(told.sum()), information

@@ -20,6 +20,7 @@ from amibayes.likelihood.channel_noise import (
     Correlation,
     channel_rows,
     correlation_of,
+    exposure_rows,
 )
 from amibayes.likelihood.channel_rows import (
     OFFSET,
@@ -29,6 +30,7 @@ from amibayes.likelihood.channel_rows import (
     channel_layout,
 )
 from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.exposure_rows import drift_of, series_of
 from amibayes.likelihood.extra_noise import (
     BOUND,
     UNLIKELY,
@@ -83,7 +85,7 @@ def fit_noise(
         extra = ExtraNoise(found[0].vis2, found[0].closure_phase_rad)
     else:
         extra = mean_of_files(data, found)
-    told = any(np.isfinite([s.vis2.error, s.closure_phase.error]).any() for s in shares)
+    told = any(np.isfinite(c.error) or c.any for s in shares for c in (s.vis2, s.closure_phase))
     return replace(extra, channels=tuple(shares) if told else (), floors=prior.floors)
 
 
@@ -110,6 +112,7 @@ class _Fit:
             if self.prior.channels and self.data.freedom is None:
                 shared = one.correlation(amount)
                 shared = one.with_larger_floors(amount, shared, self.prior)
+                shared = one.with_exposures(amount, shared)
             amount = one.amount(shared, self.prior.width(part, kind))
             if abs(amount - before) <= 1e-2 * amount:
                 break
@@ -130,11 +133,12 @@ class _Kind:
     def covariance(self, amount: float, shared: Correlation) -> Covariance:
         """With an amount of extra noise, and channels that share some of the noise."""
         base = self._with(amount)
-        if shared.value == 0.0 and not self.floors:
+        if not (shared.any or self.floors):
             return base
         if shared not in self._rows:
             shares = [ChannelShare(shared, shared)]
-            self._rows[shared] = channel_rows(self._layout, shares, self._own_floors)
+            rows = channel_rows(self._layout, shares, self._own_floors)
+            self._rows[shared] = exposure_rows(self.data, self._layout, shares, rows)
         return ChannelCovariance(base, self._rows[shared])
 
     @cached_property
@@ -203,7 +207,7 @@ class _Kind:
 
     def _misfit(self, shared: Correlation) -> Callable[[float], float]:
         """−2 ln of the restricted likelihood of an amount of extra noise, but for a constant."""
-        if shared.value == 0.0 and not self.floors:
+        if not (shared.any or self.floors):
             return self._misfit_of_independent
         return partial(self._misfit_of_shared, shared)
 
@@ -250,6 +254,17 @@ class _Kind:
             for at in (rows.level == OFFSET, rows.level == SLOPE)
         ]
         return replace(shared, offset=found[0], slope=found[1])
+
+    def with_exposures(self, amount: float, shared: Correlation) -> Correlation:
+        """The same with what exposures that follow each other share, as the residuals show."""
+        series = series_of(self.data, self._layout)
+        if not series:
+            return shared
+        alone = replace(shared, lasting=())
+        rows = channel_rows(self._layout, [ChannelShare(alone, alone)], self._own_floors)
+        noise = ChannelCovariance(self._with(amount), rows)
+        white = noise.whiten(np.column_stack([self.residual, self.jacobian]))
+        return replace(shared, lasting=drift_of(series, white).lasting)
 
     def _growth(
         self, square: FloatArray, variance: FloatArray, floor: FloatArray, ratio: float

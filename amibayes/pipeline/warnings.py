@@ -237,7 +237,7 @@ def _drifting(exposures: ExposureNoise) -> list[str]:
     return [
         f"{name} of exposures that follow each other err alike, for hours: "
         f"{drift.share[0]:.2f} +/- {drift.share[1]:.2f} of what channels share, if there is no "
-        "companion; the false-alarm probability and limits allow for it, errors of the fit do not"
+        "companion; errors, false-alarm probability and limits allow for it"
         for name, drift in told.items()
     ]
 

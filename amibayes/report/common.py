@@ -74,7 +74,7 @@ def left_out_json(rows: Sequence[OutlyingRow]) -> list[Json]:
 
 
 def channel_correlation_json(noise: ExtraNoise) -> Json:
-    """Correlation of neighbouring channels' noise, its error, and what all channels share.
+    """Correlation of neighbouring channels' noise, its error, what all share, and exposures share.
 
     Of files with correlations of their own the mean.
     """
@@ -88,6 +88,8 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
         found[f"{key}_error"] = number(float(spread))
         common = [s.common for s, ok in zip(shares, known, strict=True) if ok]
         found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
+        lasting = [sum(s.lasting) for s in shares]
+        found[f"{key}_lasting"] = float(np.mean(lasting)) if lasting else 0.0
     return found
 
 

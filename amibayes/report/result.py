@@ -10,7 +10,7 @@ from amibayes import __version__
 from amibayes.companion_search.result import Companion, Mode, SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.comparison.limits import LimitsBeside
-from amibayes.detection.exposure_noise import Drift, ExposureNoise
+from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
@@ -214,14 +214,11 @@ def _randomised(weight: Significance) -> Json | None:
 def _exposures(shared: ExposureNoise | None) -> Json | None:
     if shared is None:
         return None
-    return {name: _drift(getattr(shared, name)) for name in ("vis2", "closure_phase")}
-
-
-def _drift(drift: Drift | None) -> Json | None:
-    if drift is None:
-        return None
-    share, error = drift.share
-    return {"share": share, "share_error": error, "hours": drift.hours}
+    names = ("share", "share_error", "hours")
+    return {
+        kind: None if drift is None else dict(zip(names, (*drift.share, drift.hours), strict=True))
+        for kind, drift in (("vis2", shared.vis2), ("closure_phase", shared.closure_phase))
+    }
 
 
 def _modes(report: SearchReport) -> list[Json]:

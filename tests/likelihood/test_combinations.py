@@ -29,8 +29,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
-from amibayes.likelihood.student import symmetric_whitening
-from amibayes.likelihood.student_noise import averaged_student_noise
+from amibayes.likelihood.student import averaged_student_noise, symmetric_whitening
 from amibayes.models.parameters import Box
 
 COVARIANCES = ("known", "estimated")

@@ -23,8 +23,14 @@ from amibayes.likelihood.extra_noise import add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.noise_terms import with_nodes
-from amibayes.likelihood.student import DEGREES, normal_moments, scales, scores, symmetric_whitening
-from amibayes.likelihood.student_noise import student_terms
+from amibayes.likelihood.student import (
+    DEGREES,
+    normal_moments,
+    scales,
+    scores,
+    student_terms,
+    symmetric_whitening,
+)
 from amibayes.models.parameters import Box
 
 FIELD = (50.0, 400.0)

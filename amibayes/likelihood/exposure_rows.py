@@ -1,0 +1,223 @@
+"""Errors that exposures which follow each other share: a transfer function that drifts.
+
+Gains of baselines and offsets of closure phases change over minutes to hours. Exposures of
+one night then err alike, as light of a companion does. Of what is common to the channels of an
+exposure, a share κ of the variance is correlated by exp(−Δt/τ) between exposures of the same
+baseline (or combination of triangles). κ and τ have a posterior by restricted likelihood; a
+covariance has its mean over that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from amibayes.data.observables import Observables
+from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
+from amibayes.likelihood.chi2 import linear_fit
+from amibayes.units import FloatArray, IntArray
+
+HOURS = np.array([0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
+"""Nodes of τ: from the time between exposures to a night."""
+
+SHARES = np.linspace(0.0, 0.95, 20)
+"""Nodes of κ."""
+
+PRIOR_INDEPENDENT = 0.5
+"""Prior probability of κ = 0: even odds, as for extra noise. The rest is uniform."""
+
+NIGHT_HOURS = 12.0
+"""Exposures farther apart than this begin another series."""
+
+LONGEST = 256
+"""Exposures of a series: of more, each part by itself."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Exposures of one baseline, or combination of triangles, in one night.
+
+    Parameters
+    ----------
+    rows : (n,) int array
+        What is common to the channels of each, among whitened data.
+    hours : (n,) float array
+    source : str
+        File that they come from.
+    vis2 : bool
+        Of V², or of closure phases.
+    """
+
+    rows: IntArray
+    hours: FloatArray
+    source: str
+    vis2: bool
+
+    def correlation(self, share: float, tau: float) -> FloatArray:
+        """Correlation (n, n) of exposures for κ and τ, hours."""
+        apart = np.abs(self.hours[:, None] - self.hours)
+        return np.asarray(share * np.exp(-apart / tau) + (1.0 - share) * np.eye(len(self.rows)))
+
+    def mean_correlation(self, lasting: Sequence[float]) -> FloatArray:
+        """Its mean over a posterior; see `Drift.lasting`."""
+        each = [w * self.correlation(1.0, tau) for w, tau in zip(lasting, HOURS, strict=True)]
+        return np.asarray(np.sum(each, axis=0) + (1.0 - sum(lasting)) * np.eye(len(self.rows)))
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Posterior of what exposures of one kind of observable share.
+
+    Parameters
+    ----------
+    mass : (n_hours, n_shares) float array
+        Of the nodes `HOURS` and `SHARES`.
+    """
+
+    mass: FloatArray
+
+    @property
+    def share(self) -> tuple[float, float]:
+        """Mean and standard deviation of κ."""
+        weight = self.mass.sum(axis=0)
+        mean = float(weight @ SHARES)
+        return mean, float(np.sqrt(weight @ (SHARES - mean) ** 2))
+
+    @property
+    def hours(self) -> float:
+        """Median of τ where something is shared."""
+        some = np.cumsum(self.mass[:, 1:].sum(axis=1))
+        return float(HOURS[np.searchsorted(some, 0.5 * some[-1])])
+
+    @property
+    def lasting(self) -> tuple[float, ...]:
+        """Mean share of the variance that lasts for each of `HOURS`."""
+        return tuple((self.mass @ SHARES).tolist())
+
+    def nodes(self, n: int) -> list[tuple[float, float]]:
+        """κ and τ of equal probability, n pairs, from the least κ to the largest."""
+        order = np.argsort(np.tile(SHARES, len(HOURS)), kind="stable")
+        cumulative = np.cumsum(self.mass.ravel()[order])
+        at = order[np.searchsorted(cumulative, (np.arange(n) + 0.5) / n * cumulative[-1])]
+        return [(float(SHARES[k % len(SHARES)]), float(HOURS[k // len(SHARES)])) for k in at]
+
+
+def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
+    """Exposures of the same baselines or triangles, of unflagged data.
+
+    None of data whose covariance was estimated from scatter, or states correlations of channels.
+    """
+    if data.freedom is not None:
+        return ()
+    setup, mjd = (
+        np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
+        for name in ("setup", "mjd")
+    )
+    stations = [*data.vis2.stations.tolist(), *data.closure_phase.stations.tolist()]
+    at = layout.starts & ~layout.stated & np.isfinite(mjd[layout.datum])
+    of: dict[tuple[object, ...], list[tuple[float, int]]] = {}
+    for row, datum, place in zip(layout.order[at], layout.datum[at], layout.place[at], strict=True):
+        own, vis2 = data.setups[setup[datum]], bool(datum < data.n_vis2)
+        names = [own.stations[k] for k in stations[datum]]
+        key = own.source, vis2, own.insname, *(sorted(names) if vis2 else names), int(place)
+        of.setdefault(key, []).append((24.0 * float(mjd[datum]), int(row)))
+    found = []
+    for (source, kind, *_), members in of.items():
+        hours, rows = map(np.array, zip(*sorted(members), strict=True))
+        cuts = np.flatnonzero(np.diff(hours) > NIGHT_HOURS) + 1
+        for part in np.split(np.arange(len(rows)), cuts):
+            found += [
+                Series(rows[few], hours[few], str(source), bool(kind))
+                for few in np.array_split(part, 1 + len(part) // LONGEST)
+                if len(few) > 1
+            ]
+    return tuple(found)
+
+
+def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:
+    """Posterior of κ and τ by restricted likelihood.
+
+    Parameters
+    ----------
+    series : sequence of Series
+        At least one.
+    both : (n_independent, 1 + n_dim) float array
+        Whitened residual of a fit, and slopes of its parameters.
+    """
+    n = sum(len(one.rows) for one in series)
+    loss = np.empty((len(HOURS), len(SHARES)))
+    for i, tau in enumerate(HOURS):
+        size, along = _along_axes(series, both, tau)
+        for k, share in enumerate(SHARES):
+            variance = 1.0 + share * (size - 1.0)
+            chi2, n_fitted, information = linear_fit((along / variance[:, None]).T @ along)
+            if n == n_fitted:  # the fit passes through all data: they say nothing of their noise
+                loss[i, k] = 0.0
+                continue
+            left = n - n_fitted
+            logdet = float(np.log(variance).sum())
+            loss[i, k] = left * np.log(max(chi2, 1e-300) / left) + logdet + information
+    prior = np.full(len(SHARES), (1.0 - PRIOR_INDEPENDENT) / (len(SHARES) - 1))
+    prior[0] = PRIOR_INDEPENDENT
+    mass = np.exp(-0.5 * (loss - loss.min())) * prior
+    return Drift(mass / mass.sum())
+
+
+def _along_axes(
+    series: Sequence[Series], both: FloatArray, tau: float
+) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (n,) of exp(−Δt/τ), and data (n, …) along its eigenvectors."""
+    parts = [(np.linalg.eigh(one.correlation(1.0, tau)), both[one.rows]) for one in series]
+    return (
+        np.concatenate([values for (values, _), _ in parts]),
+        np.concatenate([vectors.T @ own for (_, vectors), own in parts]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """Eigenvalues (n,) and eigenvectors (n, n) of the covariance of some rows."""
+
+    rows: IntArray
+    values: FloatArray
+    vectors: FloatArray
+
+
+def turned_rows(
+    rows: ChannelRows, correlated: Sequence[tuple[Series, FloatArray]]
+) -> tuple[ChannelRows, list[Axes]]:
+    """Turn rows that exposures share to independent ones.
+
+    Parameters
+    ----------
+    rows : ChannelRows
+    correlated : sequence of (Series, (n, n) float array)
+        Exposures, and the correlation of what is common to the channels of each.
+
+    Returns
+    -------
+    ChannelRows
+    list of Axes
+        Of the covariance of each series.
+    """
+    sigma, axes = np.array(rows.sigma), []
+    for one, correlation in correlated:
+        own = rows.sigma[one.rows]
+        values, vectors = np.linalg.eigh(correlation * np.outer(own, own))
+        axes.append(Axes(one.rows, values, vectors))
+        sigma[one.rows] = np.sqrt(values)
+    turn = _placed([(a.rows, a.vectors.T) for a in axes], len(sigma))
+    turned = csr_array(turn @ rows.rotation)
+    return replace(rows, rotation=turned, sigma=sigma, apart=rows.apart or rows), axes
+
+
+def _placed(blocks: Sequence[tuple[IntArray, FloatArray]], n: int) -> csr_array:
+    """A matrix (n, n) with blocks at some rows, and 1 on the rest of its diagonal."""
+    rest = np.setdiff1d(np.arange(n), np.concatenate([rows for rows, _ in blocks]))
+    row = np.concatenate([rest, *(np.repeat(rows, len(rows)) for rows, _ in blocks)])
+    column = np.concatenate([rest, *(np.tile(rows, len(rows)) for rows, _ in blocks)])
+    value = np.concatenate([np.ones(len(rest)), *(block.ravel() for _, block in blocks)])
+    return csr_array((value, (row, column)), shape=(n, n))
