@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import ModelComparison
+from amibayes.data.joining import SEPARATOR
 from amibayes.detection.residuals_by_file import file_residuals
 from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.options import SearchOptions
@@ -173,7 +174,8 @@ def _false_alarm(report: SearchReport) -> Figure:
 
 def _calibrators(report: SearchReport) -> Figure:
     kept = [bool(c["kept"]) for c in calibrator_verdicts(report)]
-    return calibrator_plot(report.references, kept, short_names(report.calibrators))
+    first = [r.source.split(SEPARATOR)[0] for r in report.references]
+    return calibrator_plot(report.references, kept, short_names(first))
 
 
 def _null(report: SearchReport) -> Figure:
