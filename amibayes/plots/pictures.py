@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import ModelComparison
-from amibayes.data.joining import SEPARATOR
 from amibayes.detection.residuals_by_file import file_residuals
 from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.options import SearchOptions
@@ -173,9 +172,8 @@ def _false_alarm(report: SearchReport) -> Figure:
 
 
 def _calibrators(report: SearchReport) -> Figure:
-    kept = [bool(c["kept"]) for c in calibrator_verdicts(report)]
-    first = [r.source.split(SEPARATOR)[0] for r in report.references]
-    return calibrator_plot(report.references, kept, short_names(first))
+    kept, stars = [bool(c["kept"]) for c in calibrator_verdicts(report)], report.references
+    return calibrator_plot(stars, kept, short_names([star.source for star in stars]))
 
 
 def _null(report: SearchReport) -> Figure:
