@@ -102,7 +102,11 @@ def orientation_of(header: Header, source: str) -> Orientation:
 
 
 def _orientation_of_roll(header: Header, source: str) -> Orientation | None:
-    """ROLL_REF, V3I_YANG and VPARITY, where there is a roll."""
+    """ROLL_REF, V3I_YANG and VPARITY, where there is a roll.
+
+    V3I_YANG is counted in the sense of the pixels: with VPARITY −1 it adds to the roll, with +1
+    it is taken off, as jwst's ``calc_rotation_matrix`` has it.
+    """
     roll = number(header, "ROLL_REF", source)
     if roll is None:
         return None
@@ -110,7 +114,7 @@ def _orientation_of_roll(header: Header, source: str) -> Orientation | None:
     parity = number(header, "VPARITY", source) or -1.0
     if abs(parity) != 1.0:
         raise DataError(f"keyword VPARITY = {parity:g} is neither 1 nor -1", source=source)
-    return Orientation((roll + yang) * DEGREE, int(parity))
+    return Orientation((roll - parity * yang) * DEGREE, int(parity))
 
 
 def orientation_notes(header: Header, source: str, comments: Mapping[str, str]) -> tuple[str, ...]:
@@ -125,7 +129,7 @@ def orientation_notes(header: Header, source: str, comments: Mapping[str, str]) 
         if abs(apart) > DISAGREE_RAD:
             notes.append(
                 f"{source}: +y lies at {found.position_angle_rad / DEGREE % 360.0:.3f} deg by the "
-                f"WCS, {apart / DEGREE:+.3f} deg from ROLL_REF + V3I_YANG; the WCS is used"
+                f"WCS, {apart / DEGREE:+.3f} deg from ROLL_REF - VPARITY V3I_YANG; the WCS is used"
             )
         if found.parity != roll.parity:
             notes.append(

@@ -190,7 +190,7 @@ def _essential(cube: Cube, n: int) -> dict[str, Any]:
         "PIXELSCL": cube.pixel_scale_rad / MAS / 1000.0,
         "NINTS": n,
         "BUNIT": cube.unit,
-        "ROLL_REF": angle - yang,
+        "ROLL_REF": angle + cube.orientation.parity * yang,
         "V3I_YANG": yang,
         "VPARITY": cube.orientation.parity,
     }

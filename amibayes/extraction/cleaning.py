@@ -95,7 +95,7 @@ def reference_of(file: Source) -> Reference:
     flux = np.nansum(images, axis=(1, 2)) if len(images) else np.zeros(0)
     lit = flux > 0.2 * max(float(np.median(flux[flux > 0.0])) if np.any(flux > 0.0) else 0.0, 0.0)
     if not lit.any():
-        raise DataError("no integration holds light", source=cube.source)
+        raise _no_light(bad, cube.source)
     images, flux = images[lit], flux[lit]
     missing = np.isnan(images)
     good = np.count_nonzero(missing, axis=0) <= ALWAYS_BAD * len(images)
@@ -120,6 +120,14 @@ def reference_of(file: Source) -> Reference:
     missing |= found.outliers(images, missing, OUTLIER)
     images[missing] = np.nan
     return found
+
+
+def _no_light(bad: BoolArray, source: str) -> DataError:
+    """Describe images without light, or without a pixel that may show any."""
+    fault = "no integration holds light"
+    if bad.all():
+        fault += ": every pixel is flagged in DQ, not a number, or has no positive ERR"
+    return DataError(fault, source=source, remedy="check SCI, ERR and DQ, or leave the file out")
 
 
 def median_and_scatter(values: PixelArray) -> tuple[PixelArray, PixelArray]:

@@ -25,8 +25,16 @@ from amibayes.extraction.charge import (
     shared_errors,
     visit_migration,
 )
-from amibayes.extraction.frames import Average, Frames, average, concatenated, measure_file, select
-from amibayes.extraction.mask_map import MaskMap
+from amibayes.extraction.frames import (
+    Average,
+    Frames,
+    average,
+    concatenated,
+    measure_file,
+    refuse_starless,
+    select,
+)
+from amibayes.extraction.mask_map import MaskMap, far_from_stated
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
@@ -196,6 +204,7 @@ def _measured(
         if isinstance(file, MigrationFree):
             changes = observable_changes(file, operator, samples, flux)
     template = file.template
+    refuse_starless(frames, template.source)
     frames = _with_times(frames, template)
     if not options.keep_all:
         frames = replace(frames, reason=select(frames, options.clip, MAX_SHIFT_PX))
@@ -322,6 +331,7 @@ def _of_headers(parts: list[_Part]) -> tuple[str, ...]:
         c, d = (f"{x:+.5f}" for x in (found.matrix[0, 1], found.matrix[1, 0]))
         text = f"pixels taken as the header has them; mask magnified {a}, {b} and sheared {c}, {d}"
         notes[text] = None
+        notes |= dict.fromkeys(far_from_stated(found, parts[0].operator.view.instrument.distortion))
     return tuple(notes)
 
 

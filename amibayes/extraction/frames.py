@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from amibayes.cube import Cube
 from amibayes.cube.source import Source
 from amibayes.data.outliers import TO_SIGMA, look_elsewhere
+from amibayes.errors import DataError
 from amibayes.extraction.cleaning import MAX_BAD
 from amibayes.extraction.fourier.sampling import PixelArray
 from amibayes.extraction.image_plane import FringeFit, shift_of
@@ -18,6 +19,10 @@ from amibayes.units import BoolArray, ComplexArray, FloatArray, IntArray, Single
 
 CHUNK, CHUNK_PIXELS = 64, 2**23
 """Integrations that are worked on together; fewer where they are large."""
+
+STAR = 5.0
+"""A star's flux is more than its error times this in one integration at least; thousands of
+images of noise do not come near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +107,25 @@ def measure_file(
         replace(joined, number=number, file=np.full(len(number), index)),
         np.asarray(total / max(count, 1), dtype=complex),
         flux / max(count, 1),
+    )
+
+
+def refuse_starless(frames: Frames, source: str) -> None:
+    """Refuse images in which no star is seen.
+
+    Raises
+    ------
+    DataError
+    """
+    error = np.sqrt(np.maximum(frames.flux**2 - frames.square, 0.0))
+    if (frames.flux > STAR * error).any():
+        return
+    best = int(np.argmax(frames.flux))
+    raise DataError(
+        f"no star is seen: the flux of the brightest integration is {frames.flux[best]:.3g} ± "
+        f"{error[best]:.2g}",
+        source=source,
+        remedy="check that the images hold the star and that ERR is theirs",
     )
 
 

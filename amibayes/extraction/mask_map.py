@@ -33,6 +33,9 @@ MAX_STEPS, CONVERGED = 6, 1e-6
 LARGEST = 0.05
 """A map farther from the prior's is none of this mask."""
 
+FAR = 0.01
+"""Larger changes of the mask's image than an optical train's: pixels or filter are others."""
+
 COMPANION = 0.02
 """A companion's light looks like another map, by up to this times the rms of |V − 1|."""
 
@@ -69,6 +72,20 @@ class MaskMap:
 
     def __post_init__(self) -> None:
         read_only(self, "matrix", "error")
+
+
+def far_from_stated(found: MaskMap, stated: Distortion) -> tuple[str, ...]:
+    """Say where a map is so far from the instrument's that the pixels are in doubt.
+
+    A mask as drawn, which simulations have, is near enough.
+    """
+    far = float(np.abs(found.matrix - stated.matrix).max())
+    if far <= max(FAR, 3.0 * stated.error):
+        return ()
+    return (
+        f"the mask's image is {100.0 * far:.1f} % off that of the instrument's file: the header's "
+        "pixel scale or filter is in doubt, and separations as much (--pixel-scale, --filter)",
+    )
 
 
 def estimate_map(view: View, image: FloatArray, fit: FringeFit) -> MapEstimate | None:

@@ -186,5 +186,5 @@ def _refuse_another(
         raise DataError(
             f"the fringes of this mask and filter leave {100.0 * share:.0f} % of the image",
             source=reference.source,
-            remedy="check instrument, filter and pixel scale",
+            remedy="check instrument, filter, pixel scale; the images may be turned or mirrored",
         )

@@ -322,6 +322,17 @@ def check_together(
     return uncalibrated(ours, theirs)
 
 
+def uncalibrated_images(paths: Sequence[str | Path]) -> tuple[str, ...]:
+    """Name the image cubes of a target that is given without calibrators."""
+    raw = [str(path) for path in paths if format_of(path).read is _extracted]
+    if not raw:
+        return ()
+    return (
+        f"{', '.join(raw)}: not calibrated: what optics and detector do to V2 and closure phases "
+        "is taken for the star's, and may pass for a companion; give calibrators with --cal",
+    )
+
+
 def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None) -> ImageOptions:
     """Find what image cubes, target's and calibrators', share: the mask's map, and migration.
 

@@ -22,11 +22,20 @@ from amibayes.data.joining import different_targets, in_order, refuse_twice, unu
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.charge import CubeMigration
-from amibayes.extraction.reading import check_together, of_one_visit, read_observations
+from amibayes.extraction.reading import (
+    check_together,
+    of_one_visit,
+    read_observations,
+    uncalibrated_images,
+)
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
-from amibayes.pipeline.warnings import calibration_warnings, vetting_warnings
+from amibayes.pipeline.warnings import (
+    calibration_warnings,
+    unused_calibrators,
+    vetting_warnings,
+)
 from amibayes.support.shared_results import shared
 
 MIN_TO_VET = 3
@@ -104,7 +113,13 @@ def prepare(
         *different_targets(parts),
     )
     ready = _calibrated(parts, references, options, rng, run)
-    warnings = (*vetting_warnings(ready.vetting), *calibration_warnings(ready.calibration), *joined)
+    warnings = (
+        *vetting_warnings(ready.vetting),
+        *calibration_warnings(ready.calibration),
+        *unused_calibrators(ready.calibration, [r.source for r in references]),
+        *(uncalibrated_images(targets) if ready.calibration is None else ()),
+        *joined,
+    )
     charge = next(iter(images.charges.values()), None)
     return replace(ready, references=tuple(references), warnings=warnings, charge_migration=charge)
 

@@ -73,19 +73,22 @@ class SearchReport(Shown):
 
 
 def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:
-    """Every calibrator in the order given: vetting's verdict, then what calibration used."""
+    """Every calibrator in the order given: vetting's verdict, then what calibration used.
+
+    Files that are dithers of one star are one calibrator, with the names of all as its path.
+    """
     if report.calibration is None:
         return []
     used = iter(report.calibration.calibrators)
     verdicts = None if report.vetting is None else report.vetting.calibrators
     out: list[dict[str, object]] = []
-    for k, path in enumerate(report.calibrators):
+    for k, reference in enumerate(report.references):
         vetted = None if verdicts is None else verdicts[k]
         verdict = vetted if vetted is not None and not vetted.kept else next(used)
         agreement = None if vetted is None else vetted.agreement
         out.append(
             {
-                "path": path,
+                "path": reference.source,
                 "kept": verdict.kept,
                 "reason": verdict.reason,
                 "agreement_probability": agreement,

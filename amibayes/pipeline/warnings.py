@@ -50,6 +50,16 @@ def calibration_warnings(calibration: Calibration | None) -> list[str]:
     ]
 
 
+def unused_calibrators(calibration: Calibration | None, given: Sequence[str]) -> list[str]:
+    """Name those given calibrators that calibrate nothing; those of a library are not asked."""
+    uses = [] if calibration is None else calibration.calibrators
+    return [
+        f"calibrator {use.path} is not used: {use.reason}"
+        for use in uses
+        if not use.kept and use.path in given
+    ]
+
+
 def consistency_warnings(splits: Sequence[Consistency]) -> list[str]:
     """Name the calibrator that changes the companion most, where few good ones change it so."""
     tested = [s for s in splits if s.split == "calibrators"]

@@ -172,8 +172,8 @@ def _false_alarm(report: SearchReport) -> Figure:
 
 
 def _calibrators(report: SearchReport) -> Figure:
-    kept = [bool(c["kept"]) for c in calibrator_verdicts(report)]
-    return calibrator_plot(report.references, kept, short_names(report.calibrators))
+    kept, stars = [bool(c["kept"]) for c in calibrator_verdicts(report)], report.references
+    return calibrator_plot(stars, kept, short_names([star.source for star in stars]))
 
 
 def _null(report: SearchReport) -> Figure:

@@ -376,7 +376,7 @@ def _limits(report: SearchReport) -> Json | None:
 def _n_own(report: SearchReport) -> int:
     """Number of calibrators that calibration was given, but for those of a library."""
     vetting = report.vetting
-    return len(report.calibrators) if vetting is None else sum(v.kept for v in vetting.calibrators)
+    return len(report.references) if vetting is None else sum(v.kept for v in vetting.calibrators)
 
 
 def _calibration(report: SearchReport) -> Json | None:

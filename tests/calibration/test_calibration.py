@@ -26,7 +26,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.pipeline.warnings import calibration_warnings
+from amibayes.pipeline.warnings import calibration_warnings, unused_calibrators
 from amibayes.units import MAS
 
 HOLES = np.array(
@@ -755,3 +755,14 @@ def test_reader_is_told_what_one_calibrator_cannot_tell() -> None:
     assert len(said[0]) == 1
     assert "one calibrator calibrates" in said[0][0]
     assert said[1] == calibration_warnings(None) == []
+
+
+def test_reader_is_told_of_a_calibrator_that_calibrates_nothing() -> None:
+    rng = np.random.default_rng(5)
+    target, good, other = (simulated(niriss(), [100.0, 0.0, 0.0], rng) for _ in range(3))
+    setup = replace(other.setups[0], source="F430M", wavelength_m=np.array([4.3e-6]))
+    other = replace(other, setups=(setup,))
+    found = calibrate(target, [good, other])
+    (said,) = unused_calibrators(found, ["F430M"])
+    assert said.startswith("calibrator F430M is not used: no baseline at the same wavelength")
+    assert unused_calibrators(found, []) == unused_calibrators(None, ["F430M"]) == []

@@ -14,6 +14,7 @@ from astropy.table import Table
 from commands import run
 from helpers import error_of, niriss, simulated
 
+from amibayes.calibration import calibrate
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -25,6 +26,7 @@ from amibayes.pipeline.prepare import prepare
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.search import search_companion
+from amibayes.pipeline.vetting import vet
 from amibayes.pipeline.warnings import search_warnings
 from amibayes.report.limits import limits_summary
 from amibayes.report.result import result_json, upper_limit
@@ -167,6 +169,29 @@ def test_other_positions_and_lost_limits_stand_in_the_statement(report: SearchRe
 
 def test_a_run_without_calibrators_has_no_verdicts(report: SearchReport) -> None:
     assert calibrator_verdicts(report) == []
+
+
+@pytest.mark.parametrize("stars", [2, 3])
+def test_dithers_of_a_calibrator_are_one_calibrator(report: SearchReport, stars: int) -> None:
+    # Three are vetted, two are not; both have fewer verdicts than files.
+    rng = np.random.default_rng(4)
+    sheet = niriss()
+    names = [f"{k}_d1_calints.fits, {k}_d2_calints.fits" for k in range(stars)]
+    references = []
+    for name in names:
+        drawn = sheet.with_data(sheet.data + sheet.covariance.draw(rng, 1)[:, 0])
+        references.append(replace(drawn, setups=(replace(drawn.setups[0], source=name),)))
+    verdicts = calibrator_verdicts(
+        replace(
+            report,
+            calibrators=tuple(file for name in names for file in name.split(", ")),
+            references=tuple(references),
+            calibration=calibrate([sheet], references),
+            vetting=vet(references, null_draws=200, limits=False) if stars > 2 else None,
+        )
+    )
+    assert [v["path"] for v in verdicts] == names
+    assert all(v["kept"] for v in verdicts)
 
 
 def test_nothing_to_read_is_refused() -> None:

@@ -377,6 +377,21 @@ def test_orientation_is_that_of_the_wcs_and_contradictions_are_named(tmp_path: P
     assert other.orientation == same.orientation
 
 
+@pytest.mark.parametrize("parity", [-1, 1])
+def test_wcs_and_roll_of_jwst_are_one_orientation(tmp_path: Path, parity: int) -> None:
+    # The relation of jwst's calc_rotation_matrix.
+    angle = (40.0 - parity * 7.0) * DEGREE
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = 1.82e-5 * np.array([[parity * c, s], [-parity * s, c]])
+    roll = {"ROLL_REF": 40.0, "V3I_YANG": 7.0, "VPARITY": parity}
+    by_wcs = read_cube(wcs_file(tmp_path / "a.fits", matrix, **roll))
+    assert by_wcs.notes == ()
+    by_roll = read_cube(write_plain(tmp_path / "b.fits", (3, 8, 8), **(JWST | roll)))
+    assert by_wcs.orientation.is_like(by_roll.orientation)
+    write_cube(tmp_path / "c.fits", by_roll)
+    assert read_cube(tmp_path / "c.fits").orientation.is_like(by_roll.orientation)
+
+
 def test_raw_ramps_are_refused_with_the_step_that_comes_next(data: Path) -> None:
     with pytest.raises(DataError, match=r"uncal.*calwebb_detector1"):
         read_cube(data / "cubes" / "niriss_f480m_uncal.fits")

@@ -428,11 +428,13 @@ def test_methods_are_not_mixed(niriss: Instrument, tmp_path: Path) -> None:
         calibrate(target, [other], method="foo")  # type: ignore[arg-type]
 
 
-def test_faults_are_named(niriss: Instrument, tmp_path: Path) -> None:
+def test_faults_are_named(niriss: Instrument, tmp_path: Path, rng: np.random.Generator) -> None:
     images = binary_images(niriss, jittered(3), (0.0, 0.0), 0.0)
-    good = cube_of(images, niriss)
+    good, noise = cube_of(images, niriss), rng.normal(size=images.shape)
     cases = {
-        "no integration holds light": replace(good, images=np.zeros_like(images)),
+        "no integration holds light .check SCI": replace(good, images=np.zeros_like(images)),
+        "every pixel is flagged": replace(good, error=np.zeros_like(images)),
+        "no star is seen": replace(good, images=noise * np.hanning(80) * np.hanning(80)[:, None]),
         "edge of the image": replace(good, images=np.roll(images, 39, axis=2)),
         "leave .* of the image": replace(good, filter="F277W"),
         "has no filter": replace(good, filter="F999W"),
@@ -466,7 +468,7 @@ def test_another_mask_is_refused(niriss: Instrument, tmp_path: Path) -> None:
     (tmp_path / "other.toml").write_text(WRONG_MASK)
     images = binary_images(niriss, jittered(3), (0.0, 0.0), 0.0)
     cube = replace(cube_of(images, niriss), instrument=str(tmp_path / "other.toml"))
-    with pytest.raises(DataError, match="check instrument, filter and pixel scale"):
+    with pytest.raises(DataError, match="check instrument, filter, pixel scale"):
         extract(cube)
 
 

@@ -130,6 +130,15 @@ def test_pixels_that_are_not_known_take_the_blame_as_before(star: FloatArray) ->
     assert visit_maps([cube(star, 1)], replace(OPTIONS, geometry="stated"), {}) == [None]
 
 
+@pytest.mark.parametrize("wrong", [1.0, 1.04])
+def test_pixels_that_contradict_the_mask_are_told(star: FloatArray, wrong: float) -> None:
+    images = cube(star, 5)
+    images = replace(images, pixel_scale_rad=wrong * images.pixel_scale_rad)
+    (found,) = extract_all(images, method="fringes")
+    doubts = [note for note in found.observables.notes if "pixel scale or filter" in note]
+    assert len(doubts) == (wrong != 1.0)
+
+
 def test_slopes_of_the_map_are_those_of_mapped_masks() -> None:
     from amibayes.extraction.mask_map import map_slopes
 
