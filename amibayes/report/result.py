@@ -185,6 +185,7 @@ def _significance(result: SearchResult, tested: Significance | None, alpha: floa
             "statistic": tested.statistic,
             "threshold": tested.threshold(),
             "parametric": tested.parametric,
+            "bright": tested.bright,
             "randomised": _randomised(tested),
             "extrapolation": None
             if tested.tail is None
