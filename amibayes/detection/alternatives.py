@@ -9,6 +9,7 @@ and discs and shells surround hot stars. Both have point symmetry, so that their
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -32,6 +33,15 @@ MAX_NODES = 32
 STEPS = 40
 """Evaluations of the Jacobian: a fit from the grey star's diameter takes 5 to 20."""
 
+LEAST_AXES = 0.3
+"""Least ratio of an elongated star's axes: what two stars in contact look like is longer."""
+
+OVAL_SIZES, OVAL_ANGLES, OVAL_AXES = 32, 12, np.log([0.5, 0.65, 0.8, 0.92])
+OVAL_FITS = 6
+"""Sizes, angles and ratios of the axes that are tried, and fits that are finished."""
+
+EDGE = 1e-6
+
 LADDER = np.linspace(0.94, 1.06, 121)
 """Factors that are tried of the diameter at one wavelength: where a baseline is at a null its
 closure phases turn by 180° at once, and a fit by slopes does not see the other side."""
@@ -43,7 +53,7 @@ class Alternative:
 
     Parameters
     ----------
-    kind : {"chromatic star", "extended light"}
+    kind : {"chromatic star", "elongated star", "extended light"}
     chi2 : float
         With the noise of the search, and 1 more for each parameter beyond those of the companion's
         model: so much a parameter takes of noise.
@@ -57,7 +67,7 @@ class Alternative:
 
 
 def alternative(result: SearchResult) -> Alternative | None:
-    """The first of these sources that fits nearly as well as the best companion does, or None.
+    """One of these sources that fits nearly as well as the best companion does, or None.
 
     Parameters
     ----------
@@ -72,8 +82,9 @@ def alternative(result: SearchResult) -> Alternative | None:
     star = _chromatic_star(likelihood, result)
     if star is not None and star.chi2 <= most:
         return star
-    around = _extended_light(likelihood)
-    return around if around.chi2 <= most else None
+    others = (_extended_light(likelihood), _elongated_star(likelihood, result))
+    best = min(others, key=lambda other: other.chi2)
+    return best if best.chi2 <= most else None
 
 
 def symmetric_chi2(likelihood: Likelihood) -> float:
@@ -134,6 +145,53 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
         f"{fit.x.max():.4g} mas"
     )
     return Alternative("chromatic star", 2.0 * float(fit.cost) + max(more, 0), words)
+
+
+def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative:
+    """An elliptical disc, uniform or darkened as the star of the search is."""
+    points = likelihood.samples
+    exponent, background = (result.nuisance(name) for name in ("limb_darkening", "background"))
+
+    n_vis2 = likelihood.observables.n_vis2
+    error = np.sqrt(likelihood.noise.covariance.variance[:n_vis2])
+
+    def difference(shape: FloatArray) -> FloatArray:
+        """Data less those of ln of the larger diameter, ln of the axes' ratio, position angle."""
+        sine, cosine = np.sin(shape[2]), np.cos(shape[2])
+        along = points.u * sine + points.v * cosine
+        across = (points.u * cosine - points.v * sine) * np.exp(shape[1])
+        frequency = np.hypot(along, across)[:, None]
+        wave = power_law_disc(frequency, np.exp(shape[:1]), np.array(exponent))
+        model = likelihood.observe((wave / (1.0 + background)).astype(complex))
+        return np.asarray(likelihood.wrapped(likelihood.observables.data - model[:, 0]))
+
+    def by_vis2(shape: FloatArray) -> FloatArray:
+        return np.asarray(difference(shape)[:n_vis2] / error)
+
+    def white(shape: FloatArray) -> FloatArray:
+        return np.asarray(likelihood.noise.whiten(difference(shape)))
+
+    # Two stars that are nearly one are as long as they are apart.
+    largest = max(result.nuisance("diameter_mas"), result.companion.separation_mas)
+    sizes = largest * np.geomspace(0.5, 3.0, OVAL_SIZES)
+    angles = np.linspace(0.0, np.pi, OVAL_ANGLES, endpoint=False)
+    starts = []
+    for axes, angle in product(OVAL_AXES, angles):
+        tried = [np.array([np.log(size), axes, angle]) for size in sizes]
+        starts.append(min(tried, key=lambda shape: float((by_vis2(shape) ** 2).sum())))
+    starts = sorted(starts, key=lambda shape: float((by_vis2(shape) ** 2).sum()))[:OVAL_FITS]
+    low = [np.log(1e-2 * sizes[0]), np.log(LEAST_AXES), -np.inf]
+    high = [np.log(1e2 * sizes[-1]), 0.0, np.inf]
+    fits = []
+    for start in starts:
+        near = least_squares(by_vis2, start, bounds=(low, high), max_nfev=STEPS).x
+        near = np.clip(near, np.add(low, EDGE), np.subtract(high, EDGE))
+        fits.append(least_squares(white, near, bounds=(low, high), max_nfev=STEPS))
+    fit = min(fits, key=lambda one: float(one.cost))
+    size, axes = np.exp(fit.x[:2])
+    words = f"an elongated star (axes of {size:.4g} and {size * axes:.4g} mas)"
+    more = 3 - len(result.theta)
+    return Alternative("elongated star", 2.0 * float(fit.cost) + max(more, 0), words)
 
 
 def _extended_light(likelihood: Likelihood) -> Alternative:

@@ -3,6 +3,12 @@
 The statistic of the data and of every simulated null data set is one and the same object
 (`amibayes.detection.statistic`). In whitened data a null set is a vector of independent unit
 normals, so ten thousand searches are two matrix products.
+
+The template bank is linear in the contrast. Beside two stars of nearly equal brightness a star
+alone leaves residuals of hundreds of errors, closure phases of 180° among them, and none of the
+bank's templates need look like them: their share of the residuals may be no more than what noise
+as large has. The model of the best fit does look like them, and noise as large hardly ever does:
+`beside_bright`.
 """
 
 from __future__ import annotations
@@ -11,9 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.scan import scale_groups
+from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.randomised import Randomised
-from amibayes.detection.statistic import Statistic
+from amibayes.detection.statistic import BankStatistic, Statistic
 from amibayes.detection.tails import (
     MIN_PROBABILITY,
     TAIL_FRACTION,
@@ -23,6 +32,8 @@ from amibayes.detection.tails import (
     pareto_survival,
     tail_of,
 )
+from amibayes.detection.treatments import FreeScale
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.parallel import Executor, Journal, Progress
 from amibayes.support.arguments import checks_arguments, in_range
 from amibayes.support.notebook import Rows, Shown, ranged
@@ -60,6 +71,8 @@ class Significance(Shown):
         The check that owes nothing to the model of the noise.
     exposures : ExposureNoise, optional
         What exposures share of the noise, in null draws too.
+    bright : float, optional
+        The probability, where it is the bound of `beside_bright`.
     """
 
     statistic: float
@@ -72,6 +85,7 @@ class Significance(Shown):
     field: FloatArray | None = None
     randomised: Randomised | None = None
     exposures: ExposureNoise | None = None
+    bright: float | None = None
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
@@ -216,3 +230,94 @@ def draws_needed(alpha: float) -> int:
     """Smallest number of draws from which a probability below alpha can be told."""
     n = int(np.ceil(np.log(0.025) / np.log1p(-alpha)))
     return n if reachable(alpha, n) else n + 1
+
+
+BRIGHT = 0.1
+"""Contrast from which data are not linear in it."""
+
+EXPLAINED, IN_ALL_GROUPS = 0.9, 0.6
+"""Least share of the squared residuals of the star alone that the companion explains: in units of
+the errors, and with each group of data scaled to unit scatter (some may hold little but noise)."""
+
+PLACES, CONTRASTS, NUISANCE = 16, 32, 8
+"""Models that are counted: places at each position of the bank (a quarter of its step apart),
+contrasts, and values of each other parameter."""
+
+LEAST = 1e-10
+"""Least probability that is stated: no model of noise is known further."""
+
+BETWEEN = np.radians(8.0)
+"""Largest angle between any model, as whitened data, and the nearest one that is counted: a
+quarter of λ/8B turns fringes by 11°, half of that to either side."""
+
+
+def beside_bright(tested: Significance, result: SearchResult, noise: ExtraNoise) -> Significance:
+    """State the probability of a bright companion where that of the template bank is larger.
+
+    Parameters
+    ----------
+    tested : Significance
+    result : SearchResult
+    noise : ExtraNoise
+        What was added to the stated errors. Where anything was, the companion does not explain
+        the residuals, and ``tested`` is given back.
+
+    Notes
+    -----
+    Both probabilities are asked, so that the smaller one counts twice.
+    """
+    if tested.detected is not False or noise.vis2 > 0.0 or noise.closure_phase_rad > 0.0:
+        return tested
+    bound = bright_probability(result, tested.test)
+    if bound is None or 2.0 * bound >= tested.probability:
+        return tested
+    p = max(2.0 * bound, LEAST)
+    return replace(tested, probability=p, interval=(0.0, p), tail=None, bright=p)
+
+
+def bright_probability(result: SearchResult, test: Statistic | None) -> float | None:
+    """Upper bound of the probability that noise alone looks like the companion of the best fit.
+
+    None where the companion is faint, explains less than `EXPLAINED`, or the errors are no
+    free scales of groups of data. ``test`` is that of the search.
+
+    Notes
+    -----
+    Noise of a free scale has no preferred direction among the data. The probability that it lies
+    within an angle of a given model is that of the template bank's statistic at one position; the
+    number of models within `BETWEEN` of each other bounds that of any of them.
+    """
+    left = result.chi2_binary > (1.0 - EXPLAINED) * result.chi2_single
+    if left or result.companion.contrast < BRIGHT:
+        return None
+    if not isinstance(test, BankStatistic) or not isinstance(test.treatment, FreeScale):
+        return None
+    bank = TemplateBank(test.likelihood, test.bank.grid, test.single)
+    share = _share(result, test, bank)
+    if share < IN_ALL_GROUPS:
+        return None
+    angle = np.arccos(np.sqrt(min(share, 1.0))) + BETWEEN
+    statistic = -test.ratio.count * np.log1p(-(np.cos(angle) ** 2))
+    local = float(test.ratio.local_survival(np.array(statistic)))
+    places = len(bank.grid) * len(bank.rates_mas_yr) * PLACES
+    models = places * CONTRASTS**bank.n_contrasts * NUISANCE**bank.n_nuisance
+    return float(min(1.0, models * local))
+
+
+def _share(result: SearchResult, test: BankStatistic, bank: TemplateBank) -> float:
+    """Share of the squared residuals that the companion's change of the data has along them.
+
+    Groups of data are weighted by their scatter beside the star alone, as the statistic does.
+    """
+    noise = test.likelihood.noise
+    left = test.likelihood.residuals(np.atleast_2d(result.theta))[:, 0]
+    alone = bank.project(test.observed)
+    change = bank.project(test.observed - left)
+    groups = scale_groups(test.likelihood.observables, bank.n_nuisance, noise.rows)
+    least = 1.0 if noise.floor else 0.0
+    variance = np.maximum(groups.variances(alone[:, None])[:, 0], least)
+    scale = np.sqrt(variance)[groups.label]
+    first, second = alone / scale, change / scale
+    along = float(first @ second)
+    size = float(first @ first) * float(second @ second)
+    return along**2 / size if along > 0.0 and size > 0.0 else 0.0

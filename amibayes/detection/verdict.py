@@ -250,6 +250,11 @@ def _rejected(parts: Sequence[_Part], degrees: float, fit: float, structure: Sig
 
 
 def _found(tested: Significance) -> str:
+    if tested.bright is not None:
+        return (
+            "it explains nearly all of what a star alone leaves, as noise alone does anywhere in "
+            f"the field with a probability below {tested.bright:.2g}"
+        )
     return (
         "noise alone gives something as good in the field with a probability below "
         f"{tested.interval[1]:.2g} (95 % confidence)"

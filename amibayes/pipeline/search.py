@@ -14,7 +14,7 @@ from amibayes.companion_search.second_companion import TwoCompanions, search_sec
 from amibayes.companion_search.with_extra_noise import noise_averaged
 from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.limits import LimitsBeside
-from amibayes.detection.false_alarm import Significance
+from amibayes.detection.false_alarm import Significance, beside_bright
 from amibayes.detection.splits import Consistency
 from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
@@ -194,6 +194,7 @@ def _significance(
             found.result, options, rng["significance"], run.executor, run.progress,
             journal=run.journal("null"),
         )  # fmt: skip
+        first = beside_bright(first, found.result, found.noise)
     if found.two is None:
         return first, None
     with run.stage("significance of the second"):

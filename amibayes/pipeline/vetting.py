@@ -24,11 +24,12 @@ from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
-from amibayes.detection.false_alarm import Significance, significance
+from amibayes.detection.false_alarm import Significance, beside_bright, significance
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.treatments import Ratio
 from amibayes.errors import DataError
 from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
@@ -250,6 +251,7 @@ def _by_itself(
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
     enough = limits and found_by_noise.detected is not None
     limit = detection_limit(found, found_by_noise, rng) if enough else None
+    found_by_noise = beside_bright(found_by_noise, found, ExtraNoise())
     vetted = replace(vetted, companion=found, significance=found_by_noise, limit=limit)
     if not data.n_vis2:
         return vetted

@@ -186,6 +186,7 @@ def _significance(result: SearchResult, tested: Significance | None, alpha: floa
             "statistic": tested.statistic,
             "threshold": tested.threshold(),
             "parametric": tested.parametric,
+            "bright": tested.bright,
             "randomised": _randomised(tested),
             "exposures": _exposures(tested.exposures),
             "extrapolation": None

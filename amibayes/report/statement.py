@@ -110,6 +110,12 @@ def _chance(content: Json) -> str:
     asked = f"a detection is claimed below {alpha}"
     if significance["detected"] is None:
         asked = f"too few to measure anything below {alpha}"
+    if significance.get("bright") is not None:
+        return (
+            "The companion explains nearly all of what a star alone leaves: the chance that noise "
+            f"alone, of any size, looks like one of its brightness anywhere in the field "
+            f"({field(content)}) is below {chance(high)}; {asked}."
+        )
     if low == 0.0:
         # Where the bound does not meet what is asked, the estimate does.
         decided = significance["detected"] and high >= significance["alpha"]

@@ -149,6 +149,8 @@ def _verdict(report: SearchReport) -> str:
 
 def _chance(tested: Significance, *, stated: bool = False) -> str:
     """The false-alarm probability, with that by randomised residuals where there is one."""
+    if tested.bright is not None:
+        return f"probability below {tested.bright:.2g}: a bright companion explains nearly all"
     check = tested.randomised
     if check is None or check.probability is None:
         return _parametric(tested, stated=stated)

@@ -34,6 +34,12 @@ def chromatic(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarra
     return darkened_disc(1.0, 0.0, x * u, x * v) + 0j
 
 
+def oval(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    """A flattened star, seen past its first null."""
+    along, across = 0.8 * u + 0.6 * v, 0.6 * (0.8 * v - 0.6 * u)
+    return darkened_disc(4.5, 0.0, along, across) + 0j
+
+
 def halo(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
     """A star with an inclined Gaussian disc of a tenth of its light."""
     across = (np.pi * MAS * 2.5) ** 2 * (u**2 + 0.3 * v**2) / (4.0 * np.log(2.0))
@@ -48,7 +54,12 @@ def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("source", "kind"),
-    [(chromatic, "chromatic star"), (halo, "extended light"), (binary, None)],
+    [
+        (chromatic, "chromatic star"),
+        (oval, "elongated star"),
+        (halo, "extended light"),
+        (binary, None),
+    ],
 )
 def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | None) -> None:
     """The grey star is refused by each; only the binary needs its companion."""

@@ -128,7 +128,12 @@ def _false_alarm(s: Json) -> Fact:
         "Share of data sets without a companion, simulated with the noise of these, whose best "
         "position anywhere in the field is as good as that of the data."
     )
-    if s["false_alarm_probability"] is not None:
+    if s.get("bright") is not None:
+        meaning = (
+            "Bound of the probability that noise alone, of any size, looks like a companion as "
+            "bright as this one anywhere in the field."
+        )
+    elif s["false_alarm_probability"] is not None:
         low, high = s["false_alarm_interval"]
         meaning += (
             f" 95 % interval {chance(low)} to {chance(high)}, {count(s['n_null_draws'], 'draw')}."
