@@ -229,7 +229,9 @@ def choose_field(
 
 
 def wider_fields(result: SearchResult) -> list[tuple[float, float]]:
-    """Fields beyond that of a search, mas, where a bright companion outside may explain a misfit.
+    """Fields around that of a search, mas, where a bright companion outside may explain a misfit.
+
+    First one that begins nearer to the star, then those that reach farther.
 
     The looks outside are made with the templates of a faint companion. One half as bright as the
     star changes V² otherwise: it is found by searches alone, and a fit inside that is far off
@@ -243,7 +245,13 @@ def wider_fields(result: SearchResult) -> list[tuple[float, float]]:
     fringe = resolution_mas(likelihood)
     farthest = _affordable(likelihood, Box(grid.inner_mas, outermost(likelihood), fringe))[1]
     edges = (min(times * grid.outer_mas, farthest) for times in WIDER)
-    return [(grid.inner_mas, edge) for edge in dict.fromkeys(edges) if edge > grid.outer_mas]
+    wider = [(grid.inner_mas, edge) for edge in dict.fromkeys(edges) if edge > grid.outer_mas]
+    return [(NEARER * grid.inner_mas, grid.outer_mas), *wider]
+
+
+NEARER = 0.3
+"""Inner edge of the first of these fields, in units of that of the search: λ/7B, below which
+contrast and separation of any companion are one number."""
 
 
 FAR_OFF = 3.0

@@ -137,7 +137,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     first = _with_its_disc(likelihood, first, options)
     if options.separation_mas is None:
         first, wider = _in_wider_field(likelihood, first, options)
-        warnings += wider
+        warnings = wider or warnings
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings), observables)
@@ -161,8 +161,8 @@ def _in_wider_field(
         if found.chi2_binary < EXPLAINED * first.chi2_binary:
             place = found.companion.separation_mas
             return _with_its_disc(likelihood, found, options), [
-                f"the field was widened to {field[1]:.1f} mas: none in the default one fits, "
-                f"and a companion at {place:.1f} mas does far better"
+                f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: none in the default "
+                f"one fits, and a companion at {place:.1f} mas does far better"
             ]
     return first, []
 

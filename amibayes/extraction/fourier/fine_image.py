@@ -15,8 +15,8 @@ from amibayes.units import FloatArray, SingleArray
 COARSER = 0.75
 """What it serves need not be known to better than the interpolation's 1e-6 at this sampling."""
 
-FARTHEST = 0.95
-"""It can be moved this far, in units of the field."""
+FARTHEST = 1.8
+"""It can be moved this far, in units of the field: nearly to the first null of a hole's image."""
 
 
 @dataclass(frozen=True, eq=False)
