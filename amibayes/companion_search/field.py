@@ -187,7 +187,8 @@ def choose_field(
     """Choose the range of separations where none is asked for.
 
     `default_separation`, unless a coarse look as far as the channels allow, within
-    `MAX_WORK`, shows something notably better outside: that is inside then. The look comes
+    `MAX_WORK`, shows something notably better outside: that is inside then, or what is nearer to
+    the star and fits as well. The look comes
     before any noise is fitted to what a star alone leaves, which would hide a companion; what it
     shows has to hold with the noise that is fitted beside it, since errors that channels share
     look like wide companions.
@@ -220,10 +221,16 @@ def choose_field(
     step = fringe / COARSE_STEPS_PER_FRINGE
     within, beyond = make_grid(inner, outer, step), make_grid(outer, farthest, step)
     single = fit_single(still)[0]
-    place = _notable(still, within, beyond, single)
+    place, gain = _notable(still, within, beyond, single)
     box = Box(inner, farthest, fringe)
     if place is None or not _holds(still, within, single, place, box, prior):
         return (inner, outer), None
+    near = make_grid(NEARER * inner, inner, NEARER * step)
+    gains = _gains(still, near, single)
+    if gains.max(initial=0.0) > gain - MODE_LIMIT:
+        # What is nearer to the star than two baselines can tell has aliases far out.
+        best = int(gains.argmax())
+        return (NEARER * inner, outer), float(np.hypot(near.east_mas[best], near.north_mas[best]))
     separation = float(np.hypot(*place))
     return (inner, MARGIN * separation), separation
 
@@ -268,18 +275,18 @@ unknown noise takes no such share of it."""
 
 def _notable(
     likelihood: Likelihood, within: Grid, beyond: Grid, single: FloatArray
-) -> FloatArray | None:
-    """Place (2,), mas, outside the field that is notably better than all inside."""
+) -> tuple[FloatArray | None, float]:
+    """Place (2,), mas, outside the field that is notably better than all inside, and its gain."""
     inside, outside = (_gains(likelihood, grid, single) for grid in (within, beyond))
     if not len(inside) or not len(outside):
-        return None
+        return None, 0.0
     best = int(outside.argmax())
     left = single_likelihood(likelihood).chi2(single[None])[0] - outside[best]
     # Errors that are too small make the gains of noise too large in proportion.
     least = MODE_LIMIT * max(left / likelihood.n_independent, 1.0)
     if outside[best] < inside.max() + max(least, NOTABLY_BETTER * inside.max()):
-        return None
-    return np.array([beyond.east_mas[best], beyond.north_mas[best]])
+        return None, 0.0
+    return np.array([beyond.east_mas[best], beyond.north_mas[best]]), float(outside[best])
 
 
 def _holds(

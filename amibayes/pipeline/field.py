@@ -128,8 +128,8 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
         field, place = choose_field(likelihood, noise_prior(likelihood.observables, options))
         if place is not None:
             warnings = [
-                f"the field was widened to {field[1]:.1f} mas: near {place:.1f} mas, outside the "
-                "default one, a companion fits better than anywhere inside"
+                f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: near {place:.1f} "
+                "mas, outside the default one, a companion fits better than anywhere inside"
             ]
     first = search(likelihood, field)
     if options.diameter is None:

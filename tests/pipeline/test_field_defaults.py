@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers import simulated
+from helpers import niriss, simulated
 
 from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
@@ -52,6 +52,20 @@ def test_a_bright_companion_outside_the_default_field_is_found(position, outer, 
     )
     assert found.result.grid.outer_mas == pytest.approx(outer, abs=0.2)
     assert bool(found.warnings) == (outer > 5.0)
+
+
+@pytest.mark.parametrize("separation", [38.0, 55.0])
+def test_a_bright_companion_nearer_than_the_default_field_is_found(separation, rng) -> None:
+    """NIRISS sees down to λ/2B of 94 mas: no companion out there looks like one at 40 to 55."""
+    place = separation * np.array([np.sin(1.3), np.cos(1.3)])
+    found = search_field(simulated(niriss(), [*place, 0.1], rng), SearchOptions())
+    companion = found.result.companion
+    # Contrast and separation are one number there, but for the star's brightness.
+    assert companion.separation_mas == pytest.approx(separation, rel=0.35)
+    assert np.degrees(1.3) == pytest.approx(companion.position_angle_deg, abs=4.0)
+    moment = companion.contrast / (1.0 + companion.contrast) * companion.separation_mas
+    assert moment == pytest.approx(separation * 0.1 / 1.1, rel=0.1)
+    assert any("the field was widened" in said for said in found.warnings)
 
 
 def test_baselines_without_length_are_refused_by_their_columns() -> None:
