@@ -41,6 +41,7 @@ OVAL_FITS = 6
 """Sizes, angles and ratios of the axes that are tried, and fits that are finished."""
 
 EDGE = 1e-6
+"""How far inside of its bounds a fit begins."""
 
 LADDER = np.linspace(0.94, 1.06, 121)
 """Factors that are tried of the diameter at one wavelength: where a baseline is at a null its
@@ -149,41 +150,39 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
 
 def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative:
     """An elliptical disc, uniform or darkened as the star of the search is."""
-    points = likelihood.samples
+    data, points = likelihood.observables, likelihood.samples
     exponent, background = (result.nuisance(name) for name in ("limb_darkening", "background"))
+    error = np.sqrt(likelihood.noise.covariance.variance[: data.n_vis2])
 
-    n_vis2 = likelihood.observables.n_vis2
-    error = np.sqrt(likelihood.noise.covariance.variance[:n_vis2])
-
-    def difference(shape: FloatArray) -> FloatArray:
-        """Data less those of ln of the larger diameter, ln of the axes' ratio, position angle."""
-        sine, cosine = np.sin(shape[2]), np.cos(shape[2])
-        along = points.u * sine + points.v * cosine
-        across = (points.u * cosine - points.v * sine) * np.exp(shape[1])
-        frequency = np.hypot(along, across)[:, None]
-        wave = power_law_disc(frequency, np.exp(shape[:1]), np.array(exponent))
+    def difference(shapes: FloatArray) -> FloatArray:
+        """Data less those of ln of the larger diameter, ln of the axes' ratio, angle (3, n)."""
+        sine, cosine = np.sin(shapes[2]), np.cos(shapes[2])
+        along = points.u[:, None] * sine + points.v[:, None] * cosine
+        across = (points.u[:, None] * cosine - points.v[:, None] * sine) * np.exp(shapes[1])
+        wave = power_law_disc(np.hypot(along, across), np.exp(shapes[0]), np.array(exponent))
         model = likelihood.observe((wave / (1.0 + background)).astype(complex))
-        return np.asarray(likelihood.wrapped(likelihood.observables.data - model[:, 0]))
+        return np.asarray(likelihood.wrapped(data.data[:, None] - model))
 
     def by_vis2(shape: FloatArray) -> FloatArray:
-        return np.asarray(difference(shape)[:n_vis2] / error)
+        return np.asarray(difference(shape[:, None])[: data.n_vis2, 0] / error)
 
     def white(shape: FloatArray) -> FloatArray:
-        return np.asarray(likelihood.noise.whiten(difference(shape)))
+        return np.asarray(likelihood.noise.whiten(difference(shape[:, None])[:, 0]))
 
     # Two stars that are nearly one are as long as they are apart.
     largest = max(result.nuisance("diameter_mas"), result.companion.separation_mas)
-    sizes = largest * np.geomspace(0.5, 3.0, OVAL_SIZES)
+    sizes = np.log(largest * np.geomspace(0.5, 3.0, OVAL_SIZES))
     angles = np.linspace(0.0, np.pi, OVAL_ANGLES, endpoint=False)
     starts = []
     for axes, angle in product(OVAL_AXES, angles):
-        tried = [np.array([np.log(size), axes, angle]) for size in sizes]
-        starts.append(min(tried, key=lambda shape: float((by_vis2(shape) ** 2).sum())))
-    starts = sorted(starts, key=lambda shape: float((by_vis2(shape) ** 2).sum()))[:OVAL_FITS]
-    low = [np.log(1e-2 * sizes[0]), np.log(LEAST_AXES), -np.inf]
-    high = [np.log(1e2 * sizes[-1]), 0.0, np.inf]
+        tried = np.array([sizes, np.full(OVAL_SIZES, axes), np.full(OVAL_SIZES, angle)])
+        loss = ((difference(tried)[: data.n_vis2] / error[:, None]) ** 2).sum(axis=0)
+        starts.append((float(loss.min()), tried[:, loss.argmin()]))
+    starts = sorted(starts, key=lambda start: start[0])[:OVAL_FITS]
+    low = [sizes[0] - np.log(1e2), np.log(LEAST_AXES), -np.inf]
+    high = [sizes[-1] + np.log(1e2), 0.0, np.inf]
     fits = []
-    for start in starts:
+    for _, start in starts:
         near = least_squares(by_vis2, start, bounds=(low, high), max_nfev=STEPS).x
         near = np.clip(near, np.add(low, EDGE), np.subtract(high, EDGE))
         fits.append(least_squares(white, near, bounds=(low, high), max_nfev=STEPS))
