@@ -230,7 +230,10 @@ def weighted(
 def _cholesky(matrix: FloatArray) -> FloatArray:
     """Lower triangle of a covariance, which may be singular to rounding."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-20))
-    unit = matrix / np.outer(scale, scale) + 1e-9 * np.eye(len(matrix))
+    unit = 0.5 * (matrix + matrix.T) / np.outer(scale, scale)
+    # Inverses of matrices of 1e12 may have lost more than rounding of the covariance itself.
+    least = min(float(np.linalg.eigvalsh(unit)[0]), 0.0)
+    unit += (1e-9 - 1.01 * least) * np.eye(len(matrix))
     return np.asarray(np.linalg.cholesky(unit) * scale[:, None])
 
 
