@@ -188,10 +188,9 @@ def choose_field(
 
     `default_separation`, unless a coarse look as far as the channels allow, within
     `MAX_WORK`, shows something notably better outside: that is inside then, or what is nearer to
-    the star and fits as well. The look comes
-    before any noise is fitted to what a star alone leaves, which would hide a companion; what it
-    shows has to hold with the noise that is fitted beside it, since errors that channels share
-    look like wide companions.
+    the star and fits as well. The look comes before any noise is fitted to what a star alone
+    leaves, which would hide a companion; what it shows has to hold with the noise that is fitted
+    beside it, since errors that channels share look like wide companions.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.companion_search.reduction import Roots
+from amibayes.companion_search.reduction import GOLDEN, Roots
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.channel_noise import ChannelCovariance
 from amibayes.likelihood.channel_rows import ChannelRows, channel_layout, independent_rows
@@ -25,8 +25,6 @@ from amibayes.units import FloatArray
 
 DRAWN = 32
 """Pairs of κ and τ that null sets are drawn with, of equal probability."""
-
-GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, eq=False)

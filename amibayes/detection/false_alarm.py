@@ -69,8 +69,6 @@ class Significance(Shown):
         The statistic of the data at every position of the bank.
     randomised : Randomised, optional
         The check that owes nothing to the model of the noise.
-    exposures : ExposureNoise, optional
-        What exposures share of the noise, in null draws too.
     bright : float, optional
         The probability, where it is the bound of `beside_bright`.
     """
@@ -84,7 +82,6 @@ class Significance(Shown):
     test: Statistic | None = None
     field: FloatArray | None = None
     randomised: Randomised | None = None
-    exposures: ExposureNoise | None = None
     bright: float | None = None
 
     def rows(self) -> Rows:
@@ -97,6 +94,11 @@ class Significance(Shown):
             ("extrapolated", "no" if self.tail is None else "by a generalised Pareto law"),
             ("detected", few if self.detected is None else str(self.detected)),
         ]
+
+    @property
+    def exposures(self) -> ExposureNoise | None:
+        """What exposures share of the noise, in null draws too."""
+        return None if self.test is None else self.test.exposures
 
     @property
     def n_draws(self) -> int:
@@ -217,7 +219,6 @@ def significance(
         tail_of(null, observed, rng) if extrapolate else None,
         alpha,
         test,
-        exposures=test.exposures,
     )
 
 
@@ -293,7 +294,7 @@ def bright_probability(result: SearchResult, test: Statistic | None) -> float | 
     if not isinstance(test, BankStatistic) or not isinstance(test.treatment, FreeScale):
         return None
     bank = TemplateBank(test.likelihood, test.bank.grid, test.single)
-    share = _share(result, test, bank)
+    share = _share(result, test, bank, test.treatment.least)
     if share < IN_ALL_GROUPS:
         return None
     angle = np.arccos(np.sqrt(min(share, 1.0))) + BETWEEN
@@ -304,19 +305,17 @@ def bright_probability(result: SearchResult, test: Statistic | None) -> float | 
     return float(min(1.0, models * local))
 
 
-def _share(result: SearchResult, test: BankStatistic, bank: TemplateBank) -> float:
+def _share(result: SearchResult, test: BankStatistic, bank: TemplateBank, least: float) -> float:
     """Share of the squared residuals that the companion's change of the data has along them.
 
     Groups of data are weighted by their scatter beside the star alone, as the statistic does.
     """
-    noise = test.likelihood.noise
     left = test.likelihood.residuals(np.atleast_2d(result.theta))[:, 0]
     alone = bank.project(test.observed)
     change = bank.project(test.observed - left)
-    groups = scale_groups(test.likelihood.observables, bank.n_nuisance, noise.rows)
-    least = 1.0 if noise.floor else 0.0
-    variance = np.maximum(groups.variances(alone[:, None])[:, 0], least)
-    scale = np.sqrt(variance)[groups.label]
+    data, rows = test.likelihood.observables, test.likelihood.noise.rows
+    groups = scale_groups(data, bank.n_nuisance, rows)
+    scale = FreeScale.measured(groups, bank, test.observed, least).scale
     first, second = alone / scale, change / scale
     along = float(first @ second)
     size = float(first @ first) * float(second @ second)

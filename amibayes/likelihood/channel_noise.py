@@ -33,7 +33,7 @@ from amibayes.data.blocks import Block, BlockCovariance, orthonormal
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
-from amibayes.likelihood.chi2 import linear_fit
+from amibayes.likelihood.chi2 import restricted_loss
 from amibayes.likelihood.exposure_rows import series_of, turned_rows
 from amibayes.likelihood.noise import GaussianNoise, NoiseModel, noise_of
 from amibayes.units import FloatArray, IntArray
@@ -220,15 +220,18 @@ def noise_with_channels(
     lasting = any(sum(c.lasting) > 0.0 for s in shares for c in (s.vis2, s.closure_phase))
     if not (layout.any or floors or lasting):
         return noise_of(data)
-    rows = exposure_rows(data, layout, shares, channel_rows(layout, shares, floors))
+    rows = noise_rows(data, layout, shares, floors)
     return GaussianNoise(ChannelCovariance(data.covariance, rows), rows=rows, floor=bool(floors))
 
 
-def exposure_rows(
-    data: Observables, layout: ChannelLayout, shares: Sequence[ChannelShare], rows: ChannelRows
+def noise_rows(
+    data: Observables,
+    layout: ChannelLayout,
+    shares: Sequence[ChannelShare],
+    floors: Sequence[Systematics] = (),
 ) -> ChannelRows:
-    """Turn rows that exposures share, as the shares of their files say, to independent ones."""
-    correlated = []
+    """Independent rows of channels and exposures that share what their files' shares say."""
+    rows, correlated = channel_rows(layout, shares, floors), []
     if any(share.vis2.lasting or share.closure_phase.lasting for share in shares):
         for one in series_of(data, layout):
             share = share_of(shares, one.source)
@@ -308,10 +311,6 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     for rho in COMMON:
         variance = 1.0 - rho + (rho + sure) * length
         product = rest / (1.0 - rho) + single + (along / variance[:, None]).T @ along
-        chi2, n_fitted, information = linear_fit(product)
-        count = len(both) - n_fitted
-        if count == 0:  # the fit passes through all data: they say nothing of their noise
-            return np.zeros(len(COMMON))
         logdet = log_step + n_rest * np.log1p(-rho) + np.log(variance).sum()
-        found.append(count * np.log(max(chi2, 1e-300) / count) + logdet + information)
+        found.append(restricted_loss(product, len(both), logdet))
     return np.array(found)

@@ -109,14 +109,28 @@ def chi2_of_part(covariance: Covariance, at: IntArray, difference: FloatArray) -
     return float((part.whiten(difference[at]) ** 2).sum()), part.rank
 
 
-def linear_fit(product: FloatArray) -> tuple[float, int, float]:
-    """χ² after a linear fit, number of parameters that it tells, and ln of their information.
+def restricted_loss(product: FloatArray, n: int, logdet: float) -> float:
+    """−2 ln of the restricted likelihood of n data, the scale of their errors at its best.
+
+    0 where a linear fit passes through all of them: they say nothing of their noise then.
 
     Parameters
     ----------
     product : (1 + n_dim, 1 + n_dim) float array
         Products of whitened residual and slopes.
+    n : int
+    logdet : float
+        Of their covariance.
     """
+    chi2, n_fitted, information = _linear_fit(product)
+    count = n - n_fitted
+    if count == 0:
+        return 0.0
+    return float(count * np.log(max(chi2, 1e-300) / count) + logdet + information)
+
+
+def _linear_fit(product: FloatArray) -> tuple[float, int, float]:
+    """χ² after a linear fit, number of parameters that it tells, and ln of their information."""
     slopes = product[1:, 1:]
     scale = np.sqrt(np.maximum(np.diag(slopes), 1e-300))
     values, vectors = np.linalg.eigh(slopes / np.outer(scale, scale))

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
-from amibayes.likelihood.chi2 import linear_fit
+from amibayes.likelihood.chi2 import restricted_loss
 from amibayes.units import FloatArray, IntArray
 
 HOURS = np.array([0.25, 0.5, 1.0, 2.0, 4.0, 8.0])
@@ -153,13 +153,8 @@ def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:
         size, along = _along_axes(series, both, tau)
         for k, share in enumerate(SHARES):
             variance = 1.0 + share * (size - 1.0)
-            chi2, n_fitted, information = linear_fit((along / variance[:, None]).T @ along)
-            if n == n_fitted:  # the fit passes through all data: they say nothing of their noise
-                loss[i, k] = 0.0
-                continue
-            left = n - n_fitted
-            logdet = float(np.log(variance).sum())
-            loss[i, k] = left * np.log(max(chi2, 1e-300) / left) + logdet + information
+            product = (along / variance[:, None]).T @ along
+            loss[i, k] = restricted_loss(product, n, float(np.log(variance).sum()))
     prior = np.full(len(SHARES), (1.0 - PRIOR_INDEPENDENT) / (len(SHARES) - 1))
     prior[0] = PRIOR_INDEPENDENT
     mass = np.exp(-0.5 * (loss - loss.min())) * prior

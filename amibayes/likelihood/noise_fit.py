@@ -20,7 +20,7 @@ from amibayes.likelihood.channel_noise import (
     Correlation,
     channel_rows,
     correlation_of,
-    exposure_rows,
+    noise_rows,
 )
 from amibayes.likelihood.channel_rows import (
     OFFSET,
@@ -137,8 +137,7 @@ class _Kind:
             return base
         if shared not in self._rows:
             shares = [ChannelShare(shared, shared)]
-            rows = channel_rows(self._layout, shares, self._own_floors)
-            self._rows[shared] = exposure_rows(self.data, self._layout, shares, rows)
+            self._rows[shared] = noise_rows(self.data, self._layout, shares, self._own_floors)
         return ChannelCovariance(base, self._rows[shared])
 
     @cached_property
