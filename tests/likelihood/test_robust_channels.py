@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 from scipy import stats
-from test_channel_noise import pionier, share, with_draw
+from channel_sets import pionier, share, with_draw
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits, search_robust, shared_noise, with_shared
