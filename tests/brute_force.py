@@ -233,6 +233,7 @@ def compared(case: Case, starts: int, rng: np.random.Generator) -> Compared:
     best, _ = brute_force(case, starts, rng)
     single = single_likelihood(case.likelihood).chi2(result.single_theta[None])[0]
     best = min(best, float(single))
+    assert result.global_check is not None
     check = result.global_check.delta_chi2
     return Compared(
         result.chi2_binary - best,

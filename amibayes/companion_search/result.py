@@ -179,8 +179,8 @@ class SearchResult:
     grid : Grid
     bank_contrast, bank_sigma : (n_grid,) float array
         Best linear contrast and its error at every position, the same in every band.
-    global_check : Mode
-        What the independent global optimiser found.
+    global_check : Mode, optional
+        What the independent global optimiser found; None where it was not asked.
     warnings : tuple of str
     robustness : Robustness, optional
         How a robust search treated the data; ``likelihood`` has outliers' errors stretched.
@@ -203,7 +203,7 @@ class SearchResult:
     grid: Grid
     bank_contrast: FloatArray
     bank_sigma: FloatArray
-    global_check: Mode
+    global_check: Mode | None
     warnings: tuple[str, ...] = ()
     robustness: Robustness | None = None
     joint_gain: FloatArray | None = None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,9 @@ MAX_NUISANCE_ROUNDS = 3
 MISFIT = 10.0
 """Reduced χ² of the best fit from which other sizes of the star are tried."""
 
+BETTER = 0.1
+"""Gain in χ² over the search from which on the global check's solution is told of."""
+
 NUISANCE_HOLDS = 0.02
 """Change of the star's visibility with which the exact map need not be made again."""
 
@@ -57,6 +62,7 @@ def search(
     *,
     known: FloatArray | None = None,
     single: FloatArray | None = None,
+    check: bool = True,
 ) -> SearchResult:
     """Find the companion that explains the data best.
 
@@ -69,6 +75,8 @@ def search(
         Solutions of nearly the same problem, where fits begin in place of bright companions.
     single : (n_nuisance,) float array, optional
         A fit without a companion to begin from too.
+    check : bool
+        Look over the whole field with the global optimiser too, see `with_global_check`.
 
     Raises
     ------
@@ -88,29 +96,76 @@ def search(
     survey = bank.survey(residuals)
     coarse = coarse_likelihood(likelihood, box)
     found = _fits(likelihood, coarse, grid, survey, single, box, deviance_single, known)
-    check = _checked(likelihood, coarse, bank, box, single, deviance_single)
-    every = distinct_modes([*found, check], box.fringe_mas)
+    # Where no peak is worth a fit, the global optimiser's is the one solution.
+    checked = None if found else _checked(likelihood, coarse, grid, box, single, deviance_single)
+    every = distinct_modes(found if checked is None else [checked], box.fringe_mas)
     modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
-    theta = np.array(modes[0].theta)
-    covariance = _errors(likelihood, theta)
-    return SearchResult(
+    result = SearchResult(
         likelihood=likelihood,
-        companion=companions_of(likelihood.parameters, theta, covariance)[0],
-        theta=theta,
-        theta_covariance=covariance,
         single_theta=single,
         chi2_single=float(residuals @ residuals),
-        chi2_binary=float(likelihood.chi2(theta)[0]),
         ndof=likelihood.n_independent - len(likelihood.parameters),
-        modes=modes,
         grid=grid,
         bank_contrast=survey.contrast,
         bank_sigma=survey.sigma,
-        global_check=check,
-        warnings=_warnings(modes, aliases, found, check),
-        aliases=aliases,
+        global_check=checked,
         joint_gain=survey.gain if bank.joint else None,
+        **_solutions(likelihood, modes, aliases),
     )
+    return with_global_check(result) if check and checked is None else result
+
+
+def with_global_check(result: SearchResult) -> SearchResult:
+    """Look over the whole field with NLopt, beside the search, and take what is better."""
+    likelihood, grid, single = result.likelihood, result.grid, result.single_theta
+    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    coarse = coarse_likelihood(likelihood, box)
+    deviance = float(likelihood.deviance(np.array(result.chi2_single)))
+    found = _checked(likelihood, coarse, grid, box, single, deviance)
+    best = max(mode.delta_chi2 for mode in result.modes)
+    every = distinct_modes([*result.modes, found], box.fringe_mas)
+    modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
+    solutions = _solutions(likelihood, modes, aliases)
+    if found.delta_chi2 > best + BETTER:
+        told = (
+            f"the global optimiser found a better solution than the grid "
+            f"(Δχ² {found.delta_chi2:.2f} against {best:.2f}); it was adopted"
+        )
+        solutions["warnings"] = (told, *solutions["warnings"])
+    return replace(result, global_check=found, **solutions)
+
+
+def _checked(
+    likelihood: Likelihood,
+    coarse: Likelihood,
+    grid: Grid,
+    box: Box,
+    single: FloatArray,
+    deviance_single: float,
+) -> Mode:
+    """Global check by NLopt; of large data with their channels averaged."""
+    if coarse is not likelihood:
+        grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas)
+    bank = TemplateBank(coarse, grid, single)
+    bank = bank.reduced(np.zeros(bank.n_data, dtype=np.intp))
+    return global_check(likelihood, coarse, bank, box, single, deviance_single)
+
+
+def _solutions(
+    likelihood: Likelihood, modes: tuple[Mode, ...], aliases: tuple[Mode, ...]
+) -> dict[str, Any]:
+    """What of a result follows from its modes."""
+    theta = np.array(modes[0].theta)
+    covariance = _errors(likelihood, theta)
+    return {
+        "companion": companions_of(likelihood.parameters, theta, covariance)[0],
+        "theta": theta,
+        "theta_covariance": covariance,
+        "chi2_binary": float(likelihood.chi2(theta)[0]),
+        "modes": modes,
+        "aliases": aliases,
+        "warnings": _warnings(modes, aliases),
+    }
 
 
 def _refuse_underdetermined(likelihood: Likelihood) -> None:
@@ -165,21 +220,6 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
             source="--separation",
             remedy=f"narrow the range: at most {MAX_POSITIONS:.0e} are searched",
         )
-
-
-def _checked(
-    likelihood: Likelihood,
-    coarse: Likelihood,
-    bank: TemplateBank,
-    box: Box,
-    single: FloatArray,
-    deviance_single: float,
-) -> Mode:
-    """Global check by NLopt; of large data with their channels averaged."""
-    if coarse is not likelihood:
-        bank = TemplateBank(coarse, make_grid(box.inner_mas, box.outer_mas, box.fringe_mas), single)
-    bank = bank.reduced(np.zeros(bank.n_data, dtype=np.intp))
-    return global_check(likelihood, coarse, bank, box, single, deviance_single)
 
 
 def _fits(
@@ -238,16 +278,8 @@ def _is_new(likelihood: Likelihood, nuisance: FloatArray, tried: list[FloatArray
     return True
 
 
-def _warnings(
-    modes: Sequence[Mode], aliases: Sequence[Mode], found: Sequence[Mode], check: Mode
-) -> tuple[str, ...]:
+def _warnings(modes: Sequence[Mode], aliases: Sequence[Mode]) -> tuple[str, ...]:
     warnings = []
-    best_found = max((m.delta_chi2 for m in found), default=0.0)
-    if check.delta_chi2 > best_found + 0.1:
-        warnings.append(
-            f"the global optimiser found a better solution than the grid "
-            f"(Δχ² {check.delta_chi2:.2f} against {best_found:.2f}); it was adopted"
-        )
     if aliases and modes[0].delta_chi2 > RIVAL:
         here = np.array(modes[0].place)
         opposite = [m for m in aliases if is_opposite(m, here)]

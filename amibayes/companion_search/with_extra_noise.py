@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.companion_search.search import search
+from amibayes.companion_search.search import BETTER, search, with_global_check
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import averaged_noise
@@ -60,21 +60,25 @@ def search_with_noise(
     """
     result, noise = first or search(likelihood, separation_mas), ExtraNoise()
     tried = [(_score(result), result, noise)]
-    converged = False
-    while not converged and len(tried) <= MAX_ROUNDS:
-        before = noise
-        noise, noisy = _best_noise(likelihood, result, per_file=per_file, prior=prior)
-        converged = _same(before, noise)
-        if not converged:
-            known = np.array([mode.theta for mode in result.modes])
-            result = search(noisy, separation_mas, known=known)
-            tried.append((_score(result), result, noise))
-    if converged:
-        return tried[-1][1], tried[-1][2]
+    while len(tried) <= MAX_ROUNDS:
+        fitted, noisy = _best_noise(likelihood, result, per_file=per_file, prior=prior)
+        if _same(noise, fitted):
+            if result.global_check is not None:
+                return result, noise
+            # The whole field once, with the noise that stands: what is better has its own noise.
+            checked = with_global_check(result)
+            if checked.modes[0].delta_chi2 <= result.modes[0].delta_chi2 + BETTER:
+                return checked, noise
+            result = checked
+        else:
+            noise, known = fitted, np.array([mode.theta for mode in result.modes])
+            result = search(noisy, separation_mas, known=known, check=False)
+        tried.append((_score(result), result, noise))
     # Noise and position chase each other: the most likely pair of those tried stands, each with
     # the calibration errors that are there for certain.
     floors = noise.floors
     _, result, noise = min((t for t in tried if t[2].floors == floors), key=lambda t: t[0])
+    result = with_global_check(result) if result.global_check is None else result
     return replace(result, warnings=(*result.warnings, NOT_CONVERGED)), noise
 
 

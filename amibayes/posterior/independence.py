@@ -189,6 +189,10 @@ class Mixture:
         return np.asarray(logsumexp(parts, axis=0, b=self.share[:, None]))
 
 
+NEGLIGIBLE = 50.0
+"""ln of the mass, below that of the best mode, with which a companion that is not noticed is left
+out: its e⁻⁵⁰ of the draws would cost as much as all others."""
+
 WORTH = 0.05
 """Share of the draws from which on a mode's own proposal is looked for."""
 
@@ -210,8 +214,9 @@ def mode_mixture(
     unnoticed: list[Proposal] = []
     if likelihood.model.companions == 1:
         alone = star_alone(likelihood, prior)
-        unnoticed.append(Unnoticed(likelihood, prior, alone))
-        log_mass = np.append(log_mass, alone.log_z)
+        if alone.log_z > log_mass.max() - NEGLIGIBLE:
+            unnoticed.append(Unnoticed(likelihood, prior, alone))
+            log_mass = np.append(log_mass, alone.log_z)
     # What holds less keeps a share: its Gaussian may be too narrow.
     share = np.exp(0.5 * (log_mass - log_mass.max())) + 1e-3
     share /= share.sum()

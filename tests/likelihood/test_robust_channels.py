@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from channel_sets import pionier, share, with_draw
 from helpers import niriss, simulated
 from scipy import stats
-from channel_sets import pionier, share, with_draw
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits, search_robust, shared_noise, with_shared
