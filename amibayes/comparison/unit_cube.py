@@ -103,9 +103,17 @@ class CubeModel:
         far = self.likelihood.noise.delta_chi2(np.full(1, FAR))
         seen = self._near(predicted, data, best + self.inflation(best) * far)
         out = np.full(seen.shape, -np.inf)
-        for k, one in enumerate(data.T):
-            if seen[:, k].any():
-                out[seen[:, k], k] = self.log_prob_of(predicted[:, seen[:, k]], one)
+        rows = np.flatnonzero(seen.any(axis=1))
+        first = self.difference(predicted[:, rows], data[:, :1])
+        second = self.difference(data[:, :1], data)
+        n = self.likelihood.observables.n_vis2
+        most = np.abs(second[n:]).max(axis=1, initial=0.0)
+        # A sum of two differences of closure phases goes the short way round where it is below π.
+        short = (np.abs(first[n:]) + most[:, None] < np.pi).all(axis=0)[:, None]
+        out[rows] = self.likelihood.noise.log_prob_of_sums(first, second, seen[rows] & short)
+        seen[rows] &= ~short
+        for k in np.flatnonzero(seen.any(axis=0)):
+            out[seen[:, k], k] = self.log_prob_of(predicted[:, seen[:, k]], data[:, k])
         return out
 
     def inflation(self, chi2: FloatArray) -> FloatArray:

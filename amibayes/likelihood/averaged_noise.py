@@ -89,6 +89,23 @@ class AveragedNoise(FittedNoise):
         parts = [log_sum(term.log_parts(residual)) for term in self.terms]
         return np.asarray(np.sum(parts, axis=0))
 
+    def log_prob_of_sums(self, a: FloatArray, b: FloatArray, pairs: BoolArray) -> FloatArray:
+        """Log-likelihoods (n, m) of sums of residuals (n_data, n) and (n_data, m).
+
+        Both are whitened once; a pair costs a sum of whitened data.
+        """
+        out = np.full(pairs.shape, -np.inf)
+        # One residual to a row: rows of pairs are then taken without strides.
+        white = [[np.array((t.whitening @ x).T, order="C") for x in (a, b)] for t in self.terms]
+        for k in np.flatnonzero(pairs.any(axis=0)):
+            which = pairs[:, k]
+            parts = [
+                log_sum(term.log_parts_of_white((one[which] + other[k]).T))
+                for term, (one, other) in zip(self.terms, white, strict=True)
+            ]
+            out[which, k] = np.sum(parts, axis=0)
+        return out
+
     def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
         """Δχ², at the noise of the fit itself, that goes with a gain in ln L over no companion.
 

@@ -21,7 +21,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelRows
 from amibayes.likelihood.chi2 import deviance, log_peak
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 MAX_EXPONENT = 50.0
 """Gains in ln L are cut where their Δχ² would overflow; nothing is decided so far out."""
@@ -89,6 +89,13 @@ class NoiseModel(Protocol):
 
     def log_prob(self, residual: FloatArray) -> FloatArray:
         """Log-likelihood (n,) of residuals (n_data, n)."""
+        ...
+
+    def log_prob_of_sums(self, a: FloatArray, b: FloatArray, pairs: BoolArray) -> FloatArray:
+        """Log-likelihoods (n, m) of sums of residuals (n_data, n) and (n_data, m).
+
+        Those of ``pairs`` (n, m); of others it is −∞.
+        """
         ...
 
     def deviance(self, chi2: FloatArray) -> FloatArray:
@@ -181,6 +188,10 @@ class GaussianNoise:
         """Log-likelihood (n,) of residuals (n_data, n)."""
         white = self.whiten(residual)
         return self.log_norm - 0.5 * self.deviance(np.einsum("dn,dn->n", white, white))
+
+    def log_prob_of_sums(self, a: FloatArray, b: FloatArray, pairs: BoolArray) -> FloatArray:
+        """Log-likelihoods (n, m) of sums of residuals (n_data, n) and (n_data, m)."""
+        return one_by_one(self, a, b, pairs)
 
     def deviance(self, chi2: FloatArray) -> FloatArray:
         """χ² itself."""
@@ -332,6 +343,10 @@ class FittedNoise:
         """Log-likelihood (n,) of residuals (n_data, n)."""
         return self.fit.log_prob(residual)
 
+    def log_prob_of_sums(self, a: FloatArray, b: FloatArray, pairs: BoolArray) -> FloatArray:
+        """Log-likelihoods (n, m) of sums of residuals (n_data, n) and (n_data, m)."""
+        return one_by_one(self, a, b, pairs)
+
     def deviance(self, chi2: FloatArray) -> FloatArray:
         """−2 ln L of χ² (any shape) with the one covariance."""
         return self.fit.deviance(chi2)
@@ -363,6 +378,15 @@ class FittedNoise:
     def posterior(self, residual: FloatArray) -> Mapping[str, Any]:
         """Posterior of every unknown amount."""
         return self.fit.posterior(residual)
+
+
+def one_by_one(noise: NoiseModel, a: FloatArray, b: FloatArray, pairs: BoolArray) -> FloatArray:
+    """`NoiseModel.log_prob_of_sums` by `NoiseModel.log_prob`, one of the second at a time."""
+    out = np.full(pairs.shape, -np.inf)
+    for k in np.flatnonzero(pairs.any(axis=0)):
+        which = pairs[:, k]
+        out[which, k] = noise.log_prob(a[:, which] + b[:, k, None])
+    return out
 
 
 def noise_of(observables: Observables) -> NoiseModel:

@@ -77,15 +77,23 @@ class NoiseTerm:
 
     def log_likelihoods(self, difference: FloatArray, node: FloatArray) -> FloatArray:
         """ln L (n_nodes, n) of data minus model (n_data, n) for amounts of noise (n_nodes,)."""
+        return self.log_likelihoods_of_white(np.asarray(self.whitening @ difference), node)
+
+    def log_likelihoods_of_white(self, white: FloatArray, node: FloatArray) -> FloatArray:
+        """The same of whitened data minus model (rank, n)."""
         variance = 1.0 + np.outer(np.expm1(2.0 * node), self.share)
         n = self.n_independent
         norm = log_peak(n, self.degrees) - 0.5 * (np.log(variance).sum(axis=1) + self.log_det)
-        chi2 = (1.0 / variance) @ np.asarray(self.whitening @ difference) ** 2
+        chi2 = (1.0 / variance) @ white**2
         return np.asarray(norm[:, None] - 0.5 * deviance(chi2, n, self.degrees))
 
     def log_parts(self, difference: FloatArray) -> FloatArray:
         """Logarithm of likelihood times prior at the nodes, (n_nodes, n)."""
-        return self.log_likelihoods(difference, self.node) + self.log_prior[:, None]
+        return self.log_parts_of_white(np.asarray(self.whitening @ difference))
+
+    def log_parts_of_white(self, white: FloatArray) -> FloatArray:
+        """The same of whitened data minus model (rank, n)."""
+        return self.log_likelihoods_of_white(white, self.node) + self.log_prior[:, None]
 
     def best(self, difference: FloatArray) -> float:
         """Most likely ln(total error/stated error) of residuals (n_data,)."""

@@ -268,9 +268,9 @@ class StudentTerm(NoiseTerm):
         """Number of independent data."""
         return round(float(self.share.sum()))
 
-    def log_likelihoods(self, difference: FloatArray, node: FloatArray) -> FloatArray:
-        """ln L (n_nodes, n) of data minus model (n_data, n) for scales exp(node)."""
-        moments, square = normal_moments(), np.asarray(self.whitening @ difference) ** 2
+    def log_likelihoods_of_white(self, white: FloatArray, node: FloatArray) -> FloatArray:
+        """ln L (n_nodes, n) of residuals in their stated errors (rank, n) for scales exp(node)."""
+        moments, square = normal_moments(), white**2
         power = 0.5 * moments.power * (DEGREES + 1.0)
         slopes = [self.share @ np.log1p(square / (DEGREES * np.exp(2.0 * u))) for u in node]
         norm = self.n_independent * (0.5 * LOG_TWO_PI + moments.efficiency * node)

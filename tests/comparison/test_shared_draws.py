@@ -83,6 +83,21 @@ def test_pairs_of_models_and_data_have_their_chi2_also_across_the_circle() -> No
     np.testing.assert_allclose(model.chi2_of_pairs(predicted, data), np.transpose(expected))
 
 
+def test_likelihoods_of_pairs_hold_also_across_the_circle() -> None:
+    """Closure phases of nearly equal stars are near ±π, where differences change their sign."""
+    base = base_of("companion", [110.0, -75.0, 0.9], None)
+    model = cube_of("companion", base)
+    data = data_sets(base, 4)
+    rng = np.random.default_rng(6)
+    theta = np.array([110.0, -75.0, 0.9]) + rng.standard_normal((200, 3)) * [60.0, 60.0, 0.05]
+    predicted = model.predict(model.cube(theta))
+    found = model.log_prob_of_many(predicted, data, np.full(4, 1e7))
+    expected = np.stack([model.log_prob_of(predicted, one) for one in data.T], axis=1)
+    apart = np.abs(model.difference(predicted, data[:, :1])[base.observables.n_vis2 :])
+    assert 20 < (apart.max(axis=0) > 3.0).sum() < 180
+    np.testing.assert_allclose(found, expected)
+
+
 def test_what_is_far_away_is_left_out_and_nothing_else() -> None:
     base = base_of("companion", TRUTHS["companion"])
     model = cube_of("companion", base)

@@ -20,6 +20,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.noise_terms import MAX_INFLATION, PRIOR_STATED_ERRORS_CORRECT
+from amibayes.likelihood.student import averaged_student_noise
 from amibayes.models.parameters import Box
 from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import grid_posterior
@@ -84,6 +85,24 @@ def test_correlated_kinds_share_the_relative_noise(rng) -> None:
     residual = data.data - noisy.predict([TRUTH])[:, 0]
     found = term.log_likelihoods(residual[:, None], np.array([np.log(2.0)]))[0, 0]
     assert found == pytest.approx(noisy.log_prob([TRUTH])[0], abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["known", "averaged", "student"])
+def test_sums_of_residuals_have_the_likelihood_of_their_sums(kind, rng) -> None:
+    data = understated(TRUTH, 2.0, rng)
+    result, marginal = averaged(data)
+    fits = [(result.likelihood, result.theta)]
+    noise = {
+        "known": result.likelihood.noise,
+        "averaged": marginal.noise,
+        "student": averaged_student_noise(result.likelihood.noise, data, fits),
+    }[kind]
+    a, b = noise.draw(5, rng), noise.draw(3, rng)
+    pairs = rng.random((5, 3)) < 0.6
+    expected = np.full((5, 3), -np.inf)
+    for i, k in np.argwhere(pairs):
+        expected[i, k] = noise.log_prob((a[:, i] + b[:, k])[:, None])[0]
+    np.testing.assert_allclose(noise.log_prob_of_sums(a, b, pairs), expected, rtol=1e-10)
 
 
 @pytest.mark.slow
