@@ -1,11 +1,12 @@
 """Coverage and error rates of what a search writes, under many conditions: docs/validation.md.
 
-    python docs/validation.py FOLDER --minutes 30     as many stars as that takes of one core
-    python docs/validation.py FOLDER --full           2000 stars alone and 1000 not
-    python docs/validation.py FOLDER --table          the page, from the answers that are there
+    python docs/validation.py --minutes 30     as many stars as that takes of one core
+    python docs/validation.py --full           2000 stars alone and 1000 not
+    python docs/validation.py --table          the page, from the answers that are there
 
-Answers are kept in ``FOLDER``, one file for each condition, and every run goes on from them. The
-conditions take turns so that each has the same time.
+Answers are kept in ``docs/static/validation`` or the folder that is given, one file for each
+condition, and every run goes on from them; delete them where a change of the code asks for new ones.
+The conditions take turns so that each has the same time.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ PICTURES = ("ranks", "coverage", "false_alarms", "completeness")
 CYCLE = ("alone", "bright", "alone", "alone", "middling", "alone", "alone", "faint", "alone")
 FULL = 334 * len(CYCLE)
 
-VLTI = SimulatedTable("vlti", 0.02, 0.5, field_mas=(1.5, 12.0))
+VLTI = SimulatedTable("vlti", 0.02, 0.5, field_mas=(1.5, 12.0), calibration=(0.03, 0.5))
 CONDITIONS: dict[str, Condition] = {
     "NIRISS": SimulatedTable(),
     "V² noisier: 0.05, closure phases 0.1°": SimulatedTable(vis2_error=0.05, closure_error_deg=0.1),
@@ -55,6 +56,7 @@ CONDITIONS: dict[str, Condition] = {
     "images, one calibrator": SimulatedExposure("F430M", 7, 30, 1),
     "images, charge migration": SimulatedExposure("F480M", 19, 30, 2, 6.75, 3.6e-7),
     "images by poppy": PoppyExposure(),
+    "VLTI, no calibration errors": replace(VLTI, calibration=(0.0, 0.0)),
 }
 
 
@@ -196,7 +198,7 @@ def main(arguments: Any) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, nargs="?", default=DOCS / "static" / "validation")
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--table", action="store_true")

@@ -46,6 +46,9 @@ class SimulatedTable:
         Files, on different dates with the array turned by 40 degrees from one to the next.
     companion_mas : float
         Diameter of the companion, a uniform disc.
+    calibration : (float, float)
+        Standard deviation of calibration errors: relative of V², and of closure phases in
+        degrees. Half of the variance is an offset of the channels of an exposure, half a slope.
     field_mas : (float, float)
         Separations of the truths, and the field that is searched.
     """
@@ -57,6 +60,7 @@ class SimulatedTable:
     outliers: float = 0.0
     epochs: int = 1
     companion_mas: float = 0.0
+    calibration: tuple[float, float] = (0.0, 0.0)
     field_mas: tuple[float, float] = (50.0, 400.0)
 
     def write(
@@ -106,9 +110,10 @@ class SimulatedTable:
         for sign, u, v in _sides(closure):
             side = _visibility(u, v, closure, band, truth, self.companion_mas)
             phase = phase + sign * np.angle(side)
+        gain, drift = self._calibration_errors(sheet, rng)
         noise, of_phase = self._noise(sheet, rng)
-        value = np.abs(light) ** 2 + noise
-        angle = np.angle(np.exp(1j * (phase + of_phase)))
+        value = np.abs(light) ** 2 * (1.0 + gain) + noise
+        angle = np.angle(np.exp(1j * (phase + drift + of_phase)))
         return replace(
             sheet,
             vis2=replace(vis2, value=value),
@@ -121,12 +126,21 @@ class SimulatedTable:
         size = np.radians(self.closure_error_deg) / np.sqrt(3.0)
         vis2 = self.vis2_error * self._draw((n, n, channels), rng)
         phases = size * self._draw((n, n, channels), rng)
-        table, triangle = sheet.vis2, sheet.closure_phase
-        a, b, c = triangle.stations.T
-        k = triangle.channel
-        of_vis2 = vis2[table.stations[:, 0], table.stations[:, 1], table.channel]
-        of_phase = phases[a, b, k] + phases[b, c, k] - phases[a, c, k]
+        of_vis2, of_phase = _of_baselines(sheet, vis2, phases)
         return self._spoilt(of_vis2, rng), self._spoilt(of_phase, rng)
+
+    def _calibration_errors(
+        self, sheet: Observables, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Relative errors of V², and errors of closure phases, smooth over the channels."""
+        if not any(self.calibration):
+            return np.zeros(len(sheet.vis2)), np.zeros(len(sheet.closure_phase))
+        n, channels = len(sheet.setups[0].stations), sheet.setups[0].wavelength_m
+        slope = (channels - channels.mean()) / max(channels.std(), 1e-12)
+        smooth = rng.standard_normal((2, n, n, 2)) @ np.stack([np.ones_like(slope), slope])
+        gains, phases = np.sqrt(0.5) * smooth
+        size = np.radians(self.calibration[1]) / np.sqrt(3.0)
+        return _of_baselines(sheet, self.calibration[0] * gains, size * phases)
 
     def _draw(self, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
         """Normal numbers, of which the last axis shares a part."""
@@ -153,6 +167,17 @@ def _projected(hours: float) -> FloatArray:
     u = np.sin(angle) * x + np.cos(angle) * y
     v = np.sin(DECLINATION) * (np.sin(angle) * y - np.cos(angle) * x) + np.cos(DECLINATION) * z
     return np.column_stack([u, v])
+
+
+def _of_baselines(
+    sheet: Observables, vis2: FloatArray, phases: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Errors of V² and closure phases from those of baselines, (n, n, n_channels) each."""
+    table, triangle = sheet.vis2, sheet.closure_phase
+    a, b, c = triangle.stations.T
+    k = triangle.channel
+    of_vis2 = vis2[table.stations[:, 0], table.stations[:, 1], table.channel]
+    return of_vis2, phases[a, b, k] + phases[b, c, k] - phases[a, c, k]
 
 
 def _sides(closure: Measurements) -> list[tuple[float, FloatArray, FloatArray]]:

@@ -63,6 +63,19 @@ def test_errors_of_the_tables_are_as_stated_and_closures_share_baselines(common:
         assert white.var() == pytest.approx(1.0, abs=4.5 * np.sqrt(2.0 / white.size))
 
 
+def test_calibration_errors_of_the_tables_are_smooth_over_channels() -> None:
+    """Offset and slope: of three channels the second difference is none, the variance as said."""
+    condition = replace(VLTI, calibration=(0.03, 0.5))
+    sheet, rng = condition._exposures(0)[0], np.random.default_rng(7)
+    drawn = [condition._calibration_errors(sheet, rng) for _ in range(2000)]
+    for errors, size in zip(zip(*drawn, strict=True), (0.03, np.radians(0.5)), strict=True):
+        channels = np.array(errors).reshape(2000, -1, 3)
+        assert np.abs(channels @ [1.0, -2.0, 1.0]).max() < 1e-9
+        # Offset and slope have half of the variance each, averaged over the channels.
+        assert channels.var() == pytest.approx(size**2, rel=0.05)
+        assert channels.mean(axis=2).var() == pytest.approx(0.5 * size**2, rel=0.05)
+
+
 def test_a_share_of_the_data_is_spoilt() -> None:
     rng = np.random.default_rng(6)
     spoilt = replace(VLTI, outliers=0.05)._spoilt(np.ones(20_000), rng)
