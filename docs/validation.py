@@ -5,7 +5,7 @@
     python docs/validation.py --table          the page, from the answers that are there
 
 Answers are kept in ``docs/static/validation`` or the folder that is given, one file for each
-condition, and every run goes on from them; delete them where a change of the code asks for new ones.
+condition, and every run goes on from them; delete them where the code has changed too much.
 The conditions take turns so that each has the same time.
 """
 
