@@ -48,6 +48,7 @@ def test_another_filter_and_what_is_no_library_are_refused(tmp_path: Path) -> No
             read_library(tmp_path / name)
 
 
+@pytest.mark.slow
 def test_commands_add_to_a_library_and_draw_on_it(tmp_path: Path, capsys) -> None:
     rng = np.random.default_rng(3)
     mjd = [*(60000.0 + 3.0 * np.arange(14)), 60020.0]

@@ -201,7 +201,7 @@ LONG = ("--separation", "80:200", "--null-draws", "100000000", "--quiet")
     [
         (signal.SIGINT, 1, 1.0),
         pytest.param(signal.SIGINT, 2, 1.0, marks=pytest.mark.slow),  # while the workers start
-        (signal.SIGINT, 2, 4.0),
+        pytest.param(signal.SIGINT, 2, 4.0, marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, 1, 1.0, marks=pytest.mark.slow),
     ],
 )

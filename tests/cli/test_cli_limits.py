@@ -38,7 +38,15 @@ def test_whole_job(star: Path, tmp_path: Path, capsys) -> None:
     np.testing.assert_allclose(table["delta_mag_cp"], content["curves"][2]["delta_mag"])
 
 
-@pytest.mark.parametrize("method", ["absil", "candid", "posterior", "closure-phase"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "absil",
+        pytest.param("candid", marks=pytest.mark.slow),
+        pytest.param("posterior", marks=pytest.mark.slow),
+        "closure-phase",
+    ],
+)
 def test_closed_criteria(star: Path, tmp_path: Path, capsys, method: str) -> None:
     out = tmp_path / "out"
     assert run("limits", star, "--out", out, *FAST, "--criterion", method, "--json") == 0

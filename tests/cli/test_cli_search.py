@@ -175,6 +175,7 @@ def test_folder_that_cannot_be_made(target, tmp_path, capsys) -> None:
     assert "cannot be made a folder" in error_of(capsys)
 
 
+@pytest.mark.slow
 def test_default_field_is_widened_to_a_companion_outside_it(data: Path, tmp_path, capsys) -> None:
     path = data / "oifits" / "axcir_pionier.oifits"
     assert run("search", path, *FAST, "--out", tmp_path / "out", "--json") == 0
@@ -255,7 +256,7 @@ def test_evidence_prior_and_upper_limit_are_in_the_result(tmp_path, capsys) -> N
         ("700:1500", "nearer the star, a companion fits as well or better"),
         pytest.param("250:400", "nearer the star", marks=pytest.mark.slow),
         ("60:100", "on the edge of the field that was asked for"),
-        ("50:400", None),
+        pytest.param("50:400", None, marks=pytest.mark.slow),
     ],
 )
 def test_a_field_that_leaves_the_companion_out_is_warned_of(

@@ -228,6 +228,7 @@ def test_limits_in_mass(alone: Path, tmp_path: Path, capsys) -> None:
     assert any("no limit in this field" in text for text in lines)
 
 
+@pytest.mark.slow
 def test_other_data_in_a_folder_are_not_gone_on_with(path, alone, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     words = ("--separation", "80:200", "--null-draws", 0, "--no-posterior", "--no-limits")
@@ -245,7 +246,7 @@ def test_other_data_in_a_folder_are_not_gone_on_with(path, alone, tmp_path, caps
 @pytest.mark.parametrize(
     ("column", "cell", "outcome"),
     [
-        ("keep_all", "true", "--keep-all"),
+        pytest.param("keep_all", "true", "--keep-all", marks=pytest.mark.slow),
         ("keep_all", "maybe", "column 'keep_all' holds 'maybe' (write true or false)"),
         ("smearing", "false", "--no-smearing"),
     ],
@@ -359,7 +360,11 @@ def test_images_made_and_measured_in_words(tmp_path: Path, capsys) -> None:
     ("error", "said"),
     [
         (MemoryError("9 GB"), "not enough memory: 9 GB (ask for less)"),
-        (ValueError("odd\n  thing"), "ValueError: odd thing (a fault of amibayes"),
+        pytest.param(
+            ValueError("odd\n  thing"),
+            "ValueError: odd thing (a fault of amibayes",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_surprise_with_one_target_spares_the_others(

@@ -478,6 +478,7 @@ def test_motion_needs_two_dates_and_all_of_them() -> None:
     assert mean == pytest.approx(np.mean(MJD))
 
 
+@pytest.mark.slow
 def test_posterior_of_bands_and_motion_agrees_with_the_errors_of_a_strong_companion(rng) -> None:
     """At high signal-to-noise the posterior is the Gaussian of the fit: 5 % and 0.15 σ."""
     parts = [

@@ -298,7 +298,9 @@ def test_what_all_vis2_share_is_learned_from_fewer_integrations_than_data(rng) -
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.parametrize(("name", "n_integrations"), [("even", 200), ("uneven", 20)])
+@pytest.mark.parametrize(
+    ("name", "n_integrations"), [pytest.param("even", 200, marks=pytest.mark.slow), ("uneven", 20)]
+)
 def test_intervals_cover_at_few_integrations(name: str, n_integrations: int) -> None:
     """100 trials: binomial chance 1e-4; the uneven one has an expectation that is wrong."""
     rng = np.random.default_rng([8, n_integrations, name == "even"])

@@ -53,7 +53,7 @@ def spoilt(data: Observables, kind: str, entry: int) -> Observables:
 
 
 @pytest.mark.parametrize("kind", ["vis2", "cp"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spoilt_row_is_left_out_and_the_companion_found(kind: str, seed: int) -> None:
     """The row alone, and the binary as it is found without it; all data where asked for."""
     clean = observed(sky((5.0, -4.0, 0.05)), seed)
@@ -78,8 +78,12 @@ def test_spoilt_row_is_left_out_and_the_companion_found(kind: str, seed: int) ->
 
 @pytest.mark.parametrize(
     "source",
-    [sky(), sky((5.0, -4.0, 0.3)), sky((5.0, -4.0, 0.1), (-2.0, 7.0, 0.1)), sky((3.0, 2.0, 0.9))],
-    ids=["star", "binary", "triple", "equal stars"],
+    [
+        pytest.param(sky(), id="star", marks=pytest.mark.slow),
+        pytest.param(sky((5.0, -4.0, 0.3)), id="binary"),
+        pytest.param(sky((5.0, -4.0, 0.1), (-2.0, 7.0, 0.1)), id="triple", marks=pytest.mark.slow),
+        pytest.param(sky((3.0, 2.0, 0.9)), id="equal stars", marks=pytest.mark.slow),
+    ],
 )
 def test_nothing_is_left_out_of_other_light_and_of_noise(source: Visibility) -> None:
     """A third star is seen in many rows: none is outlying, or too many are."""

@@ -189,7 +189,9 @@ def test_structure_counts_where_it_exceeds_the_calibration_errors_of_the_table(
     assert test.strongest[0, 2] < 2.0 * second or second < 0.01
 
 
-@pytest.mark.parametrize(("contrast", "noted"), [(0.008, True), (0.1, False)])
+@pytest.mark.parametrize(
+    ("contrast", "noted"), [(0.008, True), pytest.param(0.1, False, marks=pytest.mark.slow)]
+)
 def test_a_companion_within_the_calibration_errors_is_noted(contrast: float, noted: bool) -> None:
     """Of PIONIER, 3 % of V² and half a degree, in 24 exposures with errors of 1 % and 0.3°."""
     sheet = four_telescopes(24, vis2_error=0.01, closure_error_deg=0.3)

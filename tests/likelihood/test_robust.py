@@ -204,7 +204,7 @@ def test_coverage_and_efficiency(share) -> None:
     assert np.abs(errors["robust"].mean(axis=0)).max() < 5 * scatter["robust"] / np.sqrt(n)
 
 
-@pytest.mark.parametrize("share", [0.0, SHARE])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), SHARE])
 def test_false_alarm_probability_stays_uniform(share) -> None:
     """400 null data sets with and without outliers, each against one robust null.
 

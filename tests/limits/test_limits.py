@@ -225,6 +225,7 @@ def test_same_seed_same_limit(setting) -> None:
     np.testing.assert_array_equal(first.contrast, again.contrast)
 
 
+@pytest.mark.slow
 def test_robust_search_has_limits_of_its_own_statistic() -> None:
     """One closure phase is 30 sigma off: threshold, rate and limit are those of robust searches.
 

@@ -164,6 +164,7 @@ def test_without_closure_phases(rng: np.random.Generator, tmp_path: Path) -> Non
         write_export(tmp_path / "a.oifits", export([epoch(rng)], "mira"))
 
 
+@pytest.mark.slow
 def test_public_files(data: Path, tmp_path: Path) -> None:
     for name in ("axcir_pionier.oifits", "contest2008_binary.oifits", "gravity_singlesci.fits"):
         observables = read_oifits(data / "oifits" / name)

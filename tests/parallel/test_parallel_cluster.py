@@ -58,6 +58,7 @@ def test_two_dask_workers_give_the_bits_of_a_serial_run_though_one_is_killed(
         assert all(np.asarray(a[k]).tobytes() == np.asarray(b[k]).tobytes() for k in a)
 
 
+@pytest.mark.slow
 def test_cluster_without_workers_is_given_up_in_one_line(
     scheduler: str, workers: list[subprocess.Popen[bytes]]
 ) -> None:
@@ -71,6 +72,7 @@ def test_cluster_without_workers_is_given_up_in_one_line(
     executor.close()
 
 
+@pytest.mark.slow
 def test_piece_that_kills_its_workers_is_one_line(
     scheduler: str, workers: list[subprocess.Popen[bytes]]
 ) -> None:
@@ -104,6 +106,7 @@ def test_a_timeout_of_the_piece_is_raised_and_one_of_ours_is_not() -> None:
         executor._result(_Late("error"))
 
 
+@pytest.mark.slow
 def test_scheduler_that_does_not_answer_is_one_line() -> None:
     started = time.monotonic()
     with pytest.raises(RunError, match="no dask scheduler answers"):

@@ -77,6 +77,7 @@ def test_dates_and_setups_are_read_from_files(tmp_path: Path) -> None:
     assert star_of([str(tmp_path / "gone")], {}).setup is None
 
 
+@pytest.mark.slow
 def test_a_survey_names_the_calibrators_that_it_chose(tmp_path: Path, capsys) -> None:
     mjd = [60000.0, 60010.0, *(60000.0 + np.arange(0.0, 12.0, 2.0) + 0.5)]
     for k, data in enumerate(visits(Drift(), mjd, np.random.default_rng(2))):

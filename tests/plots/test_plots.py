@@ -327,6 +327,7 @@ def test_residuals_are_those_of_the_likelihood_and_wrap(found: SearchResult) -> 
     np.testing.assert_allclose(drawn, np.sort(whitened), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_data_are_thinned_and_it_says_so(tmp_path: Path) -> None:
     data = niriss(channels=1786)
     assert len(data.data) > 1e5

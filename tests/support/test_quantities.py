@@ -55,7 +55,7 @@ def test_a_search_and_a_calibration_take_them() -> None:
 
 
 def test_what_takes_them_is_what_it_was() -> None:
-    names = ["likelihood", "separation_mas", "known", "single"]
+    names = ["likelihood", "separation_mas", "known", "single", "check"]
     assert list(inspect.signature(ab.search).parameters) == names
     assert pickle.loads(pickle.dumps(ab.search)) is ab.search
     prior = ab.Prior(50.0, 400.0)
