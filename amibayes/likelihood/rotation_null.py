@@ -88,6 +88,8 @@ def rotation_null(noise: NoiseModel, residual: FloatArray) -> RotationNull | Non
     whitening = noise.covariance.whitening
     variance, axes = np.linalg.eigh((whitening @ noise.scatter @ whitening.T).toarray())
     measured = variance > NEGLIGIBLE * variance[-1]
-    factor = axes[:, measured] * np.sqrt(noise.freedom.scatter * variance[measured])
-    rows = max(noise.freedom.scatter, factor.shape[1]) + 1.0
-    return RotationNull(degrees, rows, factor, residual)
+    # A target and its calibrators, few integrations of each, scatter in more directions than they
+    # have degrees of freedom together: what is drawn must have the variance of the estimate still.
+    freedom = max(noise.freedom.scatter, float(measured.sum()))
+    factor = axes[:, measured] * np.sqrt(freedom * variance[measured])
+    return RotationNull(degrees, freedom + 1.0, factor, residual)

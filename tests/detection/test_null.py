@@ -187,6 +187,28 @@ def scaled(n: int, vis2: float, closure: float, rng: np.random.Generator) -> np.
     return out
 
 
+def test_probability_is_uniform_where_few_integrations_were_calibrated() -> None:
+    """Four integrations of a target and of three calibrators, of noise that was expected.
+
+    They scatter in twelve directions, and are worth five degrees of freedom together.
+    """
+    rng, n = np.random.default_rng(9), 100
+    colour = np.linalg.pinv(niriss().covariance.whitening.toarray())
+    found = []
+    for _ in range(n):
+        target, calibrators = rng.standard_normal((3, 36)), rng.standard_normal((9, 36))
+        scatter = 0.75 * (target.T @ target / 3.0 + calibrators.T @ calibrators / 27.0)
+        sheet = replace(
+            niriss(), freedom=Freedom(5000.0, 5.1), scatter=csr_array(colour @ scatter @ colour.T)
+        )
+        sheet = with_values(sheet, sheet.covariance.draw(rng, 1)[:, 0])
+        test = made(sheet, 60.0, stated_errors=True)
+        found.append(significance(test, 300, rng).probability)
+    # No test of this kind is exact: small probabilities must not come too often.
+    assert stats.binomtest(int((np.array(found) < 0.1).sum()), n, 0.1, "greater").pvalue > 1e-3
+    assert 0.4 < np.mean(found) < 0.65
+
+
 def test_probability_is_uniform_where_one_kind_of_error_is_wrong() -> None:
     """200 null sets whose closure phases scatter by a third of what is stated."""
     check(scaled(200, 1.0, 0.33, np.random.default_rng(8)), 1e-4, 0.05)
