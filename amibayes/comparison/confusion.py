@@ -25,8 +25,9 @@ RANDOM_STARTS, KNOWN_STARTS = 4, 2
 """Starting points of each simulated data set beside those of the banks: random ones, and the best
 fits to the data themselves."""
 
-STEPS = 16
-"""Of a fit to simulated data: what is drawn around need not be the minimum to a digit."""
+FIRST_STEPS, STEPS, CONTINUED = 4, 12, 6
+"""Steps of every fit to simulated data, then of so many, the best ones: what is drawn around need
+not be the minimum to a digit."""
 
 QUICK = PooledEffort()
 """ln Z of simulated data is then known to 0.02 to 0.1: less than what decides."""
@@ -186,9 +187,13 @@ def _fitted(
     known = fit.cube[: KNOWN_STARTS if model.n_dim else 1]
     starts.append(np.broadcast_to(known, (n, *known.shape)))
     every = np.concatenate(starts, axis=1)
-    flat = np.concatenate(every)
-    cube, chi2 = least_squares(model, flat, np.repeat(data, every.shape[1], axis=1), STEPS)
-    return cube.reshape(every.shape), chi2.reshape(every.shape[:2])
+    for steps, most in ((FIRST_STEPS, CONTINUED), (STEPS, CONTINUED)):
+        flat = np.concatenate(every)
+        cube, chi2 = least_squares(model, flat, np.repeat(data, every.shape[1], axis=1), steps)
+        cube, chi2 = cube.reshape(every.shape), chi2.reshape(every.shape[:2])
+        best = np.argsort(chi2, axis=1, kind="stable")[:, :most]
+        every = np.take_along_axis(cube, best[:, :, None], axis=1)
+    return every, np.take_along_axis(chi2, best, axis=1)
 
 
 def _bound(fit: ModelFit, data: FloatArray, cube: FloatArray, chi2: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import qmc
 
 from amibayes.companion_search.descent import damped_steps
-from amibayes.comparison.unit_cube import CubeModel
+from amibayes.comparison.unit_cube import BATCH_VALUES, CubeModel
 from amibayes.units import FloatArray, IntArray
 
 STEPS = 40
@@ -86,6 +86,17 @@ def _linearised(
     model: CubeModel, cube: FloatArray, data: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """χ² (n,), normal matrices (n, n_dim, n_dim) and gradients (n, n_dim)."""
+    values = len(cube) * (1 + model.n_dim) * len(model.likelihood.samples)
+    pieces = np.array_split(np.arange(len(cube)), 1 + values // BATCH_VALUES)
+    found = [_linear_piece(model, cube[k], data[:, k]) for k in pieces if len(k)]
+    chi2, normal, gradient = (np.concatenate(x) for x in zip(*found, strict=True))
+    return chi2, normal, gradient
+
+
+def _linear_piece(
+    model: CubeModel, cube: FloatArray, data: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`_linearised` of as many as are worked on together."""
     predicted, slopes = model.linear(cube)
     white = model.likelihood.noise.whiten(model.difference(predicted, data)).T
     normal = np.matmul(slopes.transpose(0, 2, 1), slopes)
