@@ -10,6 +10,7 @@ from amibayes.companion_search.field import default_separation
 from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES, extended_names
 from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions
@@ -88,12 +89,17 @@ def with_models(
     report: SearchReport, found: ModelComparison | None, beside: LimitsBeside | None
 ) -> SearchReport:
     """Put a comparison of models, and what is to be warned of, in a report."""
-    warnings = (*report.warnings, *models_warnings(found))
+    warnings = (*report.warnings, *models_warnings(found, report.verdict))
     return replace(report, models=found, limits_beside=beside, warnings=warnings)
 
 
-def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:
-    """Warn of what makes the comparison less than it seems."""
+def models_warnings(
+    found: ModelComparison | None, verdict: Verdict | None = None
+) -> tuple[str, ...]:
+    """Warn of what makes the comparison less than it seems.
+
+    The verdict on the data may be that the star alone, and that with a companion, are refused.
+    """
     if found is None:
         return ()
     warnings = []
@@ -103,8 +109,18 @@ def models_warnings(found: ModelComparison | None) -> tuple[str, ...]:
             f"{found.best.chi2:.4g} for {found.best.ndof} degrees of freedom; odds between models "
             "that do not fit mean little"
         )
+    refused = verdict is not None and verdict.statement in REFUSED
+    if verdict is not None and refused and found.best.name in JUDGED:
+        warnings.append(
+            f"{found.best.name} is the most probable of the models of the sky that were compared, "
+            f"but the verdict on it is: {verdict.statement}"
+        )
     return tuple(warnings)
 
+
+REFUSED = ("model rejected", "inconsistent data")
+JUDGED = ("star", "companion")
+"""Models that the verdict is about, and what it says where neither is right."""
 
 REJECTED = 1e-3
 """Probability of a χ² below which a model does not fit."""
