@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.units import MAS, FloatArray, IntArray
+from amibayes.units import MAS, BoolArray, FloatArray, IntArray
 
 WIDTHS, CACHED = (16, 128), 65536
 """Fewest and most positions that are worked on at once, and numbers that fit a processor's cache,
@@ -62,9 +62,26 @@ class Grid:
         return int(self.outer_mas / self.step_mas)
 
     def half_plane(self, n_samples: int) -> list[IntArray]:
-        """Positions of one half plane, in pieces whose fringes at so many points stay in cache."""
-        half, width = np.arange(len(self) // 2), int(np.clip(CACHED // n_samples, *WIDTHS))
-        return np.split(half, range(width, len(half), width)) if len(half) else []
+        """Positions of one half plane, in square tiles of an even number of positions a side.
+
+        Their fringes at so many points stay in cache.
+        """
+        half, width = len(self) // 2, int(np.clip(CACHED // n_samples, *WIDTHS))
+        side = int(np.sqrt(width)) // 2 * 2
+        tile = np.stack([self.rows[:half], self.columns[:half]]) // side
+        label = np.unique(tile, axis=1, return_inverse=True)[1].ravel()
+        ends = np.cumsum(np.bincount(label))[:-1]
+        return np.split(np.argsort(label, kind="stable"), ends) if half else []
+
+    def coarse(self, tile: IntArray) -> BoolArray:
+        """Which positions (n,) of a tile are every second one along each axis, (n,).
+
+        And those at the edge of the annulus that have none of these beside them.
+        """
+        rows, columns = self.rows[tile], self.columns[tile]
+        even = (rows % 2 == 0) & (columns % 2 == 0)
+        far = [np.abs(x[:, None] - x[even]) > 1 for x in (rows, columns)]
+        return np.asarray(even | (far[0] | far[1]).all(axis=1))
 
     def image(self, values: FloatArray) -> FloatArray:
         """Lay values (n,) out as a map [north, east], NaN outside the annulus."""

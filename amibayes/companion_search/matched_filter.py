@@ -8,11 +8,14 @@ the product with the data and a triangular factor are needed, which are made onc
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from amibayes.companion_search.templates import floored
-from amibayes.likelihood.linear_response import Part
+from amibayes.likelihood.linear_response import Part, WhitenedResponse
+from amibayes.models.companion import fringes_into, fringes_of_one
+from amibayes.models.uv_points import UVPoints
 from amibayes.units import FloatArray
 
 MatchedFilter = Callable[[FloatArray], tuple[FloatArray, float]]
@@ -32,14 +35,65 @@ def few(n_rows: int, n_samples: int) -> bool:
     return n_rows * (2 * n_samples + 1) <= MAX_NUMBERS
 
 
-Waves = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], None]
-"""Puts cosine and sine (n_samples, m) of east and north (m,) into its first arguments."""
+@dataclass(frozen=True, eq=False)
+class CompanionFringes:
+    """What light at a place of the field does to the visibility, cosine and sine.
 
+    Fringes, the companion's disc, the response off the axis.
 
-def fill_one(waves_into: Waves, out: FloatArray, place: FloatArray) -> None:
-    """Put cosines, then sines of one place (2,) into one array (2 n_samples,)."""
-    n = len(out) // 2
-    waves_into(out[:n, None], out[n:, None], place[:1], place[1:])
+    Parameters
+    ----------
+    samples : UVPoints
+    smearing : bool
+    disc : (n_samples, 1) float array or None
+    star : (n_samples,) float array
+        The star's visibility.
+    """
+
+    samples: UVPoints
+    smearing: bool
+    disc: FloatArray | None
+    star: FloatArray
+
+    @classmethod
+    def of(
+        cls, samples: UVPoints, response: WhitenedResponse, *, smearing: bool
+    ) -> CompanionFringes:
+        """Make those that a response is to be multiplied with."""
+        disc = None if (response.disc == 1.0).all() else response.disc[:, None]
+        return cls(samples, smearing, disc, response.star)
+
+    def at(self, east_mas: FloatArray, north_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Cosine and sine, (n_samples, m), of places (m,) or of moving ones (n_samples, m)."""
+        cosine, sine = np.empty((2, len(self.samples), np.shape(east_mas)[-1]))
+        self._into(cosine, sine, east_mas, north_mas)
+        return cosine, sine
+
+    def of_one(self) -> Callable[[FloatArray, FloatArray], None]:
+        """Make what puts cosines, then sines of a place (2,) into an array (2 n_samples,)."""
+        if self.disc is None and self.samples.off_axis is None:
+            return fringes_of_one(self.samples, self.smearing)
+        n = len(self.samples)
+
+        def fill(out: FloatArray, place: FloatArray) -> None:
+            self._into(out[:n, None], out[n:, None], place[:1], place[1:])
+
+        return fill
+
+    def _into(
+        self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
+    ) -> None:
+        """Fill what `at` gives: dV/dc is ρDE − ρ_F V₀, not E − V₀, the flux in the cosine."""
+        fringes_into(cosine, sine, self.samples, east_mas, north_mas, self.smearing)
+        if self.disc is not None:
+            cosine *= self.disc
+            sine *= self.disc
+        if self.samples.off_axis is None:
+            return
+        fringe, flux = self.samples.off_axis.at((east_mas, north_mas))
+        turned = (cosine - 1j * sine) * fringe
+        cosine[...] = turned.real - (flux - 1.0) * self.star[:, None]
+        sine[...] = -turned.imag
 
 
 def dense_filter(

@@ -162,7 +162,7 @@ class GroupWeights:
         """Weighted sums (n, m) over the data of values (n_data, m)."""
         return self.of_sums(self.groups.sums(values))
 
-    def of(self, part: slice) -> GroupWeights:
+    def of(self, part: IntArray | slice) -> GroupWeights:
         """Weights of some of the data sets."""
         return GroupWeights(self.groups, self.weight[:, part])
 
@@ -209,10 +209,19 @@ class RunningMaximum:
         self.score = np.zeros(n, dtype=np.float32)
         self.position = np.zeros(n, dtype=np.intp)
 
-    def update(self, score: NDArray[np.floating], position: IntArray) -> None:
-        """Take the largest scores (n,) of some positions, and where they are, into account."""
-        better = score > self.score
-        self.score[better], self.position[better] = score[better], position[better]
+    def update(
+        self,
+        score: NDArray[np.floating],
+        position: IntArray,
+        which: IntArray | slice = slice(None),
+    ) -> None:
+        """Take the largest scores (n,) of some positions, and where they are, into account.
+
+        Of all data sets, or of n of them.
+        """
+        better = score > self.score[which]
+        at = np.arange(len(self.score))[which][better]
+        self.score[at], self.position[at] = score[better], position[better]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,37 +13,40 @@ one sparse matrix, and templates of the whole field span few numbers (`reduction
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from itertools import repeat
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.companion_search.grid import Grid, trial_rates
 from amibayes.companion_search.matched_filter import (
+    CompanionFringes,
     MatchedFilter,
     dense_filter,
     few,
-    fill_one,
     positive,
 )
 from amibayes.companion_search.reduction import Reduction, reduction_of
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.companion_search.templates import (
     BandTemplates,
+    CoarseTemplates,
     DataRows,
     MirroredTemplates,
     Templates,
-    at_both,
-    floored,
 )
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.linear_response import linear_response, nuisance_directions
-from amibayes.models.companion import fringes_into, fringes_of_one
+from amibayes.likelihood.linear_response import Part, linear_response, nuisance_directions
 from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
+
+
+MANY_ROWS = 128
+"""Numbers of data from which on products of matrices take longer than what is done with them."""
 
 
 class TemplateBank:
@@ -64,7 +67,7 @@ class TemplateBank:
 
     Notes
     -----
-    `scan`, `scan_at`, `templates_at` and `chunks` are those of a companion at rest, alike in
+    `scan`, `scan_at`, `templates_at` and `matches` are those of a companion at rest, alike in
     every band; `survey`, `largest_gain`, `matched_filter` and `by_band` those of the model.
     """
 
@@ -78,19 +81,20 @@ class TemplateBank:
     ) -> None:
         model, samples = likelihood.model, likelihood.samples
         self.grid = grid
-        self._kept: list[tuple[IntArray, FloatArray, Templates]] | None = None
+        self._kept: list[tuple[IntArray, FloatArray, MirroredTemplates]] | None = None
+        self._coarse: CoarseTemplates | None = None
         self.n_data = self.n_rows = likelihood.n_independent
         self.reduction: Reduction | None = None
         self.n_contrasts = model.n_contrasts
         self.rates_mas_yr = trial_rates(likelihood)
-        self._samples, self._smearing, self._moves = samples, model.smearing, model.moves
+        self._samples, self._moves = samples, model.moves
         self._bands = [samples.band[:, None] == b for b in range(model.n_contrasts)]
         self._years = samples.years(model.reference_mjd) if model.moves else np.zeros(len(samples))
         response = linear_response(likelihood, nuisance)
         self._even, self._odd, self._primary = response.even, response.odd, response.star
-        self._disc = None if (response.disc == 1.0).all() else response.disc[:, None]
+        self._fringes = CompanionFringes.of(samples, response, smearing=model.smearing)
         self._offset = response.offset
-        self._find_shared()
+        self._shared = _shared(self._even, self._odd)
         if beside is None:
             self.nuisance_basis = nuisance_directions(likelihood, nuisance)
         else:
@@ -119,10 +123,6 @@ class TemplateBank:
         """Whether a position and its opposite predict the same: without closure phases."""
         return not len(self._odd.rows)
 
-    def _find_shared(self) -> None:
-        rows = self._even.rows, self._odd.rows
-        _, self._even_shared, self._odd_shared = np.intersect1d(*rows, return_indices=True)
-
     def reduced(self, label: IntArray) -> Self:
         """Make the same in the combinations of the data that templates span, where these are few.
 
@@ -134,7 +134,7 @@ class TemplateBank:
         east, north = self.grid.east_mas[:half], self.grid.north_mas[:half]
 
         def templates(index: IntArray) -> FloatArray:
-            cosine, sine = self._waves_at(east[index], north[index])
+            cosine, sine = self._fringes.at(east[index], north[index])
             out = np.zeros((2, self.n_data, len(index)))
             out[0, self._even.rows] = self._even.matrix @ cosine - self._offset[:, None]
             out[1, self._odd.rows] = self._odd.matrix @ sine
@@ -144,11 +144,12 @@ class TemplateBank:
         if found is None:
             return self
         new = copy.copy(self)
-        new.reduction, new.n_rows, new._kept = found, len(found.label), None
+        new.reduction, new.n_rows = found, len(found.label)
+        new._kept = new._coarse = None
         new._even, new._offset = found.of_part(self._even, self._offset, self.n_data)
         new._odd, _ = found.of_part(self._odd, np.zeros(len(self._odd.rows)), self.n_data)
         new.nuisance_basis = found.combined(self.nuisance_basis)
-        new._find_shared()
+        new._shared = _shared(new._even, new._odd)
         return new
 
     def reduce(self, white: FloatArray) -> FloatArray:
@@ -179,7 +180,7 @@ class TemplateBank:
             t·r/t·t and 1/√(t·t), t the template without its nuisance part.
         """
         rows = self._rows(self.project(residuals)[:, None])
-        contrast, sigma = np.empty(len(self)), np.empty(len(self))
+        contrast, sigma = np.empty((2, len(self)))
         for index, _, templates in self._at_rest():
             sigma[index] = templates.sigma[0]
             contrast[index] = templates.match(rows)[0][0] * templates.sigma[0]
@@ -222,10 +223,23 @@ class TemplateBank:
             Where on the grid.
         """
         highest, rows = RunningMaximum(data.shape[1]), self._rows(data)
-        for index, _, templates in self.pieces():
-            gain, top = templates.highest(rows, weights)
-            highest.update(gain, index[top])
+        for (index, _, templates), some in zip(
+            self.pieces(), self._promising(rows, weights), strict=False
+        ):
+            gain, top = templates.highest(rows.at(some), weights and weights.of(some))
+            highest.update(gain, index[top], some)
         return np.asarray(highest.score, dtype=float), highest.position
+
+    def _promising(
+        self, rows: DataRows, weights: GroupWeights | None
+    ) -> Iterator[IntArray | slice]:
+        """Yield, for every piece, which data sets may have their largest gain in it."""
+        if self.joint or self.n_rows < MANY_ROWS or not self._fits:
+            return repeat(slice(None))
+        if self._coarse is None:
+            pieces = [(index, templates) for index, _, templates in self._at_rest()]
+            self._coarse = CoarseTemplates.of(pieces, self.grid)
+        return self._coarse.promising(rows, weights)
 
     def matched_filter(self, residuals: FloatArray) -> MatchedFilter:
         """Make a function (east, north in mas) → (contrasts and rates, gain), off the lattice.
@@ -235,7 +249,7 @@ class TemplateBank:
         data = self.project(residuals)
         if not self.joint and few(self.n_rows, len(self._samples)):
             response = self._even, self._odd, self._offset
-            return dense_filter(*response, self.nuisance_basis, data, self._one_wave())
+            return dense_filter(*response, self.nuisance_basis, data, self._fringes.of_one())
         rows = self._rows(data[:, None])
 
         def best(position: FloatArray) -> tuple[FloatArray, float]:
@@ -255,23 +269,30 @@ class TemplateBank:
     ) -> tuple[FloatArray, FloatArray]:
         """As `scan`, at any positions (m,), on the lattice or off it."""
         rows = self._rows(self.project(residuals)[:, None])
-        templates, m = self._mirrored(*self._waves_at(east_mas, north_mas)), len(east_mas)
+        templates, m = self._mirrored(*self._fringes.at(east_mas, north_mas)), len(east_mas)
         sigma = templates.sigma[0, :m]
         return templates.match(rows)[0][0, :m] * sigma, sigma
 
     def templates_at(self, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
         """Templates of unit norm (n_data, m) at any positions, on the lattice or off it."""
-        templates = self._mirrored(*self._waves_at(east_mas, north_mas)).laid_out()
+        templates = self._mirrored(*self._fringes.at(east_mas, north_mas)).laid_out()
         return np.asarray(templates / np.linalg.norm(templates, axis=0))
 
     def match_at(self, own: FloatArray, east_mas: FloatArray, north_mas: FloatArray) -> FloatArray:
         """Products of data (n_data, m), each with its one of `templates_at`, (m,)."""
-        return self._mirrored(*self._waves_at(east_mas, north_mas)).match_each(own)
+        return self._mirrored(*self._fringes.at(east_mas, north_mas)).match_each(own)
 
-    def chunks(self) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Yield positions (m,) and their templates of unit norm (n_data, m), all of the grid."""
+    def matches(
+        self, data: FloatArray | SingleArray, within_mas: float = np.inf
+    ) -> Iterator[tuple[IntArray, NDArray[Any]]]:
+        """Yield positions (m,) and products of data with their templates of unit norm, (n, m).
+
+        Data (n_data, n) are without nuisance directions. Positions farther out may be left out.
+        """
+        rows, separation = self._rows(data), np.hypot(*self.grid.places)
         for index, _, templates in self._at_rest():
-            yield index, templates.unit[0]
+            if separation[index].min() <= within_mas:
+                yield index, templates.match(rows)[0]
 
     def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield positions (m,) and templates of unit norm of each band (n_bands, n_data, m)."""
@@ -280,8 +301,9 @@ class TemplateBank:
 
     def _rows(self, data: FloatArray | SingleArray) -> DataRows:
         """Data sets (n_data, n) as rows."""
-        # Products take transposed matrices as they are.
-        return DataRows(data.T, data[self._even.rows].T, data[self._odd.rows].T)
+        # Rows one after the other, since some of them are picked out.
+        rows = np.ascontiguousarray(data.T)
+        return DataRows(rows, rows[:, self._even.rows], rows[:, self._odd.rows])
 
     def pieces(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
         """Yield positions (2m,), rates (2m, 2) and their templates in all bands."""
@@ -296,9 +318,14 @@ class TemplateBank:
                 both = np.concatenate([index, index + len(self.grid) // 2])
                 yield both, rates, self._in_bands(cosine, sine, mirrored=True)
 
-    def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
+    @property
+    def _fits(self) -> bool:
+        """Whether templates of the whole grid are kept."""
+        return len(self) * self.n_rows <= 2 * NUMBERS_KEPT
+
+    def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, MirroredTemplates]]:
         """Yield the same of companions at rest, alike in every band; made once where they fit."""
-        if len(self) * self.n_rows > 2 * NUMBERS_KEPT:
+        if not self._fits:
             yield from self._made()
             return
         if self._kept is None:
@@ -307,9 +334,9 @@ class TemplateBank:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave to every process to make its own templates."""
-        return self.__dict__ | {"_kept": None}
+        return self.__dict__ | {"_kept": None, "_coarse": None}
 
-    def _made(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
+    def _made(self) -> Iterator[tuple[IntArray, FloatArray, MirroredTemplates]]:
         half, still = len(self.grid) // 2, np.zeros((1, 2))
         for index, cosine, sine in self._half_plane():
             yield np.concatenate([index, index + half]), still, self._mirrored(cosine, sine)
@@ -317,41 +344,9 @@ class TemplateBank:
     def _at(self, position: FloatArray) -> Templates:
         """Templates of one place at all rates."""
         if not self.joint:
-            return self._mirrored(*self._waves_at(position[:1], position[1:]))
+            return self._mirrored(*self._fringes.at(position[:1], position[1:]))
         moved = position[:, None, None] + self.rates_mas_yr.T[:, None] * self._years[:, None]
-        return self._in_bands(*self._waves_at(*moved), mirrored=False)
-
-    def _waves_at(
-        self, east_mas: FloatArray, north_mas: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Cosine and sine, (n_samples, m), of places (m,) or of moving ones (n_samples, m)."""
-        cosine, sine = np.empty((2, len(self._samples), np.shape(east_mas)[-1]))
-        self._waves_into(cosine, sine, east_mas, north_mas)
-        return cosine, sine
-
-    def _one_wave(self) -> Callable[[FloatArray, FloatArray], None]:
-        """What `_waves_into` does, for one place (2,), cosines and sines in one array."""
-        if self._disc is None and self._samples.off_axis is None:
-            return fringes_of_one(self._samples, self._smearing)
-        return partial(fill_one, self._waves_into)
-
-    def _waves_into(
-        self, cosine: FloatArray, sine: FloatArray, east_mas: FloatArray, north_mas: FloatArray
-    ) -> None:
-        """Fill what `_waves_at` gives: fringes, the companion's disc, the response off the axis.
-
-        dV/dc = ρDE − ρ_F V₀ instead of E − V₀: the flux's part goes with the cosine.
-        """
-        fringes_into(cosine, sine, self._samples, east_mas, north_mas, self._smearing)
-        if self._disc is not None:
-            cosine *= self._disc
-            sine *= self._disc
-        if self._samples.off_axis is None:
-            return
-        fringe, flux = self._samples.off_axis.at((east_mas, north_mas))
-        turned = (cosine - 1j * sine) * fringe
-        cosine[...] = turned.real - (flux - 1.0) * self._primary[:, None]
-        sine[...] = -turned.imag
+        return self._in_bands(*self._fringes.at(*moved), mirrored=False)
 
     def _half_plane(
         self, drift: tuple[FloatArray, FloatArray] | None = None
@@ -365,26 +360,14 @@ class TemplateBank:
             east, north = places[:, index]
             if drift is not None:
                 east, north = east + drift[0][:, None], north + drift[1][:, None]
-            yield index, *self._waves_at(east, north)
+            yield index, *self._fringes.at(east, north)
 
     def _mirrored(self, cosine: FloatArray, sine: FloatArray) -> MirroredTemplates:
         """Templates of one contrast at places and at their mirror images."""
         even = self._even.matrix @ cosine - self._offset[:, None]
         odd = self._odd.matrix @ sine
         rows = self._even.rows, self._odd.rows
-        return MirroredTemplates(even, odd, *rows, self._norm(even, odd), self.nuisance_basis)
-
-    def _norm(self, even: FloatArray, odd: FloatArray) -> FloatArray:
-        """t·t at positions and their mirror images, (2m,), without the nuisance part."""
-        norm = np.einsum("dm,dm->m", even, even) + np.einsum("dm,dm->m", odd, odd)
-        i, j = self._even_shared, self._odd_shared
-        cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(i) else 0.0 * norm
-        both = at_both(norm, cross)
-        if self.nuisance_basis.size:
-            basis = self.nuisance_basis
-            along = at_both(basis[self._even.rows].T @ even, basis[self._odd.rows].T @ odd)
-            return floored(both - (along**2).sum(axis=0), both)
-        return floored(both, both)
+        return MirroredTemplates.of(even, odd, rows, self._shared, self.nuisance_basis)
 
     def _in_bands(self, cosine: FloatArray, sine: FloatArray, *, mirrored: bool) -> BandTemplates:
         """Templates of each band at places and, with ``mirrored``, at their mirror images."""
@@ -396,5 +379,10 @@ class TemplateBank:
             odd = self._odd.matrix @ np.where(here, sine, 0.0)
             template[self._even.rows] = np.tile(even, len(signs))
             template[self._odd.rows] += np.hstack([sign * odd for sign in signs])
-        along = np.einsum("dk,bdm->bkm", self.nuisance_basis, out)
-        return BandTemplates(out - np.einsum("dk,bkm->bdm", self.nuisance_basis, along))
+        return BandTemplates.beside(out, self.nuisance_basis)
+
+
+def _shared(even: Part, odd: Part) -> tuple[IntArray, IntArray]:
+    """Which rows of each part are data that the other touches too."""
+    _, *both = np.intersect1d(even.rows, odd.rows, return_indices=True)
+    return both[0], both[1]

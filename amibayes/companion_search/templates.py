@@ -7,20 +7,21 @@ contrasts of their own there is one template of each band.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amibayes.companion_search.grid import Grid
 from amibayes.companion_search.scan import (
     GroupWeights,
     ScaleGroups,
     best_positive,
     weighted_gain,
 )
-from amibayes.units import FloatArray, IntArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 UNCOUPLED = 1e-6
 """Correlation of templates below which bands are each for themselves."""
@@ -37,6 +38,10 @@ class DataRows:
     every: NDArray[Any]
     even: NDArray[Any]
     odd: NDArray[Any]
+
+    def at(self, which: IntArray | slice) -> DataRows:
+        """Some of the data sets."""
+        return DataRows(self.every[which], self.even[which], self.odd[which])
 
 
 Highest = tuple[NDArray[Any], IntArray]
@@ -104,6 +109,12 @@ class BandTemplates:
         shared = {(a, b): np.einsum("dm,dm->m", self._unit[a], self._unit[b]) for a, b in pairs}
         self._shared = {p: s for p, s in shared.items() if np.abs(s).max() > UNCOUPLED}
 
+    @classmethod
+    def beside(cls, templates: FloatArray, basis: FloatArray) -> BandTemplates:
+        """Make them of templates that have the directions (n_data, k) of ``basis`` in them."""
+        along = np.einsum("dk,bdm->bkm", basis, templates)
+        return cls(templates - np.einsum("dk,bkm->bdm", basis, along))
+
     @property
     def unit(self) -> FloatArray:
         """Templates of unit length, (n_bands, n_data, m)."""
@@ -156,6 +167,25 @@ class MirroredTemplates:
     basis: FloatArray
     squares: dict[int, tuple[ScaleGroups, FloatArray]] = field(default_factory=dict)
 
+    @classmethod
+    def of(
+        cls,
+        even: FloatArray,
+        odd: FloatArray,
+        rows: tuple[IntArray, IntArray],
+        shared: tuple[IntArray, IntArray],
+        basis: FloatArray,
+    ) -> MirroredTemplates:
+        """Make them of their parts; ``shared`` are rows of each with data of the other."""
+        norm = np.einsum("dm,dm->m", even, even) + np.einsum("dm,dm->m", odd, odd)
+        i, j = shared
+        cross = 2.0 * np.einsum("dm,dm->m", even[i], odd[j]) if len(i) else 0.0 * norm
+        both = left = at_both(norm, cross)
+        if basis.size:
+            along = at_both(basis[rows[0]].T @ even, basis[rows[1]].T @ odd)
+            left = both - (along**2).sum(axis=0)
+        return cls(even, odd, *rows, floored(left, both), basis)
+
     @property
     def sigma(self) -> FloatArray:
         """Error of the contrast, 1/length, (1, 2m)."""
@@ -203,34 +233,100 @@ class MirroredTemplates:
         """Contrast that gains most, not below zero."""
         return best_positive(match, {})
 
-    def highest(self, data: DataRows, weights: GroupWeights | None = None) -> Highest:
-        """Largest gain in χ² of every data set.
+    @classmethod
+    def joined(cls, parts: Sequence[tuple[MirroredTemplates, BoolArray]]) -> MirroredTemplates:
+        """Some positions (m,) of each of several, as one."""
+        first = parts[0][0]
+        even, odd = (
+            np.hstack([getattr(t, name)[:, chosen] for t, chosen in parts])
+            for name in ("even", "odd")
+        )
+        halves = [(np.split(t.norm, 2), chosen) for t, chosen in parts]
+        norm = np.concatenate([half[k][chosen] for k in (0, 1) for half, chosen in halves])
+        return cls(even, odd, first.even_rows, first.odd_rows, norm, first.basis)
 
-        Where a position and its mirror image have templates of equal length, the sign of the
-        odd part's product says which of them gains more: half of the scores are not needed.
-        """
-        squares = self.norm[None] if weights is None else self._squares(weights.groups)
-        here, mirrored = np.split(squares, 2, axis=1)
-        if (np.abs(here - mirrored) > EQUAL * mirrored).any():
-            gain = np.maximum(self.match(data)[0], 0.0) ** 2
-            if weights is not None:
-                gain *= self.norm.astype(gain.dtype) / weights.of_sums(squares)
-            return highest_of(gain)
-        half = here.shape[1]
-        length = np.sqrt(here) if weights is None else 1.0
-        even, odd = ((x / length).astype(data.every.dtype) for x in (self.even, self.odd))
-        n, found = len(data.every), []
-        at_once = max(SCORES_AT_ONCE // max(half, 1), data.every.shape[1])
-        for rows in (slice(k, k + at_once) for k in range(0, n, at_once)):
-            score, turned = data.even[rows] @ even, data.odd[rows] @ odd
-            score += np.abs(turned)
-            if weights is not None:
-                score /= np.sqrt(weights.of(rows).of_sums(here))
+    def highest(self, data: DataRows, weights: GroupWeights | None = None) -> Highest:
+        """Largest gain in χ² of every data set."""
+        half = self.even.shape[1]
+        found = [(np.empty(0, dtype=data.every.dtype), np.empty(0, dtype=np.intp))]
+        for score, turned in self._roots(data, weights):
             root, top = highest_of(score)
             mirror = turned[np.arange(len(top)), top] < 0.0
             found.append((np.maximum(root, 0.0) ** 2, top + half * mirror))
         gains, tops = zip(*found, strict=True)
         return np.concatenate(gains), np.concatenate(tops)
+
+    def best_of_parts(
+        self, data: DataRows, weights: GroupWeights | None, first: IntArray
+    ) -> NDArray[Any]:
+        """Roots of the largest gains within runs of positions from ``first`` (k,) on, (n, k)."""
+        roots = self._roots(data, weights)
+        return np.concatenate([np.maximum.reduceat(score, first, axis=1) for score, _ in roots])
+
+    def _roots(
+        self, data: DataRows, weights: GroupWeights | None
+    ) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+        """Yield roots of the gains at positions or mirror images, whichever gains more, (n, m).
+
+        Below zero where neither gains; and numbers (n, m) below zero where it is the mirror
+        image. Where both have templates of equal length, that is the odd part's product, and
+        half of the scores are not needed.
+        """
+        squares = self.norm[None] if weights is None else self._squares(weights.groups)
+        here, mirrored = np.split(squares, 2, axis=1)
+        equal = bool((np.abs(here - mirrored) <= EQUAL * mirrored).all())
+        length = np.sqrt(here) if weights is None and equal else 1.0
+        even, odd = ((x / length).astype(data.every.dtype) for x in (self.even, self.odd))
+        at_once = max(SCORES_AT_ONCE // max(here.shape[1], 1), data.every.shape[1])
+        for part in (slice(k, k + at_once) for k in range(0, len(data.every), at_once)):
+            some = None if weights is None else weights.of(part)
+            score, turned = data.even[part] @ even, data.odd[part] @ odd
+            if not equal:
+                both = [score + turned, score - turned]
+                for x, square in zip(both, (here, mirrored), strict=True):
+                    x /= np.sqrt(square if some is None else some.of_sums(square)).astype(x.dtype)
+                yield np.maximum(*both), both[0] - both[1]
+                continue
+            score += np.abs(turned)
+            if some is not None:
+                score /= np.sqrt(some.of_sums(here))
+            yield score, turned
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseTemplates:
+    """Templates at every second position along each axis, tile by tile of a lattice.
+
+    Positions of the lattice are λ/8B apart, so that the largest gain lies beside one of these
+    that is nearly the best. Where it does not (`NEARLY`) another is taken, some per cent
+    smaller, in data and in null sets alike.
+
+    Parameters
+    ----------
+    templates : MirroredTemplates
+    first : (n_tiles,) int array
+        Where each tile begins.
+    """
+
+    templates: MirroredTemplates
+    first: IntArray
+
+    @classmethod
+    def of(cls, tiles: Sequence[tuple[IntArray, MirroredTemplates]], grid: Grid) -> CoarseTemplates:
+        """Take them from those at all positions, of tiles and then their mirror images."""
+        parts = [(t, grid.coarse(index[: len(index) // 2])) for index, t in tiles]
+        sizes = np.array([int(chosen.sum()) for _, chosen in parts])
+        return cls(MirroredTemplates.joined(parts), np.cumsum(sizes) - sizes)
+
+    def promising(self, data: DataRows, weights: GroupWeights | None) -> Iterator[IntArray]:
+        """Yield, for every tile, which data sets may have their largest gain in it."""
+        best = self.templates.best_of_parts(data, weights, self.first)
+        return map(np.flatnonzero, (best >= NEARLY * best.max(axis=1, keepdims=True)).T)
+
+
+NEARLY = 0.8
+"""Best coarse score of a tile, as part of the best of all, from which on all of it is looked at: of
+100 data sets of noise one has its largest gain elsewhere."""
 
 
 EQUAL = 1e-9

@@ -99,8 +99,7 @@ def _best_inward(
     radius, grid = np.hypot(*places.T)[:, None], bank.grid
     best = [(np.zeros(len(places)), np.zeros(len(places), dtype=np.intp)) for _ in range(2)]
     each, every = np.arange(len(places)), grid.places
-    for index, templates in bank.chunks():
-        match = own.T @ templates.astype(np.float32)
+    for index, match in bank.matches(own, float(radius.max(initial=0.0)) + grid.step_mas):
         east, north = every[:, index]
         match[_same_place(bank, fringe_mas, places, east, north)] = 0.0
         inward = (radius - np.hypot(east, north)) / grid.step_mas

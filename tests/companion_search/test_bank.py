@@ -12,7 +12,7 @@ from scipy import stats
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.scan import GroupWeights, ScaleGroups
-from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.companion_search.template_bank import MANY_ROWS, TemplateBank
 from amibayes.data.covariance import dense_covariance
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -36,7 +36,7 @@ def test_templates_are_the_derivative_of_the_model(model, kinds, rng) -> None:
     bank = TemplateBank(likelihood, make_grid(40.0, 400.0, 35.0), nuisance)
     step, free = 1e-6, np.linalg.qr(likelihood.jacobian([100.0, 0.0, 0.0, *nuisance])[:, 3:])[0]
     seen = np.zeros(len(bank), dtype=int)
-    for index, templates in bank.chunks():
+    for index, (templates,) in bank.by_band():
         seen[index] += 1
         east, north = bank.grid.east_mas[index], bank.grid.north_mas[index]
         theta = np.column_stack([east, north, np.zeros(len(index))])
@@ -99,6 +99,39 @@ def test_largest_gain_is_that_of_templates_laid_out(mixed: bool, weighted: bool,
         every[:, index] = match**2 / (weight.T @ units[0] ** 2)
     np.testing.assert_allclose(gain, every.max(axis=1), rtol=1e-4)
     np.testing.assert_allclose(every[np.arange(90), position], gain, rtol=1e-4)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_every_second_position_leads_to_the_largest_gain(weighted: bool, rng) -> None:
+    """Of many data; where it leads elsewhere the gain is smaller, and what is large is found."""
+    likelihood = Likelihood(niriss(channels=5))
+    bank = TemplateBank(likelihood, make_grid(60.0, 600.0, 23.0), np.empty(0))
+    assert bank.n_data >= MANY_ROWS
+    groups = ScaleGroups(np.arange(bank.n_data) % 2, 1.0)
+    amount = rng.uniform(0.5, 2.0, (2, 500)) if weighted else np.ones((2, 500))
+    weight = amount[groups.label]
+    rows = weight * rng.standard_normal((bank.n_data, 500))
+    weights = GroupWeights(groups, amount) if weighted else None
+    gain, position = bank.largest_gain(rows.astype(np.float32), weights)
+    every = np.zeros((500, len(bank)))
+    for index, units in bank.by_band():
+        every[:, index] = np.maximum(rows.T @ units[0], 0.0) ** 2 / (weight.T @ units[0] ** 2)
+    np.testing.assert_allclose(every[np.arange(500), position], gain, rtol=1e-3)
+    largest = every.max(axis=1)
+    missed = gain < 0.999 * largest
+    # One of a hundred is to be expected: 21 of 500 with a probability below 1e-6.
+    assert 0 < missed.sum() <= 20
+    assert not missed[np.argsort(largest)[-50:]].any()
+
+
+def test_tiles_have_a_coarse_position_beside_every_position() -> None:
+    grid = make_grid(40.0, 300.0, 9.0)
+    tiles = grid.half_plane(900)
+    assert sorted(np.concatenate(tiles)) == list(range(len(grid) // 2))
+    for tile in tiles:
+        coarse = tile[grid.coarse(tile)]
+        far = [np.abs(x[tile][:, None] - x[coarse]) for x in (grid.rows, grid.columns)]
+        assert (np.maximum(*far).min(axis=1) <= 1).all()
 
 
 def test_grid_fills_the_annulus_and_mirrors_itself() -> None:

@@ -241,7 +241,7 @@ def test_kinds_are_weighed_by_their_own_scatter(rng) -> None:
     bank = test.bank
     white = rng.standard_normal((36, 4)) * np.repeat([1.0, 0.2], [21, 15])[:, None]
     found = test.evaluate(white)
-    templates = np.hstack([units for _, units in bank.chunks()])
+    templates = np.hstack([units for _, (units,) in bank.by_band()])
     residual, count = bank.project(white), np.array([21.0, 15.0]) * 35.0 / 36.0
     for k in range(4):
         r = residual[:, k]

@@ -108,7 +108,7 @@ def test_companion_with_disc_and_colour_against_a_sum_over_points() -> None:
 def test_templates_are_derivatives_of_the_model(model, rng) -> None:
     likelihood = Likelihood(simulated(vlti(), [2.0, 2.0, 0.0], rng), model)
     bank = TemplateBank(likelihood, make_grid(1.0, 8.0, 0.9), np.empty(0))
-    for index, templates in bank.chunks():
+    for index, (templates,) in bank.by_band():
         east, north = bank.grid.east_mas[index], bank.grid.north_mas[index]
         theta = np.column_stack([east, north, np.zeros(len(index))])
         step = np.array([0.0, 0.0, 1e-6])
