@@ -47,7 +47,8 @@ from amibayes.ramps.fit import fit_migration
 from amibayes.scene.sources import Point, Scene
 from amibayes.simulation.detector import Detector, draw_maps
 from amibayes.simulation.exposure import Exposure
-from amibayes.simulation.observe import Observation, open_shutter, ramp_path, write_exposure
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import prepare_exposure, ramp_path, write_exposure
 from amibayes.units import MAS, FloatArray
 
 SHIFT, PEAK_E, N_GROUPS = 3.6e-7, 28_000.0, 8
@@ -86,8 +87,8 @@ def exposed(
     exposure = Exposure(n_groups, n_int, keep_ramps=True, **pointing)
     observation = Observation(scene, INSTRUMENT, exposure, detector, count_rate_e_s=rate)
     maps = draw_maps(detector, (80, 80), np.random.default_rng(seed[0]))
-    shutter = open_shutter(observation, np.random.SeedSequence(list(seed)), maps)
-    write_exposure(path, shutter, SerialExecutor())
+    prepared = prepare_exposure(observation, np.random.SeedSequence(list(seed)), maps)
+    write_exposure(path, prepared, SerialExecutor())
     return path
 
 

@@ -28,7 +28,8 @@ from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Point, Scene
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
-from amibayes.simulation.observe import Observation, open_shutter, write_exposure
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import prepare_exposure, write_exposure
 from amibayes.units import DEGREE, MAS, FloatArray
 from benchmarks import peers
 from benchmarks.statements import errors_of, searched
@@ -82,9 +83,11 @@ class Visit:
                 count_rate_e_s=RATE_E_S,
                 notes={"IS_PSF": bool(k)},
             )
-            shutter = open_shutter(observation, np.random.SeedSequence([self.seed, 2, k]), maps)
+            prepared = prepare_exposure(
+                observation, np.random.SeedSequence([self.seed, 2, k]), maps
+            )
             paths.append(folder / f"{name}_calints.fits")
-            write_exposure(paths[-1], shutter, SerialExecutor())
+            write_exposure(paths[-1], prepared, SerialExecutor())
         return paths
 
 

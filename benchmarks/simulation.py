@@ -40,10 +40,10 @@ def megabytes() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def draws_alone_s(shutter: PreparedExposure, n: int) -> tuple[float, float]:
+def draws_alone_s(prepared: PreparedExposure, n: int) -> tuple[float, float]:
     """Seconds of one core for the Poisson and normal numbers of n integrations."""
-    detector = shutter.observation.detector
-    light = shutter.recorder.light(shutter.pointings.jitter_px[:32]) * detector.frame_time_s
+    detector = prepared.observation.detector
+    light = prepared.recorder.light(prepared.pointings.jitter_px[:32]) * detector.frame_time_s
     rng = np.random.default_rng(1)
     start = time.perf_counter()
     for _ in range(21):
@@ -65,13 +65,13 @@ def main() -> None:
         before, contents = megabytes(), []
         for workers in (1, 2):
             start = time.perf_counter()
-            _, shutter = next(read_program(scene).shutters(seed=1))
+            _, prepared = next(read_program(scene).prepared_exposures(seed=1))
             path = Path(folder) / f"{workers}.fits"
             with open_executor(workers) as executor:
-                write_exposure(path, shutter, executor)
+                write_exposure(path, prepared, executor)
             took = time.perf_counter() - start
             beyond = megabytes() - before
-            poisson, normal = draws_alone_s(shutter, n)
+            poisson, normal = draws_alone_s(prepared, n)
             contents.append(sha256(path))
             print(
                 f"{workers} workers: {took:.1f} s, {n / took:.0f} integrations/s, "

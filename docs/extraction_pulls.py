@@ -31,7 +31,8 @@ from amibayes.extraction.response import pointing_response, star_image
 from amibayes.parallel import SerialExecutor
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
-from amibayes.simulation.observe import Observation, PreparedExposure, blank_cube, open_shutter
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import PreparedExposure, blank_cube, prepare_exposure
 from amibayes.units import MAS, FloatArray
 
 N_INTEGRATIONS, N_GROUPS, N_PAIRS = 20, 14, 32
@@ -79,16 +80,16 @@ def pair(
     )
     maps, *exposures = np.random.SeedSequence(seed).spawn(3)
     drawn = draw_maps(detector, (80, 80), np.random.default_rng(maps))
-    return [taken(open_shutter(observation, child, drawn)) for child in exposures]
+    return [taken(prepare_exposure(observation, child, drawn)) for child in exposures]
 
 
-def taken(shutter: PreparedExposure) -> Cube:
+def taken(prepared: PreparedExposure) -> Cube:
     """The exposure in memory."""
-    chunks = list(shutter.take(SerialExecutor()))
+    chunks = list(prepared.take(SerialExecutor()))
     images, error, dq = (
         np.concatenate([getattr(c, name) for c in chunks]) for name in ("images", "error", "dq")
     )
-    return replace(blank_cube(shutter), images=images, error=error, dq=dq)
+    return replace(blank_cube(prepared), images=images, error=error, dq=dq)
 
 
 def first_order(quiet: Extraction, cube: Cube, noisy: FloatArray) -> FloatArray:

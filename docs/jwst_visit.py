@@ -22,7 +22,8 @@ from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Point, Scene
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
-from amibayes.simulation.observe import Observation, PreparedExposure, open_shutter
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import PreparedExposure, prepare_exposure
 from amibayes.simulation.wavefront import WavefrontErrors
 from amibayes.units import DEGREE, MAS, offset
 
@@ -73,7 +74,7 @@ def write_visit(
         drift, own = seed.spawn(2)
         exposure = Exposure(n_groups, n_integrations, n_pixels=n_pixels, keep_ramps=True)
         seen = replace(_observation(pointed, exposure), wavefront=ERRORS.drifted(shared, 7, drift))
-        _write(folder, pointed, open_shutter(seen, own, maps), raw=number == 0)
+        _write(folder, pointed, prepare_exposure(seen, own, maps), raw=number == 0)
 
 
 def _observation(pointed: Pointed, exposure: Exposure) -> Observation:
@@ -89,41 +90,41 @@ def _observation(pointed: Pointed, exposure: Exposure) -> Observation:
     )
 
 
-def _write(folder: Path, pointed: Pointed, shutter: PreparedExposure, raw: bool) -> None:
+def _write(folder: Path, pointed: Pointed, prepared: PreparedExposure, raw: bool) -> None:
     from amibayes.parallel import SerialExecutor
 
-    chunks = list(shutter.take(SerialExecutor()))
+    chunks = list(prepared.take(SerialExecutor()))
     images, error, dq, ramps = (
         np.concatenate([getattr(c, name) for c in chunks])
         for name in ("images", "error", "dq", "ramps")
     )
-    times = _int_times(shutter.observation)
+    times = _int_times(prepared.observation)
     ramps = ramps / GAIN_E_DN
     parts = {"SCI": ramps, "GROUPDQ": np.zeros(ramps.shape, np.uint8)}
     parts["PIXELDQ"] = np.bitwise_or.reduce(dq, axis=0)
-    _save(folder / f"{pointed.stem}_ramp.fits", pointed, shutter, parts, "DN", times)
+    _save(folder / f"{pointed.stem}_ramp.fits", pointed, prepared, parts, "DN", times)
     slopes = {"SCI": images / GAIN_E_DN, "ERR": error / GAIN_E_DN, "DQ": dq}
-    _save(folder / f"{pointed.stem}_calints.fits", pointed, shutter, slopes, "DN/s", times)
+    _save(folder / f"{pointed.stem}_calints.fits", pointed, prepared, slopes, "DN/s", times)
     if raw:
         counts = np.clip(np.rint(ramps + BIAS_DN), 0, 65535).astype(np.uint16)
         path = folder / f"{pointed.stem}_uncal.fits"
-        _save(path, pointed, shutter, {"SCI": counts}, "DN", times)
+        _save(path, pointed, prepared, {"SCI": counts}, "DN", times)
 
 
 def _save(
     path: Path,
     pointed: Pointed,
-    shutter: PreparedExposure,
+    prepared: PreparedExposure,
     parts: dict[str, Any],
     unit: str,
     times: Any,
 ) -> None:
     hdus: list[Any] = [fits.PrimaryHDU()]
-    hdus[0].header.update(_primary(path, pointed, shutter.observation))
+    hdus[0].header.update(_primary(path, pointed, prepared.observation))
     for name, array in parts.items():
         kept = array.astype(np.float32) if array.dtype.kind == "f" else array
         hdus.append(fits.ImageHDU(kept, name=name))
-    hdus[1].header.update({"BUNIT": unit} | _wcs(pointed, shutter.observation))
+    hdus[1].header.update({"BUNIT": unit} | _wcs(pointed, prepared.observation))
     fits.HDUList([*hdus, times]).writeto(path, overwrite=True)
 
 

@@ -23,7 +23,8 @@ from amibayes.calibration import bin_channels
 from amibayes.companion_search.optimise import fit_single, single_likelihood
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import diagonal_covariance
-from amibayes.data.observables import Measurements, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import join
 from amibayes.extraction.reading import read_observations
 from amibayes.pipeline.options import SearchOptions
 

@@ -18,7 +18,9 @@ from amibayes.data.covariance import (
     diagonal_covariance,
     stack_covariances,
 )
-from amibayes.data.observables import Measurements, Observables, Setup
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
+from amibayes.data.setup import Setup
 
 
 def table(name: str, columns: dict[str, tuple[str, Any, str]], **keywords: Any) -> Any:

@@ -15,14 +15,9 @@ from scipy.sparse import block_diag, coo_array, csr_array, triu
 
 from amibayes.calibration.transfer import wrapped
 from amibayes.data.closure import canonical, canonical_uv
-from amibayes.data.observables import (
-    DAY_S,
-    SIMULTANEOUS_S,
-    Measurements,
-    Observables,
-    Setup,
-    closure_sets,
-)
+from amibayes.data.measurements import DAY_S, SIMULTANEOUS_S, Measurements
+from amibayes.data.observables import Observables
+from amibayes.data.setup import Setup
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
 from amibayes.oifits.correlations import Pairs, given_covariance
@@ -190,7 +185,7 @@ def _weights(observables: Observables) -> tuple[FloatArray, FloatArray]:
     vis2, closure = (np.nan_to_num(sigma, nan=np.inf) for sigma in observables.errors)
     shared = np.zeros(len(closure))
     used = np.flatnonzero(~observables.closure_phase.flag)
-    for entries in closure_sets(observables.closure_phase.select(used)):
+    for entries in observables.closure_phase.select(used).sets:
         shared[used[entries]] = 1.0 / (closure[used[entries]] ** 2).mean()
     return 1.0 / vis2**2, shared
 

@@ -14,7 +14,9 @@ import numpy as np
 
 from amibayes.data.closure import canonical
 from amibayes.data.kernel_model import stands_alone
-from amibayes.data.observables import Measurements, Observables, Setup
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
+from amibayes.data.setup import Setup
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 SAME_CHANNEL = 0.1

@@ -9,7 +9,7 @@ import numpy as np
 
 from amibayes.calibration.scatter_likelihood import Population
 from amibayes.errors import RunError
-from amibayes.support.ensemble_moves import leaps_of
+from amibayes.support.ensemble_moves import independence_move
 from amibayes.units import FloatArray, IntArray
 
 LOWEST, HIGHEST = 0.01, 3.0
@@ -172,7 +172,10 @@ def sample_tau(grid: ScatterGrid, rng: np.random.Generator) -> FloatArray:
     older = np.random.RandomState(np.random.MT19937(rng.integers(2**63)))
     start = grid.draw(older, N_WALKERS)
     sampler = emcee.EnsembleSampler(
-        *start.shape, grid.log_prob, vectorize=True, moves=emcee.moves.MHMove(leaps_of(grid))
+        *start.shape,
+        grid.log_prob,
+        vectorize=True,
+        moves=emcee.moves.MHMove(independence_move(grid)),
     )
     state = emcee.State(start, random_state=older.get_state())
     time = np.inf

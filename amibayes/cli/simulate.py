@@ -80,7 +80,7 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
     from amibayes.support.atomic_files import output_folder
     from amibayes.support.request import digest
 
-    names = [shot.file_name for shot in program.shots]
+    names = [spec.file_name for spec in program.specs]
     names += [ramp_path(Path(n)).name for n in names if program.keeps_ramps]
     overwrite = arguments.overwrite or arguments.resume
     folder = output_folder(arguments.out, names, overwrite=overwrite)
@@ -88,18 +88,18 @@ def observe(arguments: argparse.Namespace, program: Program) -> list[dict[str, A
     journals = Journals(folder / JOURNAL, key, resume=arguments.resume)
     done = []
     with executor_of(arguments) as executor, naming_source(arguments.scene):
-        for shot, shutter in program.shutters(arguments.seed):
-            path = folder / shot.file_name
-            with progress_of(arguments, shot.name, unit="integration") as progress:
-                take(path, shutter, executor, program.history, progress, journals)
-            done.append(described(shot, shutter, path))
+        for spec, prepared in program.prepared_exposures(arguments.seed):
+            path = folder / spec.file_name
+            with progress_of(arguments, spec.name, unit="integration") as progress:
+                take(path, prepared, executor, program.history, progress, journals)
+            done.append(described(spec, prepared, path))
     journals.remove()
     return done
 
 
 def take(
     path: Path,
-    shutter: PreparedExposure,
+    prepared: PreparedExposure,
     executor: Executor,
     history: tuple[str, ...],
     progress: Progress,
@@ -112,21 +112,21 @@ def take(
     if finished.read(0) is not None and path.is_file():
         return
     pieces = journals.of(path.stem)
-    write_exposure(path, shutter, executor, history=history, progress=progress, journal=pieces)
+    write_exposure(path, prepared, executor, history=history, progress=progress, journal=pieces)
     finished.write(0, {"finished": True})
     pieces.remove()
 
 
-def described(shot: ExposureSpec, shutter: PreparedExposure, path: Path) -> dict[str, Any]:
+def described(spec: ExposureSpec, prepared: PreparedExposure, path: Path) -> dict[str, Any]:
     """Describe an exposure in plain numbers."""
     import numpy as np
 
     from amibayes.units import MAS
 
-    observation, exposure = shutter.observation, shutter.observation.exposure
+    observation, exposure = prepared.observation, prepared.observation.exposure
     pixel = observation.instrument.pixel_scale_rad / MAS
     ramp = exposure.n_groups * observation.detector.frame_time_s
-    rate = shutter.recorder.rate_e_s
+    rate = prepared.recorder.rate_e_s
     return {
         "path": str(path),
         "name": observation.scene.name,
@@ -138,7 +138,7 @@ def described(shot: ExposureSpec, shutter: PreparedExposure, path: Path) -> dict
         "count_rate_e_s": rate,
         "total_photons": rate * observation.scene.flux * ramp * exposure.n_integrations,
         "position_angle_deg": float(np.degrees(observation.orientation.position_angle_rad)),
-        "dither_mas": (shutter.pointings.dither_px * pixel).tolist(),
+        "dither_mas": (prepared.pointings.dither_px * pixel).tolist(),
     }
 
 

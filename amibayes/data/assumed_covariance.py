@@ -11,7 +11,8 @@ from amibayes.data.covariance import (
     diagonal_covariance,
     stack_covariances,
 )
-from amibayes.data.observables import CovarianceKind, Measurements, closure_sets
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import CovarianceKind
 from amibayes.units import FloatArray, IntArray
 
 
@@ -26,7 +27,7 @@ def kernel_blocks(closure_phase: Measurements, sigma: FloatArray) -> list[Block]
         Errors in radians.
     """
     by_topology: dict[bytes, list[IntArray]] = {}
-    for entries in closure_sets(closure_phase):
+    for entries in closure_phase.sets:
         key = closure_phase.stations[entries].tobytes()
         by_topology.setdefault(key, []).append(entries)
     blocks = []

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.data.observables import join as joined
 from amibayes.errors import UsageError
 from amibayes.support.arguments import checks_arguments

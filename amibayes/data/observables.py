@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -11,105 +11,22 @@ import numpy as np
 from astropy.table import QTable
 from scipy.sparse import csr_array
 
-from amibayes.data.closure import closure_matrix
 from amibayes.data.covariance import BlockCovariance, stack_covariances
 from amibayes.data.degrees_of_freedom import Freedom, stacked_freedom, stacked_scatter
 from amibayes.data.kernel_model import stands_alone
+from amibayes.data.measurements import Measurements
 from amibayes.data.setup import Setup
 from amibayes.data.shared_errors import SharedErrors, joined_errors, vis2_first, with_shared
-from amibayes.data.tables import observables_html, observables_table
+from amibayes.data.tables import measurements_table
 from amibayes.errors import DataError
-from amibayes.units import BoolArray, FloatArray, IntArray, freeze
-
-__all__ = ["CovarianceKind", "Measurements", "Observables", "Setup", "closure_sets", "join"]
+from amibayes.support.arguments import one_of
+from amibayes.support.notebook import html_table
+from amibayes.units import BoolArray, FloatArray
 
 CovarianceKind = Literal["diagonal", "assumed", "given", "estimated"]
 
-SIMULTANEOUS_S = 17.0
-"""Rows of one setup nearer in time than this, or than they were integrated, go together."""
-
-DAY_S = 86400.0
-
-
-@dataclass(frozen=True, eq=False)
-class Measurements:
-    """Numbers of one kind, squared visibilities or closure phases, one entry per number.
-
-    Parameters
-    ----------
-    value : (n,) float array
-        V² (dimensionless) or closure phase (radians).
-    u_m, v_m : (n, k) float array
-        Metres; k = 1 for V², 2 for closure phases (first two baselines of the triangle,
-        the third closes it: V(1)·V(2)·V*(1+2)).
-    wavelength_m, band_m : (n,) float array
-    mjd, integration_s : (n,) float array
-    stations : (n, k + 1) int array
-        Positions in `Setup.stations`.
-    setup, row, channel : (n,) int array
-        Which `Setup`, which table row and which spectral channel each entry comes from.
-    flag : (n,) bool array
-        True where the number must not be used.
-    expected : (n,) float array, optional
-        The same numbers as a fit has them. A gain that channels share is in proportion to these:
-        measured ones have noise, and would draw fits towards zero (Peelle's puzzle).
-    coherent_slope : (n,) float array, optional
-        Root-mean-square change by an error of 1 in the complex visibility of each point:
-        2|V| of V², √Σ 1/|V|² (radians) of closure phases, V as a fit has it.
-    """
-
-    value: FloatArray
-    u_m: FloatArray
-    v_m: FloatArray
-    wavelength_m: FloatArray
-    band_m: FloatArray
-    mjd: FloatArray
-    integration_s: FloatArray
-    stations: IntArray
-    setup: IntArray
-    row: IntArray
-    channel: IntArray
-    flag: BoolArray
-    expected: FloatArray | None = None
-    coherent_slope: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            column = getattr(self, field.name)
-            if column is not None and len(column) != len(self.value):
-                raise ValueError(f"{field.name} has another length than value")
-        freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.value)
-
-    def select(self, keep: IntArray | BoolArray) -> Measurements:
-        """The entries ``keep``, in that order."""
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        present = {name: column[keep] for name, column in columns.items() if column is not None}
-        return Measurements(**present)
-
-    @cached_property
-    def sets(self) -> tuple[IntArray, ...]:
-        """Of closure phases: the entries of each exposure and channel, which share baselines."""
-        if not len(self):
-            return ()
-        key = np.stack([exposure_labels(self), self.channel], axis=1)
-        order = np.lexsort((self.row, key[:, 1], key[:, 0]))
-        cuts = np.flatnonzero(np.any(np.diff(key[order], axis=0) != 0, axis=1)) + 1
-        return tuple(np.split(order, cuts))
-
-    @cached_property
-    def shared_noise(self) -> csr_array:
-        """Covariance K Kᵀ/3 of closure phases whose baseline phases have variance 1/3 each."""
-        rows, columns, values = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0)]
-        for entries in self.sets:
-            matrix, _ = closure_matrix(self.stations[entries])
-            rows.append(np.repeat(entries, len(entries)))
-            columns.append(np.tile(entries, len(entries)))
-            values.append((matrix @ matrix.T / 3.0).ravel())
-        where = np.concatenate(rows), np.concatenate(columns)
-        return csr_array((np.concatenate(values), where), shape=(len(self), len(self)))
+KINDS = ("vis2", "closure_phase")
+"""Kinds of data that have a table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,10 +197,25 @@ class Observables:
 
     def to_table(self, kind: Literal["vis2", "closure_phase"] = "vis2") -> QTable:
         """One kind of data as an astropy table with units."""
-        return observables_table(self, kind)
+        one_of("Observables.to_table", "kind", kind, KINDS)
+        number = KINDS.index(kind)
+        measured = (self.vis2, self.closure_phase)[number]
+        return measurements_table(kind, measured, self.errors[number], self.setups, self.source)
 
     def _repr_html_(self) -> str:
-        return observables_html(self)
+        wavelengths = np.concatenate([setup.wavelength_m for setup in self.setups]) * 1e6
+        rows = [
+            ("squared visibilities", self.n_vis2),
+            ("closure phases", self.n_closure_phases),
+            ("independent numbers", self.n_independent),
+            ("covariance", self.covariance_kind),
+            ("instruments", ", ".join(dict.fromkeys(s.insname for s in self.setups))),
+            ("targets", ", ".join(dict.fromkeys(s.target for s in self.setups if s.target))),
+            ("wavelengths (µm)", f"{wavelengths.min():.4g} to {wavelengths.max():.4g}"),
+            ("source", self.source),
+            *(("note", note) for note in self.notes),
+        ]
+        return html_table("Observables", (), rows)
 
     def __repr__(self) -> str:
         return (
@@ -291,48 +223,6 @@ class Observables:
             f"{self.n_independent} independent data, {self.covariance_kind} covariance, "
             f"{', '.join(dict.fromkeys(s.insname for s in self.setups))}>"
         )
-
-
-def exposure_labels(closure_phase: Measurements) -> IntArray:
-    """Number the exposure each closure phase belongs to: one set of triangles at one time.
-
-    Rows of one setup within `SIMULTANEOUS_S` (or their integration time) of each other are
-    simultaneous, unless a triangle comes back, which starts the next exposure.
-    """
-    m = closure_phase
-    if not len(m):
-        return np.empty(0, dtype=np.intp)
-    key = np.stack([m.setup, m.row], axis=1)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    in_time = np.lexsort((m.row[first], m.mjd[first], m.setup[first]))
-    label = np.empty(len(first), dtype=np.intp)
-    label[in_time] = _count_exposures(m.select(first[in_time]))
-    return np.asarray(label[inverse.ravel()])
-
-
-def _count_exposures(rows: Measurements) -> list[int]:
-    label: list[int] = []
-    seen: set[tuple[int, ...]] = set()
-    for i in range(len(rows)):
-        triangle = tuple(sorted(rows.stations[i].tolist()))
-        apart = i and (rows.setup[i] != rows.setup[i - 1] or _far_in_time(rows, i))
-        if apart or triangle in seen:
-            seen = set()
-        label.append(label[-1] + (not seen) if label else 0)
-        seen.add(triangle)
-    return label
-
-
-def _far_in_time(rows: Measurements, i: int) -> bool:
-    """Whether a row begins after the one before it can have ended."""
-    overlap = 0.5 * float(np.nan_to_num(rows.integration_s[[i - 1, i]]).sum())
-    gap = DAY_S * (rows.mjd[i] - rows.mjd[i - 1])
-    return bool(gap > max(SIMULTANEOUS_S, overlap))
-
-
-def closure_sets(closure_phase: Measurements) -> Sequence[IntArray]:
-    """The entries of each exposure and channel: the closure phases that share baselines."""
-    return closure_phase.sets
 
 
 def join(parts: Sequence[Observables]) -> Observables:
@@ -352,8 +242,8 @@ def join(parts: Sequence[Observables]) -> Observables:
     known = [p.n_integrations for p in parts if p.n_integrations is not None]
     scatter = stacked_scatter((p.covariance, p.scatter) for p in parts)
     return Observables(
-        _concatenate([p.vis2 for p in parts], shifts),
-        _concatenate([p.closure_phase for p in parts], shifts),
+        Measurements.joined([p.vis2 for p in parts], shifts),
+        Measurements.joined([p.closure_phase for p in parts], shifts),
         stack_covariances([p.covariance for p in parts]).select(order),
         min((p.covariance_kind for p in parts), key=kinds.index),
         tuple(s for p in parts for s in p.setups),
@@ -362,11 +252,3 @@ def join(parts: Sequence[Observables]) -> Observables:
         stacked_freedom((p.n_independent, p.freedom) for p in parts),
         None if scatter is None else scatter[order][:, order],
     )
-
-
-def _concatenate(parts: Sequence[Measurements], shifts: IntArray) -> Measurements:
-    every = [f.name for f in fields(parts[0])]
-    names = [name for name in every if all(getattr(p, name) is not None for p in parts)]
-    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-    columns["setup"] = columns["setup"] + np.repeat(shifts[: len(parts)], [len(p) for p in parts])
-    return Measurements(**columns)

@@ -16,7 +16,7 @@ import numpy as np
 
 from amibayes.units import FloatArray, IntArray, SingleComplexArray, read_only
 
-TAPS = 4
+BSPLINE_NODES = 4
 """Coefficients that a value is made of, along each axis."""
 
 
@@ -72,12 +72,12 @@ def bspline_weights(place: FloatArray, n_nodes: int) -> tuple[IntArray, FloatArr
     weight : (n, 3, 16) array
         For the value, and its derivatives by the two coordinates, per step.
     """
-    reach = 0.5 * (n_nodes - TAPS + 1)
+    reach = 0.5 * (n_nodes - BSPLINE_NODES + 1)
     inside = np.clip(place, -reach, reach)
     first = np.minimum(np.floor(inside + reach), 2.0 * reach - 1.0)
     t = inside + reach - first
     s = 1.0 - t
-    weight = np.empty((2, TAPS, *place.shape))
+    weight = np.empty((2, BSPLINE_NODES, *place.shape))
     value, slope = weight
     value[0], value[3] = s**3 / 6.0, t**3 / 6.0
     value[1] = 2.0 / 3.0 - t * t * (1.0 - 0.5 * t)
@@ -87,6 +87,6 @@ def bspline_weights(place: FloatArray, n_nodes: int) -> tuple[IntArray, FloatArr
     slope *= inside == place
     (a, b), (da, db) = value.transpose(1, 2, 0), slope.transpose(1, 2, 0)
     both = np.stack([a, da, a], axis=1)[..., None] * np.stack([b, b, db], axis=1)[:, :, None, :]
-    along = first.astype(np.intp)[..., None] + np.arange(TAPS)
+    along = first.astype(np.intp)[..., None] + np.arange(BSPLINE_NODES)
     index = along[0][:, :, None] * n_nodes + along[1][:, None, :]
-    return index.reshape(-1, TAPS**2), both.reshape(-1, 3, TAPS**2)
+    return index.reshape(-1, BSPLINE_NODES**2), both.reshape(-1, 3, BSPLINE_NODES**2)

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from amibayes.data.assumed_covariance import covariance_of_errors
-from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import CovarianceKind, Observables
+from amibayes.data.setup import Setup
 from amibayes.support.arguments import checks_arguments
 from amibayes.units import FloatArray
 

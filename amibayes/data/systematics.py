@@ -10,7 +10,8 @@ from importlib import resources
 
 import numpy as np
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.units import FloatArray
 
 MIN_EXPOSURES = 10

@@ -1,18 +1,15 @@
-"""Results as a notebook shows them, and as astropy tables."""
+"""Results and data as astropy tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
-import numpy as np
 from astropy.table import QTable
 
-from amibayes.support.arguments import one_of
-from amibayes.support.notebook import html_table
-
-if TYPE_CHECKING:
-    from amibayes.data.observables import Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.setup import Setup
+from amibayes.units import FloatArray
 
 
 def quantity_table(
@@ -38,17 +35,15 @@ def pretty(name: str) -> str:
     return name.replace("_", " ")
 
 
-KINDS = ("vis2", "closure_phase")
-"""Kinds of data that have a table."""
-
-
-def observables_table(observables: Observables, kind: Literal["vis2", "closure_phase"]) -> QTable:
-    """One kind of data, a row each, with errors, places in the (u, v) plane and stations."""
-    one_of("Observables.to_table", "kind", kind, KINDS)
-    number = KINDS.index(kind)
-    m, error = (observables.vis2, observables.closure_phase)[number], observables.errors[number]
-    setups = observables.setups
-    sides = [f"{i + 1}" for i in range(m.u_m.shape[1])] if number else [""]
+def measurements_table(
+    kind: Literal["vis2", "closure_phase"],
+    m: Measurements,
+    error: FloatArray,
+    setups: Sequence[Setup],
+    source: str,
+) -> QTable:
+    """One kind of data, a row each, with errors (n,), places in the (u, v) plane and stations."""
+    sides = [f"{i + 1}" for i in range(m.u_m.shape[1])] if kind == "closure_phase" else [""]
     columns = {
         kind: m.value,
         "error": error,
@@ -63,22 +58,5 @@ def observables_table(observables: Observables, kind: Literal["vis2", "closure_p
         "flag": m.flag,
     }
     units = {name: "m" for name in columns if name[0] in "uvw" and name != kind}
-    units |= {kind: "rad", "error": "rad"} if number else {}
-    return quantity_table(columns, units | {"mjd": "d"}, {"source": observables.source})
-
-
-def observables_html(observables: Observables) -> str:
-    """What a data set holds."""
-    wavelengths = np.concatenate([setup.wavelength_m for setup in observables.setups])
-    rows = [
-        ("squared visibilities", observables.n_vis2),
-        ("closure phases", observables.n_closure_phases),
-        ("independent numbers", observables.n_independent),
-        ("covariance", observables.covariance_kind),
-        ("instruments", ", ".join(dict.fromkeys(s.insname for s in observables.setups))),
-        ("targets", ", ".join(dict.fromkeys(s.target for s in observables.setups if s.target))),
-        ("wavelengths (µm)", f"{wavelengths.min() * 1e6:.4g} to {wavelengths.max() * 1e6:.4g}"),
-        ("source", observables.source),
-        *(("note", note) for note in observables.notes),
-    ]
-    return html_table("Observables", (), rows)
+    units |= {kind: "rad", "error": "rad"} if kind == "closure_phase" else {}
+    return quantity_table(columns, units | {"mjd": "d"}, {"source": source})

@@ -15,7 +15,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.data.systematics import calibration_errors
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.units import BoolArray, FloatArray

@@ -15,7 +15,8 @@ from functools import partial
 import numpy as np
 from scipy.special import gammaln
 
-from amibayes.data.observables import Measurements, Observables, exposure_labels
+from amibayes.data.measurements import Measurements, exposure_labels
+from amibayes.data.observables import Observables
 from amibayes.detection.null_draws import pieces_of
 from amibayes.detection.statistic import Statistic
 from amibayes.detection.tails import clopper_pearson

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.observables import Measurements
+from amibayes.data.measurements import Measurements
 from amibayes.likelihood.student import symmetric_whitening
 from amibayes.units import IntArray
 

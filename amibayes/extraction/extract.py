@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
 from amibayes.extraction.response import off_axis_response, pointing_response, star_image
-from amibayes.extraction.table import independent_basis, observables_of, target_of
+from amibayes.extraction.table import Extraction, independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import exposures, visit_maps
 from amibayes.ramps.correction import MigrationFree
@@ -55,49 +55,6 @@ TIMES = ("EXPMID", "MJD-AVG", "MJD-OBS")
 
 MAX_SHIFT_PX = 1.5
 """Integrations that point farther from the others are not used."""
-
-
-@dataclass(frozen=True, eq=False)
-class Extraction:
-    """Everything that came out of the cubes of one instrument, filter and orientation.
-
-    Parameters
-    ----------
-    observables : Observables
-    frames : Frames
-        All integrations, those that were not used too.
-    average : Average
-        Of those that were used.
-    covariance : Shrunk
-        Of one integration.
-    physical : (m, m) array
-        Covariance of one integration that photon and read noise make.
-    operators : tuple of ExtractionOperator
-        One per file: view, reference image, operators.
-    options : ExtractOptions
-    sources : tuple of str
-    charge : CubeMigration
-        What was done about charge migration.
-    """
-
-    observables: Observables
-    frames: Frames
-    average: Average
-    covariance: Shrunk
-    physical: FloatArray
-    operators: tuple[ExtractionOperator, ...]
-    options: ExtractOptions
-    sources: tuple[str, ...]
-    charge: CubeMigration = field(default_factory=CubeMigration)
-
-    @property
-    def rejected(self) -> list[tuple[str, int, str]]:
-        """File, number and reason of the integrations that were not used."""
-        frames = self.frames
-        return [
-            (self.sources[int(frames.file[k])], int(frames.number[k]), str(frames.reason[k]))
-            for k in np.flatnonzero(~frames.used)
-        ]
 
 
 @checks_arguments

@@ -9,7 +9,7 @@ on what either error would do to the fitted image, every coefficient of the fit 
 What matters most is that a target and its calibrator are seen through the same geometry:
 what is left of an error then divides out, whereas noise, or a companion's light, in a
 geometry of its own does not. Small differences from what the file says are therefore not
-believed, nor those that a companion could make that the visibilities leave room for, and
+adopted, nor those that a companion could make that the visibilities leave room for, and
 others are rounded.
 """
 
@@ -37,7 +37,7 @@ CONSTRAINED = 3e-3
 
 MAX_STEPS = 4
 
-BELIEVED, SIGNIFICANT = 2.5e-4, 4.0
+SMALLEST, SIGNIFICANT = 2.5e-4, 4.0
 """Differences from the stated geometry below this, or so many standard deviations, are left."""
 
 COMPANION = 0.02
@@ -72,12 +72,12 @@ class Geometry:
 class Solution:
     """Relative error of the pixel scale and rotation (2,), and their standard deviations.
 
-    ``believed`` is what is believed of them, and ``basis`` the fringe model with that.
+    ``adopted`` is what is adopted of them, and ``basis`` the fringe model with that.
     """
 
     value: FloatArray
     error: FloatArray
-    believed: FloatArray
+    adopted: FloatArray
     basis: FringeBasis
 
 
@@ -109,9 +109,9 @@ def fit_geometry(
     solved = solve_geometry(view, image, fit, basis)
     if solved is None:
         return view, Geometry(), basis
-    (scale, turn), error = solved.believed, solved.error
+    (scale, turn), error = solved.adopted, solved.error
     found = Geometry(1.0 + float(scale), float(turn), float(error[0]), float(error[1]), True)
-    return _moved(view, solved.believed), found, solved.basis
+    return _moved(view, solved.adopted), found, solved.basis
 
 
 def solve_geometry(
@@ -119,7 +119,7 @@ def solve_geometry(
 ) -> Solution | None:
     """Solve for pixel scale and rotation; None where the image does not tell them.
 
-    What is believed is tried, until what is found there is no reason to believe else.
+    What is adopted is tried, until what is found there is the same.
     """
     pixels = image.reshape(1, -1)
     # The place of the envelope is fitted too, but the fringes say where the star is.
@@ -129,22 +129,22 @@ def solve_geometry(
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:2]
     if not 0.0 < error.min() <= error.max() < CONSTRAINED:
         return None
-    limit = np.maximum(SIGNIFICANT * error, max(BELIEVED, COMPANION * _unlike_a_star(fit, image)))
-    believed = np.zeros(2)
+    limit = np.maximum(SIGNIFICANT * error, max(SMALLEST, COMPANION * _unlike_a_star(fit, image)))
+    adopted = np.zeros(2)
     for _ in range(MAX_STEPS):
         residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]
         step = (covariance @ (slopes * fit.weight) @ residual)[:2]
         # Scales multiply: what the slopes are linear in is their logarithm.
-        scale = (1.0 + believed[0]) * np.exp(step[0]) - 1.0
-        value = np.array([scale, believed[1] + step[1]])
+        scale = (1.0 + adopted[0]) * np.exp(step[0]) - 1.0
+        value = np.array([scale, adopted[1] + step[1]])
         if np.abs(value).max() > LARGEST:
             return None
         rounded = np.where(np.abs(value) < limit, 0.0, ROUNDED * np.round(value / ROUNDED))
-        if np.array_equal(rounded, believed):
+        if np.array_equal(rounded, adopted):
             break
-        believed, basis = rounded, _moved(view, rounded).basis()
+        adopted, basis = rounded, _moved(view, rounded).basis()
         fit = weighted_fit(FringeModel.of(basis), fit.weight)
-    return Solution(value, error, believed, basis)
+    return Solution(value, error, adopted, basis)
 
 
 def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:

@@ -14,8 +14,9 @@ from astropy.io import fits
 
 from amibayes.cube.header import orientation_of
 from amibayes.data.joining import SEPARATOR
-from amibayes.data.observables import Observables, Setup
+from amibayes.data.observables import Observables
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.setup import Setup
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.charge import CubeMigration, visit_migration
 from amibayes.extraction.extract import extract_all

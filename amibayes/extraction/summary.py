@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from amibayes import __version__
-from amibayes.extraction.extract import Extraction
 from amibayes.extraction.geometry import Geometry
 from amibayes.extraction.operator import ExtractionOperator
+from amibayes.extraction.table import Extraction
 from amibayes.units import DEGREE
 
 

@@ -1,9 +1,8 @@
-"""Averages and single integrations as `Observables`: stations are holes, baselines on the sky."""
+"""What was extracted, as `Observables`: stations are holes, baselines on the sky."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -12,15 +11,61 @@ from amibayes.cube import Cube
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import CovarianceKind, Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
+from amibayes.data.setup import Setup
+from amibayes.data.shrinkage import Shrunk
 from amibayes.errors import DataError
-from amibayes.extraction.frames import Average
+from amibayes.extraction.charge import CubeMigration
+from amibayes.extraction.frames import Average, Frames
+from amibayes.extraction.operator import ExtractionOperator
+from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.view import View
 from amibayes.units import FloatArray, IntArray
 
-if TYPE_CHECKING:
-    from amibayes.extraction.extract import Extraction
+
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """Everything that came out of the cubes of one instrument, filter and orientation.
+
+    Parameters
+    ----------
+    observables : Observables
+    frames : Frames
+        All integrations, those that were not used too.
+    average : Average
+        Of those that were used.
+    covariance : Shrunk
+        Of one integration.
+    physical : (m, m) array
+        Covariance of one integration that photon and read noise make.
+    operators : tuple of ExtractionOperator
+        One per file: view, reference image, operators.
+    options : ExtractOptions
+    sources : tuple of str
+    charge : CubeMigration
+        What was done about charge migration.
+    """
+
+    observables: Observables
+    frames: Frames
+    average: Average
+    covariance: Shrunk
+    physical: FloatArray
+    operators: tuple[ExtractionOperator, ...]
+    options: ExtractOptions
+    sources: tuple[str, ...]
+    charge: CubeMigration = field(default_factory=CubeMigration)
+
+    @property
+    def rejected(self) -> list[tuple[str, int, str]]:
+        """File, number and reason of the integrations that were not used."""
+        frames = self.frames
+        return [
+            (self.sources[int(frames.file[k])], int(frames.number[k]), str(frames.reason[k]))
+            for k in np.flatnonzero(~frames.used)
+        ]
 
 
 def independent_basis(view: View) -> FloatArray:

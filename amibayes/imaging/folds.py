@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.units import BoolArray, IntArray
 
 N_FOLDS = 5

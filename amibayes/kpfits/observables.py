@@ -13,7 +13,9 @@ from amibayes.data.closure import kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import stacked_freedom
 from amibayes.data.kernel_model import KernelModel
-from amibayes.data.observables import CovarianceKind, Measurements, Observables, Setup, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import CovarianceKind, Observables, join
+from amibayes.data.setup import Setup
 from amibayes.data.shrinkage import Shrunk, shrunk_covariance
 from amibayes.errors import DataError
 from amibayes.kpfits.file import KernelFile, open_kpfits

@@ -251,8 +251,8 @@ def _spread(critical: CriticalContrasts) -> FloatArray:
     At one position recovery depends on the contrast in units of its error there, c/σ(angle):
     a quantile of that gives every direction its own limit.
     """
-    strength = critical.located / critical.sigma[:, :, None]
+    in_errors = critical.located / critical.sigma[:, :, None]
     wanted = np.array([COMPLETENESS])
-    at = np.array([quantiles(ring, wanted) for ring in strength])
+    at = np.array([quantiles(ring, wanted) for ring in in_errors])
     out = np.quantile(critical.sigma, SPREAD, axis=1).T * at
     return np.where(out <= 1.0, out, np.nan)

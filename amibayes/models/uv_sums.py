@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.data.kernel_model import stands_alone
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.units import FloatArray, IntArray
 
 

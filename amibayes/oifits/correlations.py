@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from amibayes.data.assumed_covariance import kernel_blocks
 from amibayes.data.closure import closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance
-from amibayes.data.observables import Measurements, closure_sets, exposure_labels
+from amibayes.data.measurements import Measurements, exposure_labels
 from amibayes.errors import DataError
 from amibayes.oifits.columns import integers, numbers, placed, rest_of, same
 from amibayes.oifits.tables import OIFits, OITable
@@ -294,7 +294,7 @@ def given_covariance(
         Where the matrix is not positive definite on the kernel basis.
     """
     n, shift = len(variance), len(variance) - len(closure_phase)
-    sets = [entries + shift for entries in closure_sets(closure_phase)]
+    sets = [entries + shift for entries in closure_phase.sets]
     sets = [s for s in sets if not independent[s].all()]
     paired = np.zeros(n, dtype=bool)
     paired[pairs.first] = paired[pairs.second] = True

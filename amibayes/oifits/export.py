@@ -19,7 +19,9 @@ from astropy.io import fits
 
 from amibayes.data.closure import canonical
 from amibayes.data.covariance import diagonal_covariance
-from amibayes.data.observables import Measurements, Observables, Setup, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables, join
+from amibayes.data.setup import Setup
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits.columns import same
 from amibayes.oifits.writer import to_hdus

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.data.observables import Measurements, Observables, Setup
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
+from amibayes.data.setup import Setup
 from amibayes.oifits.rows import T3, VIS2, Kind
 from amibayes.units import IntArray
 

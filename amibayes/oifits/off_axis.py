@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from amibayes.data.observables import Setup
-from amibayes.data.off_axis_response import TAPS, OffAxisResponse
+from amibayes.data.off_axis_response import BSPLINE_NODES, OffAxisResponse
+from amibayes.data.setup import Setup
 from amibayes.oifits.layout import Layout
 from amibayes.oifits.tables import OWN_KEY, OIFits
 from amibayes.units import FloatArray
@@ -77,7 +77,7 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
     index, half = found[0].columns["STA_INDEX"], found[0].columns["COEFF"]
     lattice = _lattice(found[0].header)
     n_nodes = round(np.sqrt(2 * half.shape[-1] - 1)) if half.ndim == 2 else 0
-    if lattice is None or n_nodes <= TAPS or n_nodes**2 != 2 * half.shape[1] - 1:
+    if lattice is None or n_nodes <= BSPLINE_NODES or n_nodes**2 != 2 * half.shape[1] - 1:
         return setup
     if not np.isfinite(half).all() or not np.iscomplexobj(half):
         return setup

@@ -7,7 +7,9 @@ from dataclasses import MISSING, dataclass, fields, replace
 
 import numpy as np
 
-from amibayes.data.observables import Measurements, Observables, Setup
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
+from amibayes.data.setup import Setup
 from amibayes.errors import DataError
 from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.data.observables import Measurements
+from amibayes.data.measurements import Measurements
 from amibayes.errors import DataError
 from amibayes.oifits.columns import coordinates, integers, numbers, rest_of
 from amibayes.oifits.dates import mjd_of_date

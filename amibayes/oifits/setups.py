@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amibayes.data.observables import Setup
+from amibayes.data.setup import Setup
 from amibayes.errors import DataError
 from amibayes.oifits.columns import column, integers, numbers, rest_of, same
 from amibayes.oifits.scales import ANGLE, LENGTH, scale_of

@@ -11,7 +11,8 @@ from scipy.sparse import csr_array
 
 from amibayes.data.covariance import BlockCovariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import Freedom
-from amibayes.data.observables import CovarianceKind, Measurements
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import CovarianceKind
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import DataError
 from amibayes.oifits.columns import same

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from amibayes.data.observables import DAY_S, SIMULTANEOUS_S
+from amibayes.data.measurements import DAY_S, SIMULTANEOUS_S
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 TOLERANCE = 0.005

@@ -165,7 +165,7 @@ def pixel_weights(pixel_response: float = 0.0) -> tuple[FloatArray, FloatArray]:
 
 
 def interpolator(place: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Samples, and their weights, that give the values at ``place``; both (…, n_taps)."""
+    """Samples, and their weights, that give the values at ``place``; both (…, n_nodes_used)."""
     sample = np.ceil(place - HALF_WIDTH).astype(np.intp)[..., None] + np.arange(2 * HALF_WIDTH)
     distance = place[..., None] - sample
     inside = np.maximum(1.0 - (distance / HALF_WIDTH) ** 2, 0.0)

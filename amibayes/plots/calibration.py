@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from amibayes.data.observables import Measurements, Observables
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.plots.fit import longest_baseline_m
 from amibayes.plots.style import BLACK, GREY, LIGHT_GREY, marker_of, new_figure, styled
 from amibayes.units import FloatArray

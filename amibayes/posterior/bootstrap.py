@@ -15,7 +15,8 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.observables import DAY_S, Observables, exposure_labels
+from amibayes.data.measurements import DAY_S, exposure_labels
+from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.extra_noise import ExtraNoise

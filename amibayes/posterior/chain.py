@@ -20,7 +20,7 @@ from amibayes.posterior.laplace import physical, sampled
 from amibayes.posterior.modes import Region
 from amibayes.posterior.sampler import Draws, LogProb, ModelPrior
 from amibayes.support import request
-from amibayes.support.ensemble_moves import Leaps, along_others
+from amibayes.support.ensemble_moves import IndependenceMove, along_others
 from amibayes.units import FloatArray
 
 N_WALKERS = 32
@@ -53,7 +53,7 @@ class EnsembleSampler:
         prior that the likelihood prefers.
     region : Region, optional
         Part of the field that is sampled; all of it unless given.
-    leaps : callable, optional
+    proposal : IndependenceMove, optional
         Proposals that do not start from where a walker is (`emcee.moves.MHMove`).
     path : path, optional
         HDF5 file of the chain, readable by `emcee.backends.HDFBackend`.
@@ -67,7 +67,7 @@ class EnsembleSampler:
 
     start: FloatArray | None = None
     region: Region | None = None
-    leaps: Leaps | None = None
+    proposal: IndependenceMove | None = None
     path: str | Path | None = None
     resume: bool = False
     max_steps: int = MAX_STEPS
@@ -96,9 +96,9 @@ class EnsembleSampler:
         seed = int(rng.integers(2**32))
         posterior = self._log_posterior(log_prob, prior)
         # All of data, covariance, noise and model are in the values at the start.
-        places, with_leaps = self._places(), self.leaps is not None
+        places, independent = self._places(), self.proposal is not None
         digest = request.digest(
-            start, posterior(start), prior.prior, seed, places, with_leaps, emcee.__version__
+            start, posterior(start), prior.prior, seed, places, independent, emcee.__version__
         )
         backend = load_chain(self.path, digest) if self.path and self.resume else None
         sampler = emcee.EnsembleSampler(
@@ -131,10 +131,10 @@ class EnsembleSampler:
     def _moves(self) -> list[tuple[emcee.moves.Move, float]]:
         """Moves and how often each is made."""
         along = along_others()
-        if self.leaps is None:
+        if self.proposal is None:
             return along
         half = [(move, 0.5 * share) for move, share in along]
-        return [*half, (emcee.moves.MHMove(self.leaps), 0.5)]
+        return [*half, (emcee.moves.MHMove(self.proposal), 0.5)]
 
     def _log_posterior(
         self, log_prob: LogProb, prior: ModelPrior

@@ -27,14 +27,14 @@ from amibayes.posterior.chain import (
 )
 from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.posterior.grid import GridPosterior
-from amibayes.posterior.independence import leaps_within, mode_mixture
+from amibayes.posterior.independence import independence_move_within, mode_mixture
 from amibayes.posterior.laplace import gaussian_of, log_masses, physical
 from amibayes.posterior.modes import Region, elsewhere, mode_probabilities, modes_to_sample
 from amibayes.posterior.polynomial import PolynomialLogProb, polynomial_log_prob
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import ModelPrior
 from amibayes.support.arguments import checks_arguments, one_of
-from amibayes.support.ensemble_moves import Leaps, leaps_of
+from amibayes.support.ensemble_moves import IndependenceMove, independence_move
 from amibayes.support.labelled import labelled
 from amibayes.support.notebook import html_table
 from amibayes.support.optional import optional_package
@@ -235,14 +235,16 @@ def sample(
     region, parameters = Region.of(result), result.likelihood.parameters
     start = _start(result, prior, region, rng)
     everything, quick = ModelPrior(prior, parameters), None
-    leaps: Leaps | None = None
+    proposal: IndependenceMove | None = None
     if grid is not None:
-        leaps = leaps_within(grid, region)
+        proposal = independence_move_within(grid, region)
     elif (quick := _quick(result, everything, rng)) is not None:
-        leaps = leaps_of(quick.around)
+        proposal = independence_move(quick.around)
     else:
-        leaps = leaps_of(mode_mixture(result.likelihood, modes_to_sample(result), prior, rng))
-    walkers = EnsembleSampler(start, region, leaps, path, resume, max_steps, progress)
+        proposal = independence_move(
+            mode_mixture(result.likelihood, modes_to_sample(result), prior, rng)
+        )
+    walkers = EnsembleSampler(start, region, proposal, path, resume, max_steps, progress)
     chain = walkers.run(quick or result.likelihood.log_prob, everything, rng)
     return _posterior(chain, result, prior, grid)
 

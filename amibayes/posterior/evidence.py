@@ -123,7 +123,7 @@ def compare_models(
     method: str = "direct",
     model_prior: Sequence[float] | None = None,
 ) -> Evidence:
-    """Weigh numbers of companions against each other and against over-resolved light.
+    """Compare numbers of companions with each other and with over-resolved light.
 
     Parameters
     ----------

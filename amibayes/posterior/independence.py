@@ -105,7 +105,7 @@ class IndependenceProposal:
         return _cumulated(self.grid.nuisance_probability)
 
 
-def leaps_within(grid: GridPosterior, region: Region) -> IndependenceProposal | None:
+def independence_move_within(grid: GridPosterior, region: Region) -> IndependenceProposal | None:
     """Proposals inside a region; None where it is too improbable for cells of its own."""
     inside = region.holds(*grid.cells.position)
     if not grid.probability[inside].any():

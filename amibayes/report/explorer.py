@@ -15,7 +15,7 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
-from amibayes.data.observables import Measurements
+from amibayes.data.measurements import Measurements
 from amibayes.detection.false_alarm import Significance
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.pipeline.report_types import SearchReport

@@ -2,7 +2,8 @@
 
 from amibayes.simulation.detector import PRESETS, Detector, DetectorMaps, detector_preset, draw_maps
 from amibayes.simulation.exposure import Exposure
-from amibayes.simulation.observe import Observation, open_shutter, simulate, write_exposure
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import prepare_exposure, simulate, write_exposure
 from amibayes.simulation.wavefront import WavefrontErrors
 
 __all__ = [
@@ -14,7 +15,7 @@ __all__ = [
     "WavefrontErrors",
     "detector_preset",
     "draw_maps",
-    "open_shutter",
+    "prepare_exposure",
     "simulate",
     "write_exposure",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,11 @@ from astropy.io import fits
 
 from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, headers_of
 from amibayes.cube.reference_files import BIAS_KEYWORD, LINEARITY_KEYWORD
-from amibayes.errors import DataError
-from amibayes.instrument import Instrument, instrument_names, load_instrument
-from amibayes.optics import Wavefront, scene_image
+from amibayes.instrument import Instrument
+from amibayes.optics import scene_image
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, child_seeds, spawn
-from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Scene
-from amibayes.simulation.detector import Detector, DetectorMaps, draw_maps
+from amibayes.simulation.detector import DetectorMaps, draw_maps
 from amibayes.simulation.exposure import (
     Chunk,
     Exposure,
@@ -29,111 +27,10 @@ from amibayes.simulation.exposure import (
     make_recorder,
     record,
 )
+from amibayes.simulation.observation import Observation
 from amibayes.simulation.ramps import linearity_coefficients
 from amibayes.simulation.truth import exposure_header, instrument_keyword, truth_tables
 from amibayes.support.arguments import checks_arguments
-from amibayes.support.notebook import Shown
-from amibayes.units import FloatArray
-
-DAY_S = 86400.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Observation(Shown):
-    """All that decides what an exposure shows, but for the random numbers.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is on the sky.
-    instrument : Instrument
-        Mask, filter and pixel scale.
-    exposure : Exposure
-        Groups, integrations and pointing errors.
-    detector : Detector
-        What happens to the light.
-    orientation : Orientation
-        How the detector lies on the sky.
-    wavefront : Wavefront, optional
-        Errors of the holes.
-    count_rate_e_s : float, optional
-        Electrons per second of the star; from its magnitude unless given.
-    n_wavelengths : int
-        Wavelengths that stand for the filter.
-    start_mjd : float
-        Start of the exposure.
-    notes : mapping
-        Further header keywords.
-    """
-
-    scene: Scene
-    instrument: Instrument
-    exposure: Exposure
-    detector: Detector = field(default_factory=Detector)
-    orientation: Orientation = field(default_factory=Orientation)
-    wavefront: Wavefront | None = None
-    count_rate_e_s: float | None = None
-    n_wavelengths: int = 9
-    start_mjd: float = 60000.0
-    notes: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def rate_e_s(self) -> float:
-        """Electrons per second of the star.
-
-        Raises
-        ------
-        DataError
-            Where neither a magnitude nor a rate is known.
-        """
-        if self.count_rate_e_s is not None:
-            return self.count_rate_e_s
-        return star_rate(self.scene, self.instrument)
-
-    @property
-    def mid_times_mjd(self) -> FloatArray:
-        """(n_int,) middle of each ramp; a frame that resets the detector follows each."""
-        frame = self.detector.frame_time_s
-        ramp = self.exposure.n_groups * frame
-        start = np.arange(self.exposure.n_integrations) * (ramp + frame)
-        return np.asarray(self.start_mjd + (start + ramp / 2.0) / DAY_S)
-
-
-def star_rate(scene: Scene, instrument: Instrument, source: str | None = None) -> float:
-    """Electrons per second of a scene's star, from its magnitude.
-
-    Parameters
-    ----------
-    scene : Scene
-        With a magnitude in any filter of the instrument.
-    instrument : Instrument
-        In the filter that is used.
-    source : str, optional
-        Name or file of the instrument, where its other filters are.
-
-    Raises
-    ------
-    DataError
-        Where the scene has no magnitude.
-    """
-    if scene.magnitude is None:
-        raise DataError(
-            "key 'star.magnitude' is missing", source=scene.source, remedy="or give 'count_rate'"
-        )
-    band = None
-    if scene.magnitude_filter not in (None, instrument.bandpass.name):
-        band = load_instrument(source or _catalogued(instrument), scene.magnitude_filter).bandpass
-    return instrument.count_rate(scene.spectrum, scene.magnitude, band)
-
-
-def _catalogued(instrument: Instrument) -> str:
-    name = instrument.name.split()[0].lower()
-    if name not in instrument_names():
-        raise DataError(
-            f"a magnitude in another filter needs the file of instrument {instrument.name}",
-            remedy="give the magnitude in the filter used, or a count rate",
-        )
-    return name
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +52,7 @@ class PreparedExposure:
         return record(self.recorder, self.pointings, self.noise, executor, progress, journal)
 
 
-def open_shutter(
+def prepare_exposure(
     observation: Observation, seed: np.random.SeedSequence, maps: DetectorMaps
 ) -> PreparedExposure:
     """Point the telescope and form the image.
@@ -230,10 +127,10 @@ def simulate(
     n = exposure.n_pixels
     if maps is None:
         maps = draw_maps(observation.detector, (n, n), np.random.default_rng(of_maps))
-    shutter = open_shutter(observation, of_exposure, maps)
-    chunks = list(shutter.take(executor or SerialExecutor(), progress))
+    prepared = prepare_exposure(observation, of_exposure, maps)
+    chunks = list(prepared.take(executor or SerialExecutor(), progress))
     return replace(
-        blank_cube(shutter),
+        blank_cube(prepared),
         images=np.concatenate([chunk.images for chunk in chunks]),
         error=np.concatenate([chunk.error for chunk in chunks]),
         dq=np.concatenate([chunk.dq for chunk in chunks]),
@@ -241,9 +138,9 @@ def simulate(
     )
 
 
-def blank_cube(shutter: PreparedExposure) -> Cube:
+def blank_cube(prepared: PreparedExposure) -> Cube:
     """Everything of the cube but its images."""
-    observation = shutter.observation
+    observation = prepared.observation
     n = observation.exposure.n_pixels
     empty = np.empty((0, n, n))
     exposure = observation.exposure
@@ -257,13 +154,13 @@ def blank_cube(shutter: PreparedExposure) -> Cube:
         integration_time_s=exposure.n_groups * observation.detector.frame_time_s,
         # Only where pixels are known can another mask be told from other pixels.
         pixels_known=observation.instrument.mask.is_mapped,
-        header=exposure_header(observation, shutter.pointings, shutter.recorder.rate_e_s),
+        header=exposure_header(observation, prepared.pointings, prepared.recorder.rate_e_s),
     )
 
 
 def write_exposure(
     path: Path,
-    shutter: PreparedExposure,
+    prepared: PreparedExposure,
     executor: Executor,
     *,
     history: tuple[str, ...] = (),
@@ -280,8 +177,8 @@ def write_exposure(
     ----------
     path : Path
         ``…_calints.fits``.
-    shutter : PreparedExposure
-        From `open_shutter`.
+    prepared : PreparedExposure
+        From `prepare_exposure`.
     executor : Executor
         Where the work is done.
     history : tuple of str
@@ -296,8 +193,8 @@ def write_exposure(
     RunError
         Where a file cannot be written.
     """
-    with _files(path, shutter, history) as (cube, ramps):
-        for chunk in shutter.take(executor, progress, journal):
+    with _files(path, prepared, history) as (cube, ramps):
+        for chunk in prepared.take(executor, progress, journal):
             cube.write(chunk.start, chunk.images, chunk.error, chunk.dq)
             if ramps is not None and chunk.ramps is not None:
                 ramps.write("SCI", chunk.start, chunk.ramps)
@@ -305,12 +202,12 @@ def write_exposure(
 
 @contextmanager
 def _files(
-    path: Path, shutter: PreparedExposure, history: tuple[str, ...]
+    path: Path, prepared: PreparedExposure, history: tuple[str, ...]
 ) -> Iterator[tuple[CubeStream, FitsStream | None]]:
-    observation = shutter.observation
+    observation = prepared.observation
     n = observation.exposure.n_integrations
-    template = blank_cube(shutter)
-    tables = truth_tables(observation, shutter.pointings)
+    template = blank_cube(prepared)
+    tables = truth_tables(observation, prepared.pointings)
     with ExitStack() as stack:
         mid = observation.mid_times_mjd
         cube = stack.enter_context(
@@ -318,9 +215,9 @@ def _files(
         )
         ramps = None
         if observation.exposure.keep_ramps:
-            hdus = _ramp_hdus(shutter)
+            hdus = _ramp_hdus(prepared)
             if observation.detector.adc_nonlinearity > 0.0:
-                _write_references(path, shutter, hdus[0].header)
+                _write_references(path, prepared, hdus[0].header)
             ramps = stack.enter_context(FitsStream.create(ramp_path(path), hdus))
         yield cube, ramps
 
@@ -330,10 +227,10 @@ def ramp_path(path: Path) -> Path:
     return path.with_name(path.name.replace("_calints", "_ramp"))
 
 
-def _write_references(path: Path, shutter: PreparedExposure, header: fits.Header) -> None:
+def _write_references(path: Path, prepared: PreparedExposure, header: fits.Header) -> None:
     """Write what the ramps went through as JWST's reference files have it, and name them."""
-    bias = shutter.recorder.maps.bias_dn
-    linear = linearity_coefficients(shutter.observation.detector, bias.shape)
+    bias = prepared.recorder.maps.bias_dn
+    linear = linearity_coefficients(prepared.observation.detector, bias.shape)
     for keyword, kind, name, values in (
         (BIAS_KEYWORD, "superbias", "SCI", bias),
         (LINEARITY_KEYWORD, "linearity", "COEFFS", linear),
@@ -345,12 +242,12 @@ def _write_references(path: Path, shutter: PreparedExposure, header: fits.Header
         header[keyword] = file.name
 
 
-def _ramp_hdus(shutter: PreparedExposure) -> list[Any]:
-    observation = shutter.observation
+def _ramp_hdus(prepared: PreparedExposure) -> list[Any]:
+    observation = prepared.observation
     exposure = observation.exposure
     # What a reader of slopes asks of a header, a reader of ramps asks too.
     primary, science = headers_of(
-        replace(blank_cube(shutter), unit="electron"), exposure.n_integrations
+        replace(blank_cube(prepared), unit="electron"), exposure.n_integrations
     )
     reads = observation.detector.n_reads(exposure.n_groups)
     shape = (exposure.n_integrations, reads, exposure.n_pixels, exposure.n_pixels)

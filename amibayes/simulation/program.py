@@ -22,7 +22,8 @@ from amibayes.scene.sources import Scene
 from amibayes.simulation.budget import LONGEST_S, PlanOptions, integrations, make_plan
 from amibayes.simulation.detector import Detector, DetectorMaps, detector_preset, draw_maps
 from amibayes.simulation.exposure import Exposure, refuse_too_many
-from amibayes.simulation.observe import Observation, PreparedExposure, open_shutter, star_rate
+from amibayes.simulation.observation import Observation, star_rate
+from amibayes.simulation.observe import PreparedExposure, prepare_exposure
 from amibayes.simulation.wavefront import WAVEFRONT_PRESETS, WavefrontErrors
 from amibayes.support.toml import Section, read_toml
 from amibayes.units import DEGREE, MAS
@@ -74,19 +75,19 @@ class Program:
 
     Parameters
     ----------
-    shots : tuple of ExposureSpec
+    specs : tuple of ExposureSpec
         Target first.
     text : str
         The file itself.
     """
 
-    shots: tuple[ExposureSpec, ...]
+    specs: tuple[ExposureSpec, ...]
     text: str
 
     @property
     def keeps_ramps(self) -> bool:
         """Whether the reads are written as well."""
-        return self.shots[0].observation.exposure.keep_ramps
+        return self.specs[0].observation.exposure.keep_ramps
 
     @property
     def history(self) -> tuple[str, ...]:
@@ -94,7 +95,7 @@ class Program:
         lines = [_without_comment(line) for line in self.text.expandtabs(4).splitlines()]
         return tuple(line.encode("ascii", "replace").decode() for line in lines if line)
 
-    def shutters(self, seed: int) -> Iterator[tuple[ExposureSpec, PreparedExposure]]:
+    def prepared_exposures(self, seed: int) -> Iterator[tuple[ExposureSpec, PreparedExposure]]:
         """Open each exposure in turn: one detector and one telescope for all of them.
 
         Parameters
@@ -104,16 +105,16 @@ class Program:
 
         Yields
         ------
-        Shot, Shutter
+        ExposureSpec, PreparedExposure
         """
-        of_maps, of_shared, of_shots = child_seeds(np.random.SeedSequence(seed), 3)
-        seeds = child_seeds(of_shots, len(self.shots))
-        for shot, child in zip(self.shots, seeds, strict=True):
+        of_maps, of_shared, of_specs = child_seeds(np.random.SeedSequence(seed), 3)
+        seeds = child_seeds(of_specs, len(self.specs))
+        for spec, child in zip(self.specs, seeds, strict=True):
             of_drift, of_exposure = child_seeds(child, 2)
-            wavefront = _wavefront(shot, of_shared, of_drift)
-            notes = shot.observation.notes | {"SEED": seed}
-            observation = replace(shot.observation, wavefront=wavefront, notes=notes)
-            yield shot, open_shutter(observation, of_exposure, _maps(shot, of_maps))
+            wavefront = _wavefront(spec, of_shared, of_drift)
+            notes = spec.observation.notes | {"SEED": seed}
+            observation = replace(spec.observation, wavefront=wavefront, notes=notes)
+            yield spec, prepare_exposure(observation, of_exposure, _maps(spec, of_maps))
 
 
 def _without_comment(line: str) -> str:
@@ -121,16 +122,16 @@ def _without_comment(line: str) -> str:
     return re.sub(r"""(^|\s)#[^"']*$""", "", line).rstrip()
 
 
-def _maps(shot: ExposureSpec, seed: np.random.SeedSequence) -> DetectorMaps:
-    n = shot.observation.exposure.n_pixels
-    return draw_maps(shot.observation.detector, (n, n), np.random.default_rng(seed))
+def _maps(spec: ExposureSpec, seed: np.random.SeedSequence) -> DetectorMaps:
+    n = spec.observation.exposure.n_pixels
+    return draw_maps(spec.observation.detector, (n, n), np.random.default_rng(seed))
 
 
 def _wavefront(
-    shot: ExposureSpec, shared: np.random.SeedSequence, drift: np.random.SeedSequence
+    spec: ExposureSpec, shared: np.random.SeedSequence, drift: np.random.SeedSequence
 ) -> Wavefront:
-    n_holes = shot.observation.instrument.mask.n_holes
-    return shot.errors.drifted(shot.errors.shared(n_holes, shared), n_holes, drift)
+    n_holes = spec.observation.instrument.mask.n_holes
+    return spec.errors.drifted(spec.errors.shared(n_holes, shared), n_holes, drift)
 
 
 def example() -> str:
@@ -166,8 +167,8 @@ def read_program(path: str | Path, overrides: Overrides | None = None) -> Progra
         for number, section in enumerate(top.sections("calibrator"), 1):
             stars.append(reader.star(section, is_calibrator=True, number=number))
         reader.refuse_unknown()
-        shots = _scheduled([shot for star in stars for shot in star])
-    return Program(shots, Path(path).read_text("utf-8"))
+        specs = _scheduled([spec for star in stars for spec in star])
+    return Program(specs, Path(path).read_text("utf-8"))
 
 
 @contextmanager
@@ -357,7 +358,7 @@ def _slug(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9+.-]+", "_", name).strip("_.") or "star"
 
 
-def _scheduled(shots: list[ExposureSpec]) -> tuple[ExposureSpec, ...]:
+def _scheduled(specs: list[ExposureSpec]) -> tuple[ExposureSpec, ...]:
     """Put the exposures one after the other.
 
     Raises
@@ -365,15 +366,15 @@ def _scheduled(shots: list[ExposureSpec]) -> tuple[ExposureSpec, ...]:
     DataError
         Where two have one name, so that their files would collide.
     """
-    names = [shot.name for shot in shots]
+    names = [spec.name for spec in specs]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise DataError(f"two stars are called '{twice}'", remedy="give each a name of its own")
-    start = shots[0].observation.start_mjd
+    start = specs[0].observation.start_mjd
     timed = []
-    for shot in shots:
-        timed.append(replace(shot, observation=replace(shot.observation, start_mjd=start)))
-        exposure, frame = shot.observation.exposure, shot.observation.detector.frame_time_s
+    for spec in specs:
+        timed.append(replace(spec, observation=replace(spec.observation, start_mjd=start)))
+        exposure, frame = spec.observation.exposure, spec.observation.detector.frame_time_s
         duration = exposure.n_integrations * (exposure.n_groups + 1) * frame
         start += (duration + BETWEEN_S) / 86400.0
     return tuple(timed)

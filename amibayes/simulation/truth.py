@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -11,12 +11,10 @@ from astropy.time import Time
 from amibayes import __version__
 from amibayes.cube.write import MAP_KEYWORDS, SHIFT_KEYWORDS
 from amibayes.instrument import instrument_names
+from amibayes.scene.sources import Scene
+from amibayes.simulation.exposure import Pointings
+from amibayes.simulation.observation import Observation
 from amibayes.units import MAS
-
-if TYPE_CHECKING:
-    from amibayes.scene.sources import Scene
-    from amibayes.simulation.exposure import Pointings
-    from amibayes.simulation.observe import Observation
 
 
 def exposure_header(

@@ -10,7 +10,7 @@ import numpy as np
 
 from amibayes.units import FloatArray
 
-Leaps = Callable[[FloatArray, np.random.RandomState], tuple[FloatArray, FloatArray]]
+IndependenceMove = Callable[[FloatArray, np.random.RandomState], tuple[FloatArray, FloatArray]]
 """Places (n, n_dim) proposed for walkers (n, n_dim), and ln q(old)/q(new), (n,)."""
 
 
@@ -26,14 +26,14 @@ class Proposal(Protocol):
         ...
 
 
-def leaps_of(proposal: Proposal) -> Leaps:
+def independence_move(proposal: Proposal) -> IndependenceMove:
     """Proposals that do not start from where a walker is, for `emcee.moves.MHMove`."""
 
-    def leaps(walkers: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+    def move(walkers: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
         places = proposal.draw(random, len(walkers))
         return places, proposal.log_density(walkers) - proposal.log_density(places)
 
-    return leaps
+    return move
 
 
 def along_others() -> list[tuple[emcee.moves.Move, float]]:

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.special import j1
 
-from amibayes.data.observables import Measurements, Observables, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.instrument import load_instrument
 from amibayes.oifits.writer import write_oifits

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amibayes.companion_search.search import search
-from amibayes.data.observables import Measurements, Observables, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel

@@ -15,7 +15,8 @@ from oi_builders import diagonal, random_observables
 
 from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.covariance import dense_covariance
-from amibayes.data.observables import Measurements, Observables, join
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, RunError, UsageError
 from amibayes.oifits import read_oifits, write_oifits
 

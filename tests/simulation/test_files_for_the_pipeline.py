@@ -18,7 +18,8 @@ from amibayes.parallel import SerialExecutor
 from amibayes.scene.sources import Scene
 from amibayes.simulation import Detector, Exposure
 from amibayes.simulation.detector import draw_maps
-from amibayes.simulation.observe import Observation, open_shutter, write_exposure
+from amibayes.simulation.observation import Observation
+from amibayes.simulation.observe import prepare_exposure, write_exposure
 
 REQUIRED = (
     "DATAMODL", "TELESCOP", "INSTRUME", "FILTER", "PUPIL", "EXP_TYPE", "SUBARRAY", "TARGPROP",
@@ -41,7 +42,7 @@ def test_what_ami_analyze_reads_is_there(tmp_path: Path) -> None:
         count_rate_e_s=1e5,
     )
     maps = draw_maps(detector, (32, 32), np.random.default_rng(1))
-    write_exposure(path, open_shutter(observation, np.random.SeedSequence(1), maps),
+    write_exposure(path, prepare_exposure(observation, np.random.SeedSequence(1), maps),
                    SerialExecutor())  # fmt: skip
     with fits.open(path) as file:
         primary, science = file[0].header, file["SCI"].header

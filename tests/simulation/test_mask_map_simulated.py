@@ -91,8 +91,8 @@ def test_which_mask_is_simulated(edit: str | None, mapped: bool, tmp_path: Path)
         line = edit if edit and "=" in edit else ""
         text = text.replace('mask_map = "as built"', line)
     (tmp_path / "scene.toml").write_text(text)
-    shots = read_program(tmp_path / "scene.toml").shots
-    assert [s.observation.instrument.mask.is_mapped for s in shots] == [mapped, mapped]
+    specs = read_program(tmp_path / "scene.toml").specs
+    assert [s.observation.instrument.mask.is_mapped for s in specs] == [mapped, mapped]
 
 
 def test_what_is_mapped_once_is_not_mapped_again() -> None:

@@ -175,7 +175,7 @@ def test_example_runs_and_explains_every_key(
             table = "[detector]\npreset"
             changed = small.replace(table, f"[detector]\n{line}\npreset")
             program = read_program(write(tmp_path, changed))
-            detector = program.shots[0].observation.detector
+            detector = program.specs[0].observation.detector
             assert detector == Detector(), line
 
 
@@ -357,9 +357,9 @@ def test_fault_of_an_option_is_not_the_files(
 def test_options_stand_in_the_place_of_the_file(text: str, tmp_path: Path) -> None:
     """Also of what it says of single stars, and of its number of integrations."""
     program = read_program(write(tmp_path, text), Overrides("F480M", 1e7))
-    assert len(program.shots) == 8
-    for shot in program.shots:
-        taken = shot.observation
+    assert len(program.specs) == 8
+    for spec in program.specs:
+        taken = spec.observation
         assert taken.instrument.bandpass.name == "F480M"
         one = 4 * 0.0745 * taken.count_rate_e_s * taken.scene.flux
         assert 1e7 <= taken.exposure.n_integrations * one <= 1e7 + 2 * one
@@ -439,17 +439,17 @@ def test_map_of_the_wavefront_is_that_of_its_file(tmp_path: Path) -> None:
     fits.PrimaryHDU(opd_m).writeto(tmp_path / "opd.fits")
     text = SMALL.replace("[wavefront]", '[wavefront]\nmap = "opd.fits"\nmap_width_m = 6.6')
     program = read_program(write(tmp_path, text))
-    assert program.shots
-    for shot in program.shots:
-        assert shot.errors.map is not None
-        np.testing.assert_array_equal(shot.errors.map.opd_m, opd_m)
-        assert shot.errors.map.width_m == 6.6
-    for _, shutter in program.shutters(1):
-        wavefront = shutter.observation.wavefront
+    assert program.specs
+    for spec in program.specs:
+        assert spec.errors.map is not None
+        np.testing.assert_array_equal(spec.errors.map.opd_m, opd_m)
+        assert spec.errors.map.width_m == 6.6
+    for _, prepared in program.prepared_exposures(1):
+        wavefront = prepared.observation.wavefront
         assert wavefront is not None
         assert wavefront.map is not None
         np.testing.assert_array_equal(wavefront.map.opd_m, opd_m)
-    assert read_program(write(tmp_path)).shots[0].errors.map is None
+    assert read_program(write(tmp_path)).specs[0].errors.map is None
     for width in ("", "map_width_m = 0.0"):
         bad = SMALL.replace("[wavefront]", f'[wavefront]\nmap = "opd.fits"\n{width}')
         with pytest.raises(DataError, match="map_width_m"):

@@ -14,29 +14,44 @@ second order, by as much as the second order itself.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amibayes.units import ComplexArray, FloatArray, IntArray
-
-if TYPE_CHECKING:
-    from amibayes.extraction.fourier.sampling import OneEach
+from amibayes.units import ComplexArray, FloatArray, IntArray, SingleArray
 
 
 def observable_covariance(
-    sampling: OneEach, samples: ComplexArray, variance: FloatArray, third: FloatArray
+    samples: ComplexArray,
+    triangles: IntArray,
+    noise: FloatArray,
+    share: FloatArray,
+    slope: FloatArray,
+    numbers: SingleArray,
+    third: FloatArray,
 ) -> FloatArray:
     """Covariance of V² and closure phase of one sample per baseline, fluxes in units of one.
 
-    Exact for Gaussian noise, and for photons up to the second power of 1/flux. The arguments
-    are those of `Sampling.expected_covariance`, of a star of unit flux.
+    Exact for Gaussian noise, and for photons up to the second power of 1/flux.
+
+    Parameters
+    ----------
+    samples : (n,) complex array
+        Their expectations.
+    triangles : (n_triangles, 3) int array
+        Baselines ij, jk, ik of every triangle.
+    noise : (1 + 2n, 1 + 2n) array
+        Covariance of the numbers: flux, real parts, imaginary parts.
+    share : (n, 1 + 2n) array
+        V² as sums of squares of the numbers.
+    slope : (n + n_triangles, 1 + 2n) array
+        Derivatives of V² and closure phase by the numbers.
+    numbers : (1 + 2n, n_pixels) float32 array
+        The numbers that a unit in each pixel makes.
+    third : (n_pixels,) array
+        Third cumulant of the noise of each pixel.
     """
-    noise = sampling.covariance(variance)
-    share, slope = sampling.shares(1.0, samples), sampling.jacobian(1.0, samples)
-    legs = _Legs.of(sampling, samples, noise)
-    n = len(share)
-    skewed = slope @ _curved(sampling, samples, share, third)
+    legs, n = _Legs.of(samples, triangles, noise), len(share)
+    skewed = slope @ _curved(samples, triangles, share, numbers, third)
     slope[n:] += legs.slope_of_third()
     total = slope @ noise @ slope.T + skewed + skewed.T
     both = legs.second_order_with(share)
@@ -56,18 +71,22 @@ def signs(triangles: IntArray, n_baselines: int) -> FloatArray:
 
 
 def _curved(
-    sampling: OneEach, samples: ComplexArray, share: FloatArray, third: FloatArray
+    samples: ComplexArray,
+    triangles: IntArray,
+    share: FloatArray,
+    columns: SingleArray,
+    third: FloatArray,
 ) -> FloatArray:
     """Third moments (n_numbers, n_baselines + n_triangles) of a number and a second order.
 
     The second order that a unit in one pixel makes with itself is Σ pairs x·y of the legs'
     changes: (Σ Re)(Σ Im) − Σ Re·Im is its imaginary part.
     """
-    columns, n = sampling.single.T[:-1], sampling.n_samples
+    n = len(samples)
     of_leg = (1.0 / samples)[:, None].astype(np.complex64)
     a, b = columns[1 : 1 + n], columns[1 + n :]
     real, imaginary = a * of_leg.real - b * of_leg.imag, a * of_leg.imag + b * of_leg.real
-    turned, share = signs(sampling.triangles, n).astype(np.float32), share.astype(np.float32)
+    turned, share = signs(triangles, n).astype(np.float32), share.astype(np.float32)
     curved = np.concatenate([share @ columns**2, (np.abs(turned) @ real) * (turned @ imaginary)])
     curved[n:] -= turned @ (real * imaginary)
     curved *= third.astype(np.float32)
@@ -94,11 +113,11 @@ class _Legs:
     conjugate: ComplexArray
 
     @classmethod
-    def of(cls, sampling: OneEach, samples: ComplexArray, noise: FloatArray) -> _Legs:
-        n = sampling.n_samples
+    def of(cls, samples: ComplexArray, triangles: IntArray, noise: FloatArray) -> _Legs:
+        n = len(samples)
         relative = np.zeros((n, 1 + 2 * n), dtype=complex)
         relative[:, 1 : 1 + n], relative[:, 1 + n :] = np.diag(1.0 / samples), np.diag(1j / samples)
-        forms = relative[sampling.triangles.T]
+        forms = relative[triangles.T]
         forms[2] = forms[2].conj()
         flat = forms.reshape(-1, 1 + 2 * n)
         noisy, shape = flat @ noise, (*forms.shape[:2], *forms.shape[:2])

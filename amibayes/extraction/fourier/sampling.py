@@ -169,7 +169,10 @@ class OneEach:
     ) -> FloatArray:
         """All orders that matter of a faint star; see `low_flux.observable_covariance`."""
         # In units of the flux, so that single precision holds it.
-        return observable_covariance(self, samples / flux, variance / flux**2, skewness / flux**3)
+        samples, noise = samples / flux, self.covariance(variance / flux**2)
+        share, slope = self.shares(1.0, samples), self.jacobian(1.0, samples)
+        numbers, third = self.single.T[:-1], skewness / flux**3
+        return observable_covariance(samples, self.triangles, noise, share, slope, numbers, third)
 
     def shares(self, flux: float, samples: ComplexArray) -> FloatArray:
         """V² as a sum of squares of the numbers: their shares (n_baselines, n_numbers)."""

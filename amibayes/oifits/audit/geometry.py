@@ -9,7 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from amibayes.data.closure import canonical
-from amibayes.data.observables import Measurements, Observables, closure_sets
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, data_tables, listed
 from amibayes.oifits.columns import coordinates
@@ -265,7 +266,7 @@ def four_triangles(part: Observables) -> list[FourTriangles]:
     closure = part.closure_phase.select(~part.closure_phase.flag)
     sigma = part.errors[1][~part.closure_phase.flag]
     found = []
-    for entries in closure_sets(closure):
+    for entries in closure.sets:
         few = closure.select(entries)
         ordered, sign = canonical(few.stations)
         place = {tuple(t): i for i, t in enumerate(ordered.tolist())}

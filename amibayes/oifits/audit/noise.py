@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from amibayes.data.closure import canonical, canonical_uv, closure_matrix, kernel_basis
-from amibayes.data.observables import Measurements, Observables, closure_sets
+from amibayes.data.measurements import Measurements
+from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.oifits.audit.finding import Finding, Findings, column, count, listed
 from amibayes.oifits.reader import observables_of
@@ -31,7 +32,7 @@ def independent_closures(oifits: OIFits, parts: Sequence[Observables]) -> Findin
         closure = part.closure_phase.select(~part.closure_phase.flag)
         correlated = _correlated_setups(oifits)
         n = rank = 0
-        for entries in closure_sets(closure):
+        for entries in closure.sets:
             if part.setups[int(closure.setup[entries[0]])].insname not in correlated:
                 n += len(entries)
                 rank += _rank(closure.stations[entries])

@@ -1,4 +1,4 @@
-"""Leaps: drawn as the grid says, with the density that they state, and harmless where wrong."""
+"""Proposals: drawn as the grid says, with the density that they state, and harmless where wrong."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ def test_draws_have_the_distribution_of_the_grid(grid: GridPosterior) -> None:
 
 def test_stated_density_is_that_of_the_draws(grid: GridPosterior) -> None:
     """Its integral over a box about the mode, by Monte Carlo, is the share of draws there."""
-    leaps, rng = IndependenceProposal(grid), np.random.default_rng(2)
-    places, stated = leaps.draw(DRAWS, np.random.RandomState(2))
-    found = leaps.log_density(places)
+    proposal, rng = IndependenceProposal(grid), np.random.default_rng(2)
+    places, stated = proposal.draw(DRAWS, np.random.RandomState(2))
+    found = proposal.log_density(places)
     # A draw at the very edge of a cell may be rounded into its neighbour.
     assert np.mean(found == stated) > 0.999
     low, high = np.quantile(places, [0.2, 0.8], axis=0)
     seen = float(((places > low) & (places < high)).all(axis=1).mean())
     points = rng.uniform(low, high, (DRAWS, len(low)))
-    density = np.exp(leaps.log_density(points)) * np.prod(high - low)
+    density = np.exp(proposal.log_density(points)) * np.prod(high - low)
     error = np.hypot(np.sqrt(seen * (1 - seen) / DRAWS), density.std() / np.sqrt(DRAWS))
     assert abs(density.mean() - seen) < 4.5 * error
     assert error < 0.1 * seen
@@ -90,7 +90,9 @@ def test_outside_the_grid_there_is_no_density(grid: GridPosterior) -> None:
         assert IndependenceProposal(grid).log_density(away)[0] == -np.inf
 
 
-def test_wrong_leaps_make_no_wrong_posterior(likelihood: Likelihood, grid: GridPosterior) -> None:
+def test_wrong_proposals_make_no_wrong_posterior(
+    likelihood: Likelihood, grid: GridPosterior
+) -> None:
     """Draws that favour the east by five to one are put right by Metropolis & Hastings' rule."""
     east = grid.cells.position[0] > grid.interval("east_mas")[0]
     share = grid.contrast_probability * np.where(east, 5.0, 1.0)[:, None]
