@@ -45,6 +45,10 @@ NEVER_USED = ("DO_NOT_USE", "NON_SCIENCE", "DEAD", "REFERENCE_PIXEL")
 """Flags of pixels that see no light; slopes that jumps or saturation only cut short are good."""
 
 
+NO_LIGHT = "every pixel is flagged, not a number, or the same"
+"""What is wrong with images and ramps that show nothing."""
+
+
 MIN_PIXEL_RAD, MAX_PIXEL_RAD = 1e-12, 1e-3
 """Between 0.2 µas and 3 arcmin: pixel scales of other sizes are in other units than radians."""
 

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from amibayes.cube.container import DO_NOT_USE, JUMP_DET, SATURATED, Cube
+from amibayes.cube.container import DO_NOT_USE, JUMP_DET, NO_LIGHT, SATURATED, Cube, flag_bits
 from amibayes.cube.reference_files import Linearity, as_read
 from amibayes.cube.timing import GroupTiming
+from amibayes.errors import DataError
 from amibayes.support.fits_errors import reporting_damage
 from amibayes.units import BoolArray, FloatArray, IntArray, SingleArray
 
@@ -143,6 +144,12 @@ class RampFile:
             return np.uint32(0)
         return np.asarray(flags.section[:, :]).astype(np.uint32)
 
+    @property
+    def _never_used(self) -> BoolArray:
+        """Pixels (ny, nx) that are used in no integration."""
+        flags = np.broadcast_to(self.pixel_flags, self.template.images.shape[1:])
+        return np.asarray((flags & np.uint32(flag_bits(self.template.bad_flags))) != 0)
+
     @cached_property
     def noise(self) -> tuple[FloatArray, float]:
         """Photon variance of a difference (ny, nx), and read variance of one group, in units².
@@ -154,17 +161,31 @@ class RampFile:
         difference, good = found.values, found.good
         count = np.maximum(good.sum(axis=(0, 1)), 1)
         mean = difference.sum(axis=(0, 1), dtype=float) / count
+        used = mean[(count > 1) & ~self._never_used]
+        if not used.size or not np.ptp(used) > 0.0:
+            raise DataError(NO_LIGHT, source=self.template.source)
         photons = np.maximum(mean, 0.0) / self.gain_e
         off = np.where(good, difference - mean, 0.0)
         variance = (off**2).sum(axis=(0, 1), dtype=float) / np.maximum(count - 1, 1)
-        faint = mean <= np.median(mean)
-        spare = variance - photons * float(np.diag(self.timing.photon_covariance).mean())
-        read = 0.5 * float(np.median(spare[faint & (count > 1)]))
+        faint = (mean <= np.median(mean)) & (count > 1)
+        spare = variance / _median_of_variance(count)
+        spare -= photons * float(np.diag(self.timing.photon_covariance).mean())
+        read = 0.5 * float(np.median(spare[faint]))
         return photons, max(read, 1e-6 * float(np.median(variance[faint])), 1e-12)
 
     @cached_property
     def _weights(self) -> SlopeWeights:
         return SlopeWeights.of(*self.noise, self.timing)
+
+
+def _median_of_variance(count: IntArray) -> FloatArray:
+    """Median of the variance of so many differences, in units of its mean, where reads are noise.
+
+    Differences that share a read are correlated by −1/2, which leaves 1/(1 + 2/4) of their degrees
+    of freedom; the median of χ² is that of Wilson and Hilferty (1931).
+    """
+    degrees = np.maximum(count - 1, 1) / 1.5
+    return np.asarray((1.0 - 2.0 / (9.0 * degrees)) ** 3)
 
 
 @dataclass(frozen=True, eq=False)

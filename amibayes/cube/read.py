@@ -15,10 +15,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from amibayes.cube import header as keys
-from amibayes.cube.container import NEVER_USED, Cube
+from amibayes.cube.container import NEVER_USED, NO_LIGHT, Cube
 from amibayes.cube.ramps import RampFile
-from amibayes.cube.reference_files import bias_of, linearity_of
-from amibayes.cube.timing import timing_of
+from amibayes.cube.read_ramps import check_ramps, ramp_file, refuse_raw
 from amibayes.errors import DataError
 from amibayes.instrument import (
     HeaderRules,
@@ -83,7 +82,7 @@ def holds_light(cube: Cube) -> bool:
 
 def no_light(source: str) -> DataError:
     """Describe a cube without a single usable value."""
-    return DataError("every pixel is flagged, not a number, or the same", source=source)
+    return DataError(NO_LIGHT, source=source)
 
 
 @checks_arguments
@@ -154,54 +153,17 @@ def _described(hdus: Any, given: dict[str, Any], source: str) -> CubeFile | Ramp
             remedy="give it to search, limits or calibrate",
         )
     science = _science(hdus, source)
-    if len(science.shape) == 4:
-        return _ramp_file(hdus, science, given, source)
-    chosen = {"SCI": science} | _companions(hdus, science, source)
     _check_complete(hdus, source)
     header = _merged(hdus, science)
+    check_ramps(hdus, science, header, source)
+    is_ramp = len(science.shape) == 4
+    chosen = {} if is_ramp else {"SCI": science} | _companions(hdus, science, source)
     template = _template(header, science, given, source, _comments(hdus, science))
-    n = science.shape[0] if len(science.shape) == 3 else 1
-    return CubeFile(template, n, chosen, _mid_times(hdus, n, header, source))
-
-
-def _ramp_file(hdus: Any, science: Any, given: dict[str, Any], source: str) -> RampFile:
-    """Ramps that are read as slopes.
-
-    Raises
-    ------
-    DataError
-        Where they are raw, have fewer than two groups, or do not say the time between groups.
-    """
-    _check_complete(hdus, source)
-    n, groups, *shape = science.shape
-    header = _merged(hdus, science)
-    step = keys.number(header, "TGROUP", source) or keys.number(header, "TFRAME", source)
-    if groups < 2 or step is None or not step > 0.0:
-        fault = f"has {groups} group in a ramp" if groups < 2 else "does not say TGROUP"
-        raise DataError(f"{fault}: no slopes", source=source, remedy="give slope images (calints)")
-    parts = {"SCI": science}
-    for name, wanted in (("GROUPDQ", science.shape), ("PIXELDQ", tuple(shape))):
-        there = [h for h in hdus if h.name == name and h.is_image]
-        if there and there[0].shape != wanted:
-            raise DataError(f"{name} has the shape {there[0].shape}, not {wanted}", source=source)
-        parts |= {name: there[0]} if there else {}
-    template = _template(header, science, given, source, _comments(hdus, science))
-    unit = "electron/s" if "electron" in template.unit.lower() else "DN/s"
-    template = replace(template, unit=unit, notes=template.notes + _cut_ramps(header, source))
-    timing = timing_of(header, groups, step)
-    mjd, pixels = _mid_times(hdus, n, header, source), (shape[0], shape[1])
-    bias, linearity = bias_of(header, source, pixels), linearity_of(header, source, pixels)
-    return RampFile(template, n, parts, mjd, timing, bias, linearity)
-
-
-def _cut_ramps(header: dict[str, Any], source: str) -> tuple[str, ...]:
-    """Say where jwst has flagged the groups that tell of charge migration."""
-    if keys.text(header, "S_CHGMIG") != "COMPLETE":
-        return ()
-    return (
-        f"{source}: jwst's charge_migration step has flagged the last groups of bright pixels "
-        "(S_CHGMIG), which hence tell less of it; run calwebb_detector1 without that step",
-    )
+    n = 1 if len(science.shape) == 2 else science.shape[0]
+    mjd = _mid_times(hdus, n, header, source)
+    if is_ramp:
+        return ramp_file(hdus, science, template, mjd)
+    return CubeFile(template, n, chosen, mjd)
 
 
 @contextmanager
@@ -225,30 +187,10 @@ def _science(hdus: Any, source: str) -> Any:
         raise DataError("holds no image", source=source)
     hdu = images[0]
     if len(hdu.shape) > 3:
-        _refuse_ramps(hdus, hdu, source)
+        refuse_raw(hdus, hdu, source)
     if len(hdu.shape) < 2 or 0 in hdu.shape:
         raise DataError(f"its image has the shape {hdu.shape}", source=source)
     return hdu
-
-
-def _refuse_ramps(hdus: Any, hdu: Any, source: str) -> None:
-    """Refuse ramps that are raw, by the step that comes next, and what is no ramp at all."""
-    names = {h.name for h in hdus}
-    # The detector counts in whole numbers; every later step makes floating-point ones.
-    raw = len(hdu.shape) == 4 and hdu.header["BITPIX"] > 0 and "GROUPDQ" not in names
-    if raw:
-        raise DataError(
-            "holds raw ramps (uncal): neither linear nor flagged",
-            source=source,
-            remedy="run jwst's calwebb_detector1 and give its _ramp file, or calwebb_image2 too, "
-            "and give its _calints",
-        )
-    if len(hdu.shape) != 4 or 0 in hdu.shape:
-        raise DataError(
-            f"holds {len(hdu.shape)}-dimensional data, neither images nor ramps",
-            source=source,
-            remedy="give the slope images of each integration (calints)",
-        )
 
 
 def _companions(hdus: Any, science: Any, source: str) -> dict[str, Any]:

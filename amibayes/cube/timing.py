@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from amibayes.cube.header import number
 from amibayes.units import FloatArray
 
 
@@ -73,15 +74,21 @@ class GroupTiming:
         return np.asarray(difference @ of_groups @ difference.T)
 
 
-def timing_of(header: Mapping[str, Any], n_groups: int, group_s: float) -> GroupTiming:
+def timing_of(
+    header: Mapping[str, Any], n_groups: int, group_s: float, source: str = "ramps"
+) -> GroupTiming:
     """Timing from the keywords TFRAME, NFRAMES and, of simulated ramps, ZEROREAD.
 
     Where they are absent a group is one read, and the first one frame after the reset.
+
+    Raises
+    ------
+    DataError
+        Where one of them is no number.
     """
-    frame = header.get("TFRAME")
-    count = header.get("NFRAMES")
-    n_frames = count if isinstance(count, int) and count > 0 else 1
-    frame_s = float(frame) if isinstance(frame, int | float) and frame > 0.0 else group_s / n_frames
+    frame, count = (number(header, key, source) for key in ("TFRAME", "NFRAMES"))
+    n_frames = max(int(count or 1), 1)
+    frame_s = frame if frame is not None and frame > 0.0 else group_s / n_frames
     frame_s = min(frame_s, group_s / n_frames)
     first = 0.0 if header.get("ZEROREAD") is True else frame_s
     return GroupTiming(n_groups, group_s, frame_s, n_frames, first)

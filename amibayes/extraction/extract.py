@@ -42,6 +42,7 @@ from amibayes.extraction.response import off_axis_response, pointing_response, s
 from amibayes.extraction.table import Extraction, independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import exposures, visit_maps
+from amibayes.oifits.products import Contents, refuse_twice
 from amibayes.ramps.correction import MigrationFree
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import EXTRACTION_METHODS
@@ -119,6 +120,7 @@ def extract_all(
         _measured(cube, index, chosen, header, mask_map, charge)
         for index, (cube, mask_map, charge) in enumerate(zip(given, maps, charges, strict=True))
     ]
+    refuse_twice([Contents(p.template.source, p.template.header, (), ()) for p in parts])
     groups = exposures(parts, lambda part: part.template, one_star=one_star)
     return [_finished(_numbered(group), chosen) for group in groups]
 

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2 as chi2_distribution
 
-from amibayes.units import FloatArray, IntArray, read_only
+from amibayes.units import FloatArray, IntArray, freeze
 
 WIDEST = 3e-6
 """Per electron: 4 % at half of full well, more than any pixel that may be used is off by."""
@@ -52,7 +52,7 @@ class OwnResponse:
     carried: IntArray
 
     def __post_init__(self) -> None:
-        read_only(self, "value", "error", "carried")
+        freeze(self)
 
 
 def own_response(

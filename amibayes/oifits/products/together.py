@@ -44,6 +44,12 @@ class Contents:
         return str(self.header.get("FILENAME") or self.path).endswith("_ramp.fits")
 
     @property
+    def integrations(self) -> tuple[int, int] | None:
+        """First and last integration of the exposure, where the header numbers them."""
+        ends = (self.header.get("INTSTART"), self.header.get("INTEND"))
+        return (ends[0], ends[1]) if all(type(end) is int for end in ends) else None  # type: ignore[return-value]
+
+    @property
     def is_product(self) -> bool:
         """Whether it is a stage-3 product."""
         return is_product_header(self.header, self.names)
@@ -55,7 +61,7 @@ class Contents:
 
 
 def refuse_twice(files: Sequence[Contents]) -> None:
-    """Refuse a product, or ramps, together with another file of their exposure.
+    """Refuse a product, ramps or integrations together with another file of their exposure.
 
     Raises
     ------
@@ -65,9 +71,7 @@ def refuse_twice(files: Sequence[Contents]) -> None:
     for k, one in enumerate(files):
         exposure = exposure_of(one.header)
         for other in files[k + 1 :]:
-            # Images of one exposure may be segments of it; ramps beside slopes are none.
-            images = not (one.is_product or other.is_product)
-            if exposure is None or (images and one.is_ramp == other.is_ramp):
+            if exposure is None or _segments(one, other):
                 continue
             if exposure_of(other.header) == exposure:
                 raise UsageError(
@@ -75,6 +79,19 @@ def refuse_twice(files: Sequence[Contents]) -> None:
                     source=other.path,
                     remedy="give one of them: the ramps or images, else amimulti-oi, else ami-oi",
                 )
+
+
+def _segments(one: Contents, other: Contents) -> bool:
+    """Whether two files of an exposure may be segments of it: no integration is in both.
+
+    Ramps beside slopes are none, unless their numbers of integrations say so.
+    """
+    if one.is_product or other.is_product:
+        return False
+    if one.integrations is None or other.integrations is None:
+        return one.is_ramp == other.is_ramp
+    (first, last), (begin, end) = one.integrations, other.integrations
+    return last < begin or end < first
 
 
 def refuse_calibrating_again(targets: Sequence[Contents], calibrators: Sequence[Contents]) -> None:
