@@ -30,7 +30,8 @@ from trials import Answer, keep_answer, known_answers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from amibayes.comparison.compare import Compared, ModelComparison, NoiseSetting, compare_sky_models
+from amibayes.comparison.best_fits import NoiseSetting
+from amibayes.comparison.compare import Compared, ModelComparison, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES, Hypothesis
 from amibayes.comparison.summary import derived
 from amibayes.data.observables import Observables

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
+from amibayes.comparison.best_fits import NoiseSetting, best_fits
 from amibayes.comparison.confusion import HOPELESS, measure_confusion
-from amibayes.comparison.fit_models import ModelFit, fit_model
+from amibayes.comparison.fit_models import ModelFit
 from amibayes.comparison.hypotheses import (
-    MORE_GENERAL,
-    Hypothesis,
     hypotheses,
-    prior_of,
 )
 from amibayes.comparison.integral import Effort, integrate
-from amibayes.comparison.unit_cube import CubeModel
 from amibayes.comparison.verdict import Confusion, ModelVerdict, choose
 from amibayes.data.observables import Observables
-from amibayes.likelihood.averaged_noise import averaged_noise
 from amibayes.likelihood.chi2 import chi2_survival
-from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.parallel import Executor, Journal, Progress
 from amibayes.posterior.priors import Prior, PriorSetting
 from amibayes.posterior.sampler import Draws, draw_posterior
@@ -128,24 +123,6 @@ class ModelComparison:
         return f"<ModelComparison: {self.verdict.statement}; {listed}>"
 
 
-@dataclass(frozen=True)
-class NoiseSetting:
-    """How the noise of a search was made: what the comparison makes its own from.
-
-    Parameters
-    ----------
-    found : ExtraNoise
-        Of the search.
-    prior : NoisePrior, optional
-        None: the noise of the search stands as it is.
-    per_file : bool
-    """
-
-    found: ExtraNoise = field(default_factory=ExtraNoise)
-    prior: NoisePrior | None = None
-    per_file: bool = False
-
-
 def compare_sky_models(
     result: SearchResult,
     prior: Prior,
@@ -188,9 +165,7 @@ def compare_sky_models(
     """
     asked, streams = hypotheses(models), rng.spawn(4)
     setting = noise or NoiseSetting()
-    fits, found = _best_fits(
-        asked, result, prior, stated, setting, settings, default_field, streams
-    )
+    fits, found = best_fits(asked, result, prior, stated, setting, settings, default_field, streams)
     compared = _all_compared(fits, streams[1], method)
     log_prior = np.full(len(fits), -np.log(len(fits)))
     wanted = _n_confusion(result.likelihood) if confusion_draws is None else confusion_draws
@@ -206,123 +181,9 @@ def compare_sky_models(
     return ModelComparison(compared, log_prior, found, confusion, statement)
 
 
-def _best_fits(
-    asked: Sequence[Hypothesis],
-    result: SearchResult,
-    prior: Prior,
-    stated: Observables | None,
-    setting: NoiseSetting,
-    settings: Sequence[PriorSetting],
-    default_field: tuple[float, float] | None,
-    streams: Sequence[np.random.Generator],
-) -> tuple[list[ModelFit], ExtraNoise]:
-    """Best fits with the noise, and in the field, that the best of the models leaves."""
-    modes = {"companion": np.array([m.theta for m in result.modes])}
-    fits = _fits(asked, result.likelihood, prior, settings, modes, streams[0])
-    found, likelihood, best = _best_noise(fits, result.likelihood, stated, setting)
-    narrow = default_field is not None and best.family != "point"
-    if narrow and default_field is not None:
-        # Companions were looked for far out because one inside does not explain the data; where
-        # other light does, that was not called for.
-        prior = replace(prior, inner_mas=default_field[0], outer_mas=default_field[1])
-    if likelihood is not result.likelihood or narrow:
-        known = {fit.hypothesis.name: fit.model.theta(fit.cube) for fit in fits}
-        fits = _fits(asked, likelihood, prior, settings, known, streams[3])
-    return _averaged(fits, stated, setting, found), found
-
-
 def _n_confusion(likelihood: Likelihood) -> int:
     wanted = CONFUSION_VALUES // max(len(likelihood.samples), 1)
     return int(np.clip(wanted, MIN_CONFUSION, CONFUSION_DRAWS))
-
-
-def _fits(
-    asked: Sequence[Hypothesis],
-    base: Likelihood,
-    prior: Prior,
-    settings: Sequence[PriorSetting],
-    known: Mapping[str, FloatArray],
-    rng: np.random.Generator,
-) -> list[ModelFit]:
-    """Best fits of all models, simpler ones first, in the order that was asked for."""
-    star = single_likelihood(base).parameters.names
-    done: dict[str, ModelFit] = {}
-
-    def fitted(name: str) -> ModelFit:
-        if name not in done:
-            one = Hypothesis(name)
-            likelihood = one.likelihood(base)
-            model = CubeModel(one, likelihood, prior_of(likelihood, prior, star, settings))
-            parts = [fitted(simpler) for simpler in _simpler(one)]
-            done[name] = fit_model(model, parts, rng, known.get(name))
-        return done[name]
-
-    return [fitted(one.name) for one in asked]
-
-
-def _simpler(one: Hypothesis) -> list[str]:
-    """Names of the models with one source less, or with that source in less detail."""
-    parts = one.parts
-    if not parts:
-        return []
-    if parts == ("two",):
-        return ["companion"]
-    found = ["+".join(p for p in parts if p != left) or "star" for left in parts]
-    special = {general: p for p, general in MORE_GENERAL.items()}
-    for part in parts:
-        if part in special:
-            found.append("+".join(special.get(p, p) if p == part else p for p in parts))
-    return list(dict.fromkeys(found))
-
-
-def _best_noise(
-    fits: list[ModelFit], base: Likelihood, stated: Observables | None, setting: NoiseSetting
-) -> tuple[ExtraNoise, Likelihood, Hypothesis]:
-    """Fit the noise at the best fit of every model, and take that of the most likely pair.
-
-    Returns the noise, a likelihood with it (``base`` where that has it), and the model.
-    """
-    if stated is None or setting.prior is None:
-        best = min(fits, key=lambda fit: float(fit.chi2[0]))
-        return setting.found, base, best.hypothesis
-    clean = Likelihood(stated, base.model)
-    tried = []
-    for fit in fits:
-        likelihood = clean.with_model(fit.model.likelihood.model).expecting(fit.theta)
-        found = fit_noise(likelihood, fit.theta, per_file=setting.per_file, prior=setting.prior)
-        noisy = with_noise(likelihood, found)
-        tried.append((float(noisy.log_prob(fit.theta[None])[0]), noisy, found, fit.hypothesis))
-    _, noisy, found, one = max(tried, key=lambda t: t[0])
-    if found == setting.found:
-        return found, base, one
-    return found, base.with_noise(noisy.noise), one
-
-
-def _averaged(
-    fits: list[ModelFit], stated: Observables | None, setting: NoiseSetting, found: ExtraNoise
-) -> list[ModelFit]:
-    """Average the likelihood over the amount of noise, the same way for all models."""
-    if stated is None or setting.prior is None or setting.prior.vis2 <= 0.0:
-        return fits
-    # Gains and coherent errors go with the fringes of a fit, as in the noise that was fitted.
-    best = min(fits, key=lambda fit: float(fit.chi2[0]))
-    clean = Likelihood(stated, best.model.likelihood.model)
-    noise = averaged_noise(
-        fits[0].model.likelihood.noise,
-        clean.expecting(best.theta).observables,
-        [(fit.model.likelihood, fit.theta) for fit in fits],
-        per_file=setting.per_file,
-        channels=found.channels,
-        prior=setting.prior,
-    )
-    return [
-        replace(
-            fit,
-            model=(model := replace(fit.model, likelihood=fit.model.likelihood.with_noise(noise))),
-            banks=tuple(replace(bank, model=model) for bank in fit.banks),
-        )
-        for fit in fits
-    ]
 
 
 def _all_compared(
@@ -341,7 +202,7 @@ def _all_compared(
 def largest_log_prob(fit: ModelFit) -> float:
     """ln L of the best fit, which the evidence is below."""
     data = fit.model.likelihood.observables.data
-    return float(fit.model.log_prob(fit.cube[:1], data)[0])
+    return float(fit.model.log_prob(fit.cube, data).max())
 
 
 def _compared(
@@ -350,6 +211,7 @@ def _compared(
     likelihood, model = fit.model.likelihood, fit.model
     if method in SAMPLERS and model.n_dim and not hopeless:
         draws, how = draw_posterior(likelihood, model.prior, rng, method), method
+        draws = replace(draws, samples=model.brighter_first(draws.samples))
     else:
         n = int(np.clip(DRAWS_VALUES // len(likelihood.samples), MIN_DRAWS, Effort().modes))
         effort = HURRIED if hopeless else Effort(prior=2 * n, modes=n)

@@ -22,6 +22,15 @@ FIRST_STEPS, CONTINUED = 8, 64
 KEPT = 24
 """Fits that are kept of each model, the best ones."""
 
+REFERENCES, ELSEWHERE = 3, 0.05
+"""Fits of a simpler model that another source is searched for beside: the best one, and others that
+differ from it by so much in a dimension of the cube. Two companions may each be an alias, or
+lie where the best single one does not."""
+
+AS_GOOD = 1.0
+"""χ² within which, of several places of companions, the innermost counts as the best fit: a mask
+on a lattice repeats itself on the sky, as in `amibayes.companion_search.modes`."""
+
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
@@ -78,8 +87,10 @@ def fit_model(
         Parameter sets to begin from too.
     """
     data = model.likelihood.observables.data
-    banks = tuple(_banks(model, parts, int(rng.integers(2**31))))
-    starts = [bank.seeds(data[:, None])[0] for bank in banks]
+    seed = int(rng.integers(2**31))
+    banks = tuple(_banks(model, parts, seed))
+    more = [bank for k in range(1, REFERENCES) for bank in _banks(model, parts, seed, k)]
+    starts = [bank.seeds(data[:, None])[0] for bank in (*banks, *more)]
     starts.append(rng.random((n_starts(model) if model.n_dim else 1, model.n_dim)))
     starts += [embedded(model, part.model, part.cube[0])[None] for part in parts]
     if known is not None:
@@ -89,14 +100,44 @@ def fit_model(
         cube, chi2 = least_squares(model, every, np.tile(data[:, None], (1, len(every))), steps)
         order = np.argsort(chi2, kind="stable")[:kept]
         every = cube[order]
+    cube, chi2 = model.brighter_first(every), chi2[order]
+    order = np.argsort(np.arange(len(chi2)) != innermost(model, cube, chi2), kind="stable")
     return ModelFit(model, cube[order], chi2[order], banks)
 
 
-def _banks(model: CubeModel, parts: Sequence[ModelFit], seed: int) -> list[SeedBank]:
-    """A bank of every source that a simpler model lacks, on what that model fits."""
+def innermost(model: CubeModel, cube: FloatArray, chi2: FloatArray) -> int:
+    """Which of the fits (n, n_dim) that are as good as the best has the nearest companions."""
+    parameters, theta = model.likelihood.parameters, model.theta(cube)
+    if not parameters.companions:
+        return int(np.argmin(chi2))
+    places = [theta[:, parameters.place(k + 1)] for k in range(parameters.companions)]
+    far = np.sum([np.hypot(*place.T) for place in places], axis=0)
+    return int(np.argmin(np.where(chi2 <= chi2.min() + AS_GOOD, far, np.inf)))
+
+
+def references(fit: ModelFit) -> FloatArray:
+    """Fits (n, n_dim) of a model that differ from each other, the best first."""
+    kept = [fit.cube[0]]
+    for cube in fit.cube[1:]:
+        apart = np.abs(fit.model.apart(np.array(kept), cube)).max(axis=1, initial=0.0)
+        if len(kept) < REFERENCES and (apart > ELSEWHERE).all():
+            kept.append(cube)
+    return np.array(kept)
+
+
+def _banks(
+    model: CubeModel, parts: Sequence[ModelFit], seed: int, number: int = 0
+) -> list[SeedBank]:
+    """A bank of every source that a simpler model lacks, on what that model fits.
+
+    On the best of its fits, or the one of a ``number`` where it has companions.
+    """
     found = []
     for part in parts:
-        reference = embedded(model, part.model, part.cube[0])
+        known = references(part) if part.hypothesis.companions else part.cube[:1]
+        if number >= len(known):
+            continue
+        reference = embedded(model, part.model, known[number])
         names = [n.replace("ring_", "crescent_") for n in part.model.likelihood.parameters.names]
         names += part.model.likelihood.parameters.names
         for columns, flux in model.groups:

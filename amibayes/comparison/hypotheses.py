@@ -10,8 +10,11 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.background import Background
 from amibayes.models.binary import BinaryModel
 from amibayes.models.extended import Extended
+from amibayes.models.parameters import Parameter
+from amibayes.models.source import Component
 from amibayes.posterior.evidence import HALO_BACKGROUND
 from amibayes.posterior.priors import Prior, PriorSetting
 from amibayes.support.options import SKY_MODELS
@@ -88,8 +91,19 @@ class Hypothesis:
         return held and (other.halo or not self.halo)
 
     def model(self, base: BinaryModel) -> BinaryModel:
-        """The model, with the star of ``base`` and companions of its kind."""
-        around = tuple(replace(EXTENDED[p], smearing=base.smearing) for p in self.surroundings)
+        """The model, with the star of ``base`` and companions of its kind.
+
+        The flux of extended light goes with wavelength as that of companions does.
+        """
+        around = tuple(
+            replace(
+                EXTENDED[p],
+                smearing=base.smearing,
+                slope=base.contrast_slope,
+                reference_wavelength_m=base.reference_wavelength_m,
+            )
+            for p in self.surroundings
+        )
         return replace(
             base,
             companions=self.companions,
@@ -108,12 +122,13 @@ def hypotheses(names: Iterable[str]) -> tuple[Hypothesis, ...]:
     Raises
     ------
     UsageError
-        Where a name is not known.
+        Where a name is not known, or two names are of one model, which would count twice.
     """
     found = tuple(Hypothesis(name) for name in dict.fromkeys(names))
+    seen: dict[frozenset[str], str] = {}
     for one in found:
-        unknown = [p for p in one.name.split("+") if p not in SKY_MODELS]
-        if unknown or len(set(one.name.split("+"))) < len(one.name.split("+")):
+        words = one.name.split("+")
+        if any(p not in SKY_MODELS for p in words) or len(set(words)) < len(words):
             raise UsageError(
                 f"{one.name!r} is no model of the sky",
                 source="--models",
@@ -121,13 +136,51 @@ def hypotheses(names: Iterable[str]) -> tuple[Hypothesis, ...]:
             )
         if {"companion", "two"} <= set(one.parts):
             raise UsageError("two already has both companions", source="--models")
+        other = seen.setdefault(frozenset(one.parts), one.name)
+        if other != one.name:
+            raise UsageError(
+                f"{other} and {one.name} are one model", source="--models", remedy="name it once"
+            )
     return found
 
 
-def extended_names(models: Iterable[str]) -> set[str]:
-    """Names of the parameters of extended light in some models, without their unit."""
-    parts = [EXTENDED[p] for one in hypotheses(models) for p in one.surroundings]
-    return {p.name.removesuffix("_mas") for part in parts for p in part.parameters}
+def extended_parameters(models: Iterable[str]) -> dict[str, Parameter]:
+    """Parameters of extended light in some models, by their names without unit."""
+    asked = hypotheses(models)
+    parts: list[Component] = [EXTENDED[p] for one in asked for p in one.surroundings]
+    parts += [Background("free") for one in asked if one.halo]
+    return {p.name.removesuffix("_mas"): p for part in parts for p in part.parameters}
+
+
+def split_settings(
+    settings: Iterable[PriorSetting], models: Iterable[str], *, background: bool
+) -> tuple[tuple[PriorSetting, ...], tuple[PriorSetting, ...]]:
+    """Split settings of priors into those of companions and star, and of extended light.
+
+    With a free ``background``, over-resolved light is there in every model, and is the star's.
+
+    Raises
+    ------
+    UsageError
+        Where a range is one that a parameter of extended light cannot have.
+    """
+    known = extended_parameters(models)
+    if background:
+        known.pop("background", None)
+    mine = tuple(s for s in settings if s.name.removesuffix("_mas") in known)
+    for one in mine:
+        p = known[one.name.removesuffix("_mas")]
+        low, high = one.bounds or (p.lower, p.upper)
+        logarithmic = p.unit == "mas" or p.name.endswith("_flux")
+        if low < p.lower or high > p.upper or (logarithmic and not low > 0.0):
+            least = "above 0" if logarithmic else f"{p.lower:g}"
+            most = f" to {p.upper:g}" if np.isfinite(p.upper) else ""
+            raise UsageError(
+                f"the range of {one.name}, {low:g} to {high:g}, is impossible",
+                source="--prior",
+                remedy=f"it goes from {least}{most}",
+            )
+    return tuple(s for s in settings if s not in mine), mine
 
 
 def prior_of(

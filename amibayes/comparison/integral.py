@@ -54,7 +54,7 @@ def log_z_laplace(model: CubeModel, data: FloatArray, cube: FloatArray, chi2: Fl
     triangle = laplace_shapes(model, best[None], model.inflation(chi2[[first]]))[0]
     volume = np.log(np.diag(triangle)).sum() + 0.5 * len(best) * np.log(2.0 * np.pi)
     at_best = model.log_prob(best[None], data)[0]
-    return float(at_best + min(volume - np.log(2.0) * edges.sum(), 0.0))
+    return float(at_best + min(volume - np.log(2.0) * edges.sum() + model.log_names, 0.0))
 
 
 def integrate(

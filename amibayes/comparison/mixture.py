@@ -53,7 +53,7 @@ class PriorDraws:
     @classmethod
     def of(cls, model: CubeModel, n: int, rng: np.random.Generator) -> PriorDraws:
         """Draw ``n`` points."""
-        cube = rng.random((n, model.n_dim))
+        cube = model.brighter_first(rng.random((n, model.n_dim)))
         return cls(cube, model.predict(cube))
 
 
@@ -110,10 +110,21 @@ class Mixture:
         turned = self.model.turning & (np.abs(step) > 0.5)
         found = np.where(self.model.turning, found % 1.0, found)
         inside = ((found >= 0.0) & (found <= 1.0)).all(axis=1) & ~turned.any(axis=1)
-        return np.asarray(found[inside])
+        return self.model.brighter_first(found[inside])
 
     def log_parts(self, cube: FloatArray) -> FloatArray:
-        """Log-density of each distribution times its share, (k, n)."""
+        """Log-density of each distribution times its share, (k, n).
+
+        Of two companions the brighter one is the first: what is drawn the other way round is
+        exchanged, and both ways count.
+        """
+        out = self._log_parts(cube)
+        if not self.model.exchangeable:
+            return out
+        return np.logaddexp(out, self._log_parts(self.model.exchanged(cube)))
+
+    def _log_parts(self, cube: FloatArray) -> FloatArray:
+        """`log_parts` of points as they are."""
         d = self.model.n_dim
         norm = gammaln(0.5 * (TAILS + d)) - gammaln(0.5 * TAILS) - 0.5 * d * np.log(TAILS * np.pi)
         out = np.empty((len(self.share), len(cube)))
@@ -172,7 +183,7 @@ def first_mixture(model: CubeModel, cube: FloatArray, chi2: FloatArray, most: in
     scale = model.inflation(best)
     merit = ((chi2 - best) / scale).ravel()
     inflation = np.broadcast_to(scale, chi2.shape).ravel()
-    fits = cube.reshape(-1, model.n_dim)
+    fits = model.brighter_first(cube.reshape(-1, model.n_dim))
     order = np.argsort(merit, kind="stable")
     kept: list[int] = []
     for i in order[merit[order] <= MODE_LIMIT]:
@@ -221,10 +232,10 @@ def weighted(
     total = len(prior.cube) + n
     cube = np.concatenate([prior.cube, drawn])
     value = np.concatenate([at_prior, log_prob(drawn)]) if len(drawn) else at_prior
-    share = len(prior.cube) / total
+    share, log_names = len(prior.cube) / total, mixture.model.log_names
     parts = mixture.log_parts(cube) + np.log1p(-share)
-    density = np.logaddexp(np.log(share), log_sum(parts))
-    return WeightedDraws(cube, value, value - density[:, None], total)
+    density = np.logaddexp(np.log(share) + log_names, log_sum(parts))
+    return WeightedDraws(cube, value, value + log_names - density[:, None], total)
 
 
 def _cholesky(matrix: FloatArray) -> FloatArray:

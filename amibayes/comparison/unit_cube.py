@@ -58,6 +58,28 @@ class CubeModel:
         found[periodic(self.likelihood)] = True
         return found
 
+    @property
+    def exchangeable(self) -> bool:
+        """Whether there are two companions, which may be called by either's number."""
+        return self.likelihood.parameters.companions == 2
+
+    def exchanged(self, points: FloatArray) -> FloatArray:
+        """Points (…, n_dim), of the cube or parameter sets, with the companions exchanged."""
+        return points[..., self.likelihood.parameters.swapped]
+
+    def brighter_first(self, points: FloatArray) -> FloatArray:
+        """The same sky with the brighter companion first: points (…, n_dim) or parameter sets."""
+        if not self.exchangeable:
+            return points
+        one, two = (self.likelihood.parameters.columns("flux", component=k)[0] for k in (1, 2))
+        fainter = points[..., one] < points[..., two]
+        return np.where(fainter[..., None], self.exchanged(points), points)
+
+    @property
+    def log_names(self) -> float:
+        """ln of how many ways the companions may be numbered."""
+        return float(np.log(2.0)) if self.exchangeable else 0.0
+
     def inside(self, cube: FloatArray) -> FloatArray:
         """Bring points (n, n_dim) back: angles by whole turns, the rest to the nearest edge."""
         return np.where(self.turning, cube % 1.0, np.clip(cube, 0.0, 1.0))

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.field import default_separation
-from amibayes.comparison.compare import ModelComparison, NoiseSetting, compare_sky_models
-from amibayes.comparison.hypotheses import FAMILIES, extended_names
+from amibayes.comparison.best_fits import NoiseSetting
+from amibayes.comparison.compare import ModelComparison, compare_sky_models
+from amibayes.comparison.hypotheses import FAMILIES
 from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
 from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.likelihood import Likelihood
@@ -16,7 +17,7 @@ from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Run
-from amibayes.posterior.priors import Prior, PriorSetting
+from amibayes.posterior.priors import Prior
 from amibayes.support.options import NULL_DRAWS, SAMPLERS
 
 
@@ -49,7 +50,7 @@ def compare_stage(
             models=options.models,
             stated=used if fitted else None,
             noise=noise,
-            settings=extended_settings(options)[1],
+            settings=options.settings[1],
             method=method,
             default_field=_default_field(found, options),
             executor=run.executor,
@@ -132,12 +133,3 @@ def _default_field(found: FieldSearch, options: SearchOptions) -> tuple[float, f
         return None
     inner, outer = default_separation(Likelihood(found.result.likelihood.observables))
     return (inner, outer) if found.result.grid.outer_mas > 1.01 * outer else None
-
-
-def extended_settings(
-    options: SearchOptions,
-) -> tuple[tuple[PriorSetting, ...], tuple[PriorSetting, ...]]:
-    """Split settings of priors into those of companions and star, and of extended light."""
-    names = extended_names(options.models or ())
-    mine = tuple(s for s in options.prior if s.name.removesuffix("_mas") in names)
-    return tuple(s for s in options.prior if s not in mine), mine

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from amibayes.comparison.hypotheses import split_settings
 from amibayes.extraction.reading import ImageOptions
 from amibayes.posterior.priors import PriorSetting
 from amibayes.support.arguments import annulus, checks_arguments, in_range, one_of
@@ -182,6 +183,19 @@ class SearchOptions:
                 one_of("SearchOptions", name, one, known)
         methods = (*EVIDENCE_METHODS, *SAMPLERS)  # those too that were put there since
         one_of("SearchOptions", "evidence_method", self.evidence_method, dict.fromkeys(methods))
+        _ = self.settings  # which refuses what no model has, before anything is read
+
+    @property
+    def settings(self) -> tuple[tuple[PriorSetting, ...], tuple[PriorSetting, ...]]:
+        """Settings of priors: of companions and star, and of extended light.
+
+        Raises
+        ------
+        UsageError
+            Where one is impossible, or a model is not known.
+        """
+        free = self.background == "free"
+        return split_settings(self.prior, self.models or (), background=free)
 
     def to_json(self) -> dict[str, Any]:
         """All of them in JSON's types, as ``result.json`` keeps them."""

@@ -13,6 +13,7 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
 from amibayes.companion_search.with_extra_noise import noise_averaged
 from amibayes.comparison.compare import ModelComparison
+from amibayes.comparison.hypotheses import extended_parameters
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.detection.false_alarm import Significance, beside_bright
 from amibayes.detection.splits import Consistency
@@ -26,7 +27,6 @@ from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdi
 from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
 from amibayes.pipeline.models import (
     compare_stage,
-    extended_settings,
     limits_stage,
     with_models,
 )
@@ -340,8 +340,9 @@ def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference)
 def _prior(result: SearchResult, options: SearchOptions) -> Prior:
     likelihood = result.likelihood
     prior = default_prior(likelihood, result.grid.inner_mas, result.grid.outer_mas)
-    settings, _ = extended_settings(options)
-    return edit_prior(prior, settings, single_likelihood(likelihood).parameters.names)
+    others = extended_parameters(options.models or ())
+    names = single_likelihood(likelihood).parameters.names
+    return edit_prior(prior, options.settings[0], names, others)
 
 
 def _counts(options: SearchOptions) -> tuple[int, ...]:

@@ -348,8 +348,15 @@ def parse_setting(text: str) -> PriorSetting:
     return PriorSetting(name, form, bounds)
 
 
-def edit_prior(prior: Prior, settings: Iterable[PriorSetting], nuisance: Iterable[str]) -> Prior:
+def edit_prior(
+    prior: Prior,
+    settings: Iterable[PriorSetting],
+    nuisance: Iterable[str],
+    others: Iterable[str] = (),
+) -> Prior:
     """Change a prior as the settings say; ``nuisance`` names its nuisance parameters.
+
+    ``others`` may be named too, elsewhere: they are offered where a name is not known.
 
     Raises
     ------
@@ -374,7 +381,7 @@ def edit_prior(prior: Prior, settings: Iterable[PriorSetting], nuisance: Iterabl
             raise UsageError(
                 f"{wish.name!r} is not a free parameter",
                 source="--prior",
-                remedy=f"free ones: {', '.join(['contrast', 'position', *names])}",
+                remedy=f"free ones: {', '.join(['contrast', 'position', *names, *others])}",
             )
     return replace(prior, nuisance=tuple(ranges))
 

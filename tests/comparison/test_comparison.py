@@ -10,7 +10,8 @@ from helpers import niriss, simulated
 from scipy.special import logsumexp
 
 from amibayes.companion_search.search import search
-from amibayes.comparison.compare import NoiseSetting, _best_noise, compare_sky_models
+from amibayes.comparison.best_fits import NoiseSetting, _best_noise
+from amibayes.comparison.compare import compare_sky_models
 from amibayes.comparison.fit_models import embedded, fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import Hypothesis, hypotheses, prior_of
@@ -265,10 +266,10 @@ def test_noise_is_that_of_the_most_likely_model_with_its_own(of_search: ExtraNoi
     setting = NoiseSetting(of_search, NoisePrior())
     clean = base.observables
     noisy = with_noise(base, of_search)
-    found, likelihood, one = _best_noise(fits, noisy, clean, setting)
-    assert (one.name, found.any) == ("companion", False)
+    likely = _best_noise(fits, noisy, clean, setting)
+    assert (likely.of.name, likely.noise.any) == ("companion", False)
     at = fits[1].theta[None]
-    assert likelihood.log_prob(at) == pytest.approx(base.log_prob(at))
+    assert likely.likelihood.log_prob(at) == pytest.approx(base.log_prob(at))
 
 
 def test_the_averaged_noise_has_the_errors_that_data_are_simulated_with() -> None:

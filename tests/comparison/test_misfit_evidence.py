@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from helpers import niriss, simulated
 
-from amibayes.comparison.compare import Compared, NoiseSetting, compare_sky_models
+from amibayes.comparison.best_fits import NoiseSetting
+from amibayes.comparison.compare import Compared, compare_sky_models
 from amibayes.pipeline.field import noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.posterior.nested import NestedSampler
