@@ -68,6 +68,8 @@ class Curvature:
     bend_dof : int
     waves : WaveColumns, optional
         What errors of the converter make of the ramps, where the bias is known.
+    noise_degrees : float
+        Degrees of freedom that the read noise is known with.
     """
 
     source: str
@@ -84,6 +86,7 @@ class Curvature:
     bend_chi2: float
     bend_dof: int
     waves: WaveColumns | None = None
+    noise_degrees: float = np.inf
 
     def __post_init__(self) -> None:
         read_only(self, "current", "change", "sigma", "batches", "gains", "departure")
@@ -265,6 +268,7 @@ def _averaged(sums: _Sums, weights: _Weights, file: RampFile, bad: BoolArray) ->
         weights.lag_s,
         float(chi2[used].sum()),
         int(used.sum()) * (len(weights.kept) - 2),
+        noise_degrees=file.noise_degrees,
     )
     if file.bias_dn is None:
         return found

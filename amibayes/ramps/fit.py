@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import f as f_distribution
 
 from amibayes.ramps.converter import WAVE_PRIOR, WAVES
 from amibayes.ramps.curvature import Curvature
@@ -211,9 +212,21 @@ def _solved(exposures: Sequence[Curvature], kinds: tuple[str, ...]) -> Migration
     chi2, bend = (sum(s.left(value) for s in parts) for parts in (systems, bends))
     dof, bend_dof = sum(s.n_data for s in systems) - len(kinds), sum(e.bend_dof for e in exposures)
     migration = replace(migration, covariance=migration.covariance * scale**2)
-    p = float(chi2_distribution.sf(chi2, dof))
-    p_bend = float(chi2_distribution.sf(bend, bend_dof)) if bend_dof else 1.0
+    known = sum(e.noise_degrees for e in exposures)
+    p, p_bend = survival(chi2, dof, known), survival(bend, bend_dof, known)
     return MigrationFit(migration, chi2, dof, chi2, p, bend, p_bend, scale, tuple(exposures))
+
+
+def survival(chi2: float, dof: int, noise_degrees: float) -> float:
+    """Probability of a larger χ², of noise whose variance is known with degrees of freedom.
+
+    Their ratio per degree has Fisher's F distribution.
+    """
+    if not dof:
+        return 1.0
+    if not np.isfinite(noise_degrees):
+        return float(chi2_distribution.sf(chi2, dof))
+    return float(f_distribution.sf(chi2 / dof, dof, noise_degrees))
 
 
 @dataclass(frozen=True, eq=False)

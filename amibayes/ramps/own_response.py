@@ -21,6 +21,9 @@ from amibayes.units import FloatArray, IntArray, freeze
 WIDEST = 3e-6
 """Per electron: 4 % at half of full well, more than any pixel that may be used is off by."""
 
+STRANGE = 5.0
+"""Standard deviations beyond twice that from which on it is not linearity that a pixel shows."""
+
 CARRIED = 40
 """Pixels whose errors are followed into V² and closure phases: what a pixel does goes with the
 fourth power of its light, and these have nearly all of it."""
@@ -73,6 +76,9 @@ def own_response(
     known = np.sum([w * g**2 for w, g in zip(weight, gain, strict=True)], axis=0)
     right = np.sum([w * g * r for w, g, r in zip(weight, gain, change, strict=True)], axis=0)
     seen = known > 0.0
+    # Far more than any pixel's linearity is off by: a jump that was not flagged, or the like.
+    size = np.abs(right[seen]) / known[seen] - 2.0 * WIDEST
+    seen[seen] = size < STRANGE / np.sqrt(known[seen])
     variance = 1.0 / known[seen]
     found = right[seen] * variance
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, read_cube
+from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, open_cube, read_cube
+from amibayes.cube.ramps import RampFile
 from amibayes.errors import DataError
 
 GAIN, READ_DN, TIME_S = 1.61, 9.0, 0.07544
@@ -74,8 +75,6 @@ def test_jumps_and_saturation_are_left_out(tmp_path: Path, rng: np.random.Genera
 def test_a_few_integrations_are_those_of_the_whole(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    from amibayes.cube import open_cube
-
     path = ramp_file(tmp_path / "a_ramp.fits", rng)
     with open_cube(path) as file:
         part = file.read(5, 9)
@@ -103,3 +102,58 @@ def test_ramps_that_the_charge_migration_step_has_cut_are_told(
 ) -> None:
     cube = read_cube(ramp_file(tmp_path / "a_ramp.fits", rng, S_CHGMIG=state))
     assert any("charge_migration step" in note for note in cube.notes) == (state == "COMPLETE")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"NGROUPS": 5}, r"axes \(40, 8, 16, 16\), and NGROUPS is 5"),
+        ({"NFRAMES": "x"}, "NFRAMES"),
+        ({"hdus": lambda found: {"GROUPDQ": np.zeros(SHAPE)}}, "GROUPDQ holds floating"),
+        ({"hdus": lambda found: {"SCI": np.zeros(SHAPE, np.float32)}}, "every pixel is flagged"),
+        (
+            {"hdus": lambda found: {"PIXELDQ": np.full(SHAPE[2:], DO_NOT_USE, np.uint32)}},
+            "every pixel is flagged",
+        ),
+        ({"hdus": lambda found: {k: v[0] for k, v in found.items() if v.ndim == 4}}, "three axes"),
+    ],
+)
+def test_ramps_that_are_not_what_the_header_says_are_refused(
+    change: dict[str, Any], match: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    with pytest.raises(DataError, match=match):
+        read_cube(ramp_file(tmp_path / "a_ramp.fits", rng, **change))
+
+
+def test_electrons_are_told_by_every_spelling(tmp_path: Path, rng: np.random.Generator) -> None:
+    for unit in ("electron", "electrons", "e-"):
+        path = ramp_file(tmp_path / f"{unit}_ramp.fits", rng, BUNIT=unit)
+        assert read_cube(path).unit == "electron/s"
+    assert read_cube(ramp_file(tmp_path / "dn_ramp.fits", rng, BUNIT="DN")).unit == "DN/s"
+
+
+def test_the_time_of_a_group_follows_from_its_frames(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    change = {"TFRAME": TIME_S / 5.0, "NFRAMES": 4, "GROUPGAP": 1}
+    path = ramp_file(tmp_path / "a_ramp.fits", rng, **change)
+    fits.delval(path, "TGROUP")
+    cube = read_cube(path)
+    assert np.median(cube.images / rate_dn_s()) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("n", [2, 3, 40])
+def test_read_noise_is_true_of_few_integrations_too(n: int, tmp_path: Path) -> None:
+    found = []
+    for seed in range(12):
+        rng = np.random.default_rng([n, seed])
+        path = ramp_file(
+            tmp_path / f"{seed}_ramp.fits",
+            rng,
+            hdus=lambda parts: {k: v[:n] for k, v in parts.items() if v.ndim == 4},
+        )
+        with open_cube(path) as file:
+            assert isinstance(file, RampFile)
+            found.append(file.noise[1])
+    # 128 faint pixels in each of twelve files: to 0.6 % for n = 2, photons included.
+    assert np.sqrt(np.mean(found)) == pytest.approx(READ_DN, rel=0.025)

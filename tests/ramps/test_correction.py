@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 from charge_drift import drifting_ramp
 
-from amibayes.cube import Cube, write_cube
+from amibayes.cube import Cube, read_cube, write_cube
 from amibayes.cube.source import InMemoryCube, opened
 from amibayes.data.observables import Observables
 from amibayes.errors import UsageError
@@ -205,3 +205,40 @@ def test_slopes_beside_ramps_are_corrected_with_their_fit(
     write_cube(beside, replace(slopes, header={"NGROUPS": GROUPS, "TGROUP": FRAME_S}))
     found = visit_migration([visit[0], beside], ExtractOptions(), {})
     assert [f.migration.source for f in found if f.migration is not None] == ["fit", "fit"]
+
+
+def test_single_pixels_that_differ_go_through_the_extraction(tmp_path: Path) -> None:
+    """A pixel of its own linearity is found, taken off and in the errors that files share."""
+    ramps = noisy_ramps(9, 30, 1.0)
+    top = np.unravel_index(np.argmax(ramps[:, -1].mean(axis=0)), ramps.shape[2:])
+    at = (..., *top)
+    ramps[at] += 0.5 * 6e-6 * ramps[at] ** 2
+    path = tmp_path / "bent_ramp.fits"
+    write_ramps(path, ramps)
+    (found,) = extract_all([path], ExtractOptions(charge_migration="fit"))
+    fit = found.charge.fit
+    assert fit is not None
+    assert fit.pixels_differ
+    assert fit.own is not None
+    assert fit.own.carried.dtype.kind == "i"
+    assert found.observables.shared is not None
+    assert len(found.observables.shared.names) > 10
+
+
+def test_an_exposure_counts_once(visit: list[Path], tmp_path: Path) -> None:
+    """Ramps beside their slopes, and a segment beside the whole, are refused; segments are not."""
+    exposure = {"EXPSTART": 60000.0, "EXPEND": 60000.1, "TARGPROP": "star"}
+    ramps = noisy_ramps(1, 8, 0.5)
+    whole = tmp_path / "whole_ramp.fits"
+    write_ramps(whole, ramps, **exposure, INTSTART=1, INTEND=8)
+    parts = [tmp_path / f"seg{k}_ramp.fits" for k in (1, 2)]
+    for k, path in enumerate(parts):
+        own = {"INTSTART": 4 * k + 1, "INTEND": 4 * k + 4}
+        write_ramps(path, ramps[4 * k : 4 * k + 4], **exposure, **own)
+    slopes = tmp_path / "whole_calints.fits"
+    write_cube(slopes, replace(read_cube(whole), header=fits.getheader(whole)))
+    for pair in ([whole, parts[0]], [whole, slopes]):
+        with pytest.raises(UsageError, match="same exposure"):
+            extract_all(pair, ExtractOptions(charge_migration="off"))
+    (found,) = extract_all(parts, ExtractOptions(charge_migration="off"))
+    assert len(found.frames) == 8

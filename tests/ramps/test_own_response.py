@@ -96,6 +96,19 @@ def test_slopes_are_nearer_to_those_of_even_pixels() -> None:
     assert after < 0.7 * before
 
 
+def test_a_jump_that_was_not_flagged_is_no_linearity() -> None:
+    """Three cosmic rays in faint pixels of sixty integrations of even ones."""
+    file = ramp_file(77, 60, 6, MOVING)
+    reads = file.hdus["SCI"].section
+    for integration, row, column in ((3, 1, 2), (17, 30, 5), (40, 8, N - 2)):
+        reads[integration, 3:, row, column] += 20_000.0
+    found = curvature_of(file)
+    assert found is not None
+    fit = fit_migration([found])
+    assert not fit.pixels_differ
+    np.testing.assert_allclose(fit.migration.mean[0], TRUE, atol=5.0 * fit.migration.mean[1])
+
+
 def test_even_pixels_are_left_alone() -> None:
     fits = [
         fit_migration([c for c in [curvature_of(ramp_file(50 + k, 20, 6, MOVING))] if c])
