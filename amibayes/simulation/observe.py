@@ -254,7 +254,9 @@ def _ramp_hdus(prepared: PreparedExposure) -> list[Any]:
     primary, science = headers_of(template, exposure.n_integrations)
     if "DATAMODL" in primary:
         primary["DATAMODL"] = "RampModel"
+    # Groups of ramps are what SCI holds, the read after the reset included where it is kept.
     reads = observation.detector.n_reads(exposure.n_groups)
+    primary["NGROUPS"] = reads
     shape = (exposure.n_integrations, reads, exposure.n_pixels, exposure.n_pixels)
     return [
         fits.PrimaryHDU(header=primary),
