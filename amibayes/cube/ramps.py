@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.cube.container import DO_NOT_USE, JUMP_DET, NO_LIGHT, SATURATED, Cube, flag_bits
 from amibayes.cube.reference_files import Linearity, as_read
@@ -51,10 +52,13 @@ class Differences:
         In the file's unit; 0 where they may not be used.
     good : (n, m, ny, nx) bool array
         Those that may be used.
+    flags : (n, ny, nx) uint32 array
+        SATURATED or JUMP_DET where a group has that flag; JUMP_DET where one is no number.
     """
 
     values: SingleArray
     good: BoolArray
+    flags: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +102,8 @@ class RampFile:
             return self.template, np.zeros(self.template.images.shape)
         found = self.differences(part)
         slope, error, when = self._weights.slopes(found)
-        dq = np.zeros(slope.shape, dtype=np.uint32)
-        dq |= self.pixel_flags
+        dq = found.flags | self.pixel_flags
         dq[~found.good.any(axis=1)] |= DO_NOT_USE
-        dq[~found.good.all(axis=1)] |= JUMP_DET
         time = self.timing.group_s
         mjd = None if self.mjd is None else self.mjd[part]
         cube = replace(self.template, images=slope / time, error=error / time, dq=dq, mjd=mjd)
@@ -125,15 +127,17 @@ class RampFile:
             flags = self.hdus.get("GROUPDQ")
             dq = None if flags is None else np.asarray(flags.section[part])
         good = np.isfinite(groups)
+        flagged = np.where(good.all(axis=1), 0, JUMP_DET).astype(np.uint32)
         groups = self._true(groups)
         steps = groups[:, 1:] - groups[:, :-1]
         used = good[:, 1:] & good[:, :-1]
         if dq is not None and dq.any():
             good = (dq & (DO_NOT_USE | SATURATED)) == 0
             used &= good[:, 1:] & good[:, :-1] & ((dq[:, 1:] & JUMP_DET) == 0)
+            flagged |= np.bitwise_or.reduce(dq, axis=1) & np.uint32(JUMP_DET | SATURATED)
         if not used.all():
             steps[~used] = 0.0
-        return Differences(steps, used)
+        return Differences(steps, used, flagged)
 
     def _true(self, groups: SingleArray) -> SingleArray:
         """Take off what the converter gave too much of, where that is known."""

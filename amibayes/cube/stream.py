@@ -73,7 +73,7 @@ class EmptyImage:
     shape : tuple
         Shape of the array; the first axis counts the planes.
     dtype : str
-        ``float32``, ``uint16`` or ``uint32``.
+        ``float32``, ``uint8``, ``uint16`` or ``uint32``.
     header : astropy Header, optional
         Further keywords.
     """
@@ -88,11 +88,12 @@ class EmptyImage:
 
     def reserve(self, stream: BinaryIO) -> tuple[int, NDArray[Any]]:
         """Write the header and leave room; give the place of the data and a plane's form."""
-        kind = self.dtype if self.dtype.kind == "f" else np.dtype(f"i{self.dtype.itemsize}")
+        offset = _has_offset(self.dtype)
+        kind = np.dtype(f"i{self.dtype.itemsize}") if offset else self.dtype
         header = fits.ImageHDU(np.zeros((1,) * len(self.shape), kind), name=self.name).header
         for axis, length in enumerate(reversed(self.shape), start=1):
             header[f"NAXIS{axis}"] = length
-        if self.dtype.kind == "u":  # FITS has no unsigned integers but by an offset
+        if offset:
             header["BSCALE"] = 1
             header["BZERO"] = 1 << (8 * self.dtype.itemsize - 1)
         header.extend(self._header, unique=True)
@@ -104,10 +105,15 @@ class EmptyImage:
         return start, np.empty(self.shape[1:], self.dtype)
 
 
+def _has_offset(dtype: np.dtype[Any]) -> bool:
+    """Tell whether FITS has such numbers only by an offset: unsigned ones of more than a byte."""
+    return dtype.kind == "u" and dtype.itemsize > 1
+
+
 def _encoded(planes: NDArray[Any], dtype: np.dtype[Any]) -> bytes:
     """Bytes of an array as FITS stores it: big-endian, unsigned with an offset."""
     array = planes.astype(dtype, copy=False)
-    if dtype.kind == "u":
+    if _has_offset(dtype):
         bits = 8 * dtype.itemsize
         array = (array ^ dtype.type(1 << (bits - 1))).view(f"i{dtype.itemsize}")
     return array.astype(array.dtype.newbyteorder(">")).tobytes()

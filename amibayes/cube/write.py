@@ -138,7 +138,7 @@ def cube_stream(
         hdus.append(EmptyImage("ERR", shape, "float32", _unit_header(template.unit)))
     hdus.append(EmptyImage("DQ", shape, "uint32"))
     if mjd is not None:
-        hdus.append(_int_times(mjd, template.integration_time_s or 0.0))
+        hdus.append(int_times(mjd, template.integration_time_s or 0.0))
     with FitsStream.create(path, [*hdus, *tables]) as stream:
         yield CubeStream(stream)
 
@@ -205,7 +205,8 @@ def _unit_header(unit: str) -> Any:
     return header
 
 
-def _int_times(mjd: FloatArray, integration_time_s: float) -> Any:
+def int_times(mjd: FloatArray, integration_time_s: float) -> Any:
+    """Table INT_TIMES of integrations whose middles are at some dates (n_integrations,)."""
     half = integration_time_s / 2.0 / DAY_S
     columns = [
         fits.Column("integration_number", "J", array=np.arange(1, len(mjd) + 1)),

@@ -8,7 +8,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amibayes.cube import DO_NOT_USE
 from amibayes.errors import UsageError
 from amibayes.units import BoolArray, FloatArray
 
@@ -217,6 +219,11 @@ class DetectorMaps:
     def bad(self) -> BoolArray:
         """Pixels that are not to be used."""
         return self.dead | self.hot
+
+    @property
+    def dq(self) -> NDArray[np.uint32]:
+        """(ny, nx) flags of pixels, the same in all integrations."""
+        return np.where(self.bad, DO_NOT_USE, 0).astype(np.uint32)
 
 
 def draw_maps(detector: Detector, shape: tuple[int, int], rng: np.random.Generator) -> DetectorMaps:

@@ -15,7 +15,7 @@ from amibayes.optics import ShiftedImage
 from amibayes.parallel import Executor, Journal, Progress, child_seeds, run_job, slices
 from amibayes.simulation.detector import Detector, DetectorMaps
 from amibayes.simulation.ramps import read_ramps
-from amibayes.simulation.slopes import SlopeFit
+from amibayes.simulation.slopes import SlopeFit, group_flags
 from amibayes.support.arguments import checks_arguments
 from amibayes.units import MAS, FloatArray
 
@@ -137,7 +137,8 @@ def draw_pointings(exposure: Exposure, pixel_rad: float, seed: np.random.SeedSeq
 class Chunk:
     """Consecutive integrations from number ``start`` on; arrays (n, ny, nx).
 
-    ``ramps`` (n, n_reads, ny, nx) are the reads in electrons, where they were kept.
+    ``ramps`` (n, n_reads, ny, nx) are the reads in electrons, where they were kept, and
+    ``group_dq`` their flags (`amibayes.simulation.slopes.group_flags`).
     """
 
     start: int
@@ -145,6 +146,7 @@ class Chunk:
     error: NDArray[np.float32]
     dq: NDArray[np.uint32]
     ramps: NDArray[np.float32] | None
+    group_dq: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,13 +193,14 @@ class Recorder:
         light, n_groups = self.light(jitter), self.exposure.n_groups
         ramps = read_ramps(light, self.detector, n_groups, rng, self.maps.bias_dn)
         slopes = self.fit(ramps)
-        result = {
+        result: dict[str, Any] = {
             "images": slopes.images.astype(np.float32),
             "error": np.sqrt(slopes.variance).astype(np.float32),
             "dq": slopes.dq,
         }
         if self.exposure.keep_ramps:
             result["ramps"] = np.swapaxes(ramps.reads, 0, 1).astype(np.float32)
+            result["group_dq"] = group_flags(ramps, slopes)
         return result
 
 
@@ -264,9 +267,8 @@ def record(
     told = None if progress is None else _counting(progress, recorder.exposure.n_integrations)
     results = run_job(recorder, pieces, executor, journal=journal, progress=told)
     for part, result in zip(parts, results, strict=True):
-        yield Chunk(
-            part.start, result["images"], result["error"], result["dq"], result.get("ramps")
-        )
+        kept = (result.get(name) for name in ("ramps", "group_dq"))
+        yield Chunk(part.start, result["images"], result["error"], result["dq"], *kept)
 
 
 def _counting(progress: Progress, n_integrations: int) -> Progress:

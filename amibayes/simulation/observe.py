@@ -13,6 +13,7 @@ from astropy.io import fits
 
 from amibayes.cube import Cube, CubeStream, EmptyImage, FitsStream, cube_stream, headers_of
 from amibayes.cube.reference_files import BIAS_KEYWORD, LINEARITY_KEYWORD
+from amibayes.cube.write import int_times
 from amibayes.instrument import Instrument
 from amibayes.optics import scene_image
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, child_seeds, spawn
@@ -171,7 +172,8 @@ def write_exposure(
 
     The file carries the truth: the scene and the seed in its header, the sources, the
     wavefront and the pointing of every integration in tables. Where the reads are kept,
-    they go to a file of their own beside it, named ``…_ramp.fits``.
+    they go to a file of their own beside it, named ``…_ramp.fits``, with the flags that the
+    slopes were fitted with.
 
     Parameters
     ----------
@@ -196,8 +198,9 @@ def write_exposure(
     with _files(path, prepared, history) as (cube, ramps):
         for chunk in prepared.take(executor, progress, journal):
             cube.write(chunk.start, chunk.images, chunk.error, chunk.dq)
-            if ramps is not None and chunk.ramps is not None:
+            if ramps is not None and chunk.ramps is not None and chunk.group_dq is not None:
                 ramps.write("SCI", chunk.start, chunk.ramps)
+                ramps.write("GROUPDQ", chunk.start, chunk.group_dq)
 
 
 @contextmanager
@@ -243,12 +246,22 @@ def _write_references(path: Path, prepared: PreparedExposure, header: fits.Heade
 
 
 def _ramp_hdus(prepared: PreparedExposure) -> list[Any]:
+    """What a file of ramps holds; SCI and GROUPDQ are streamed."""
     observation = prepared.observation
     exposure = observation.exposure
     # What a reader of slopes asks of a header, a reader of ramps asks too.
-    primary, science = headers_of(
-        replace(blank_cube(prepared), unit="electron"), exposure.n_integrations
-    )
+    template = replace(blank_cube(prepared), unit="electron")
+    primary, science = headers_of(template, exposure.n_integrations)
+    if "DATAMODL" in primary:
+        primary["DATAMODL"] = "RampModel"
+    # Groups of ramps are what SCI holds, the read after the reset included where it is kept.
     reads = observation.detector.n_reads(exposure.n_groups)
+    primary["NGROUPS"] = reads
     shape = (exposure.n_integrations, reads, exposure.n_pixels, exposure.n_pixels)
-    return [fits.PrimaryHDU(header=primary), EmptyImage("SCI", shape, "float32", science)]
+    return [
+        fits.PrimaryHDU(header=primary),
+        EmptyImage("SCI", shape, "float32", science),
+        fits.ImageHDU(prepared.recorder.maps.dq, name="PIXELDQ"),
+        EmptyImage("GROUPDQ", shape, "uint8"),
+        int_times(observation.mid_times_mjd, template.integration_time_s or 0.0),
+    ]

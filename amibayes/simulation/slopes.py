@@ -8,7 +8,7 @@ C⁻¹1 / (1ᵀC⁻¹1) of all pixels are two matrix products.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,11 +77,16 @@ def slope_weights(electrons: FloatArray, n_increments: int, detector: Detector) 
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Rates of some integrations, with errors and flags, each (n_int, ny, nx)."""
+    """Rates of some integrations, with errors and flags, each (n_int, ny, nx).
+
+    ``jump`` is the number of the first read with a cosmic ray, 0 where none was found; None
+    where none was looked for.
+    """
 
     images: FloatArray
     variance: FloatArray
     dq: NDArray[np.uint32]
+    jump: NDArray[np.int16] | None = None
 
 
 class SlopeFit:
@@ -123,7 +128,7 @@ class SlopeFit:
         if ramps.n_good is not None:
             self._refit_saturated(slopes, ramps.reads, ramps.n_good)
         if self._detector.cosmic_rays_s > 0.0 and self._n > 1:
-            self._refit_jumps(slopes, ramps)
+            slopes = replace(slopes, jump=self._refit_jumps(slopes, ramps))
         return self._flattened(slopes)
 
     def _refit_saturated(
@@ -143,8 +148,11 @@ class SlopeFit:
             slopes.images[where] = np.sum(weights.reads[:, 0] * reads[:good, where], axis=0)
             slopes.variance[where] = weights.variance[0]
 
-    def _refit_jumps(self, slopes: Slopes, ramps: Ramps) -> None:
-        """Find cosmic rays and fit their ramps without the difference that they are in."""
+    def _refit_jumps(self, slopes: Slopes, ramps: Ramps) -> NDArray[np.int16]:
+        """Find cosmic rays and fit their ramps without the difference that they are in.
+
+        Gives the `Slopes.jump` of these ramps.
+        """
         steps = np.diff(ramps.reads, axis=0)
         highest = steps.max(axis=0)
         others = (steps.sum(axis=0) - highest) / (self._n - 1)
@@ -158,6 +166,9 @@ class SlopeFit:
             steps[:, hit], electrons, self._detector
         )
         slopes.dq[hit] |= JUMP_DET
+        jump = np.zeros(hit.shape, np.int16)
+        jump[hit] = steps[:, hit].argmax(axis=0) + 1
+        return jump
 
     def _flattened(self, slopes: Slopes) -> Slopes:
         """Divide by the flat field and mark the bad pixels."""
@@ -165,8 +176,34 @@ class SlopeFit:
         images, variance = slopes.images / flat, slopes.variance / flat**2
         images[:, self._maps.dead] = np.nan
         images[:, self._maps.hot] += self._detector.full_well_e
-        slopes.dq[:, self._maps.bad] |= DO_NOT_USE
-        return Slopes(images, variance, slopes.dq)
+        slopes.dq[:] |= self._maps.dq
+        return replace(slopes, images=images, variance=variance)
+
+
+def group_flags(ramps: Ramps, slopes: Slopes) -> NDArray[np.uint8]:
+    """Flags of the reads that slopes were fitted without, as JWST's GROUPDQ has them.
+
+    Parameters
+    ----------
+    ramps : Ramps
+    slopes : Slopes
+        Of these ramps.
+
+    Returns
+    -------
+    (n_int, n_reads, ny, nx) uint8 array
+        SATURATED from the first read at full well on, and JUMP_DET at the read whose difference
+        from the one before has a cosmic ray. Pixels that are bad in all ramps are not in it.
+    """
+    n_reads, n_int, ny, nx = ramps.reads.shape
+    flags = np.zeros((n_int, n_reads, ny, nx), np.uint8)
+    if ramps.n_good is not None:
+        number = np.arange(n_reads)[:, None, None]
+        flags[number >= ramps.n_good[:, None]] |= SATURATED
+    if slopes.jump is not None:
+        integration, y, x = np.nonzero(slopes.jump)
+        flags[integration, slopes.jump[integration, y, x], y, x] |= JUMP_DET
+    return flags
 
 
 def electron_variance(rate_e_s: FloatArray, detector: Detector) -> FloatArray:

@@ -67,6 +67,9 @@ def test_jumps_and_saturation_are_left_out(tmp_path: Path, rng: np.random.Genera
     for at in ((3, 5, 6), (4, 7, 7), (5, 8, 8)):
         assert abs(cube.images[at] - rate_dn_s()[at[1:]]) < 5.0 * cube.error[at]
         assert cube.error[at] > 1.03 * np.median(cube.error[:, at[1], at[2]])
+    assert [cube.dq[at] for at in ((3, 5, 6), (4, 7, 7), (5, 8, 8), (6, 2, 2), (7, 2, 2))] == [
+        JUMP_DET, JUMP_DET, SATURATED, DO_NOT_USE, 0,
+    ]  # fmt: skip
     assert cube.bad[6, 2, 2]
     assert cube.bad[:, 1, 1].all()
     assert cube.bad.sum() == 1 + SHAPE[0]

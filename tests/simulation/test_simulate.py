@@ -6,6 +6,8 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +22,10 @@ from amibayes.instrument import load_instrument
 from amibayes.optics import psf, scene_image
 from amibayes.scene.orientation import Orientation
 from amibayes.scene.sources import Point, Scene
-from amibayes.simulation import Detector, Exposure, simulate
+from amibayes.simulation import PRESETS, Detector, Exposure, simulate
 from amibayes.simulation.exposure import Recorder
 from amibayes.simulation.program import Overrides, example, read_program
+from amibayes.support.toml import Section
 from amibayes.units import DEGREE, MAS
 
 SMALL = """
@@ -157,26 +160,38 @@ def test_same_seed_same_bytes_whatever_the_workers(made: Path, tmp_path: Path) -
 
 
 def test_example_runs_and_explains_every_key(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main(["simulate", "--example"]) == 0
     text = capsys.readouterr().out
     assert text == example()
     small = text.replace("photons = 1e8", "photons = 1e6").replace("n_pixels = 80", "n_pixels = 24")
     scene = write(tmp_path, small)
+    asked: set[str] = set()
+    real = Section._get
+    monkeypatch.setattr(
+        Section, "_get", lambda self, key, default: asked.add(key) or real(self, key, default)
+    )
     assert main(["simulate", scene, "--out", str(tmp_path / "out"), "--json"]) == 0
     exposures = json.loads(capsys.readouterr().out)["exposures"]
     assert [e["calibrator"] for e in exposures] == [False, True, True]
     assert len(list((tmp_path / "out").glob("*_calints.fits"))) == 3
-    # a key that is commented out is a real one, with the default that the comment gives
-    for line in re.findall(r"^# (\w+ = [\w.\"-]+)", text, re.MULTILINE):
-        key = line.split(" = ")[0]
-        if key not in ("map", "map_width_m", "count_rate", "n_groups", "n_integrations"):
-            table = "[detector]\npreset"
-            changed = small.replace(table, f"[detector]\n{line}\npreset")
-            program = read_program(write(tmp_path, changed))
-            detector = program.specs[0].observation.detector
-            assert detector == Detector(), line
+    assert {"migration_threshold_e", "tilt_drift_mas", "n_wavelengths"} < asked
+    assert [key for key in asked if not re.search(rf"\b{key}\b", text)] == []
+
+
+def test_example_has_every_number_of_the_detector_with_its_defaults() -> None:
+    table = example().partition("[detector]")[2].partition("[wavefront]")[0]
+    lines = dict(re.findall(r"^# (\w+) = (.*)$", table, re.MULTILINE))
+    paper, realistic = (PRESETS[name] for name in ("paper", "realistic"))
+    assert set(lines) == {entry.name for entry in fields(Detector)}
+    for name, line in lines.items():
+        assert tomllib.loads(f"x = {line.split()[0]}")["x"] == getattr(paper, name), name
+        other = getattr(realistic, name)
+        if other != getattr(paper, name):
+            stated = re.search(r"\(([^()]*)\)$", line)
+            assert stated is not None, name
+            assert tomllib.loads(f"x = {stated[1]}")["x"] == other, name
 
 
 def test_paper_scene_of_the_examples_runs_as_it_is(tmp_path: Path) -> None:
@@ -184,18 +199,6 @@ def test_paper_scene_of_the_examples_runs_as_it_is(tmp_path: Path) -> None:
     assert main(["simulate", str(scene), "--out", str(tmp_path), "--quiet"]) == 0
     (path,) = tmp_path.glob("*_calints.fits")
     assert read_cube(path).filter == "F380M"
-
-
-def test_ramps_on_request(tmp_path: Path) -> None:
-    text = SMALL.replace("roll_deg = [0.0, 60.0]\ndithers = 2", "ramps = true")
-    assert main(["simulate", write(tmp_path, text), "--out", str(tmp_path), "--quiet"]) == 0
-    with fits.open(tmp_path / "AB_Dor_ramp.fits") as hdus:
-        hdus.verify("exception")
-        assert hdus["SCI"].data.shape == (40, 5, 32, 32)
-        assert hdus[0].header["NGROUPS"] == 4
-        steps = np.diff(hdus["SCI"].data.astype(float), axis=1).mean(axis=(0, 1))
-    slopes = read_cube(tmp_path / "AB_Dor_calints.fits").images.mean(axis=0)
-    assert steps.sum() / 0.07544 == pytest.approx(slopes.sum(), rel=2e-3)
 
 
 def test_realistic_preset_shows_its_effects(tmp_path: Path) -> None:
@@ -232,12 +235,14 @@ def test_simulate_in_memory() -> None:
     )
 
 
+@pytest.mark.parametrize("option", [(), ("--ramps",)])
 def test_run_that_is_cut_off_goes_on_to_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    option: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = write(tmp_path)
+    hits = '[detector]\npreset = "realistic"\ncosmic_rays_s = 2e-3\n'
+    scene = write(tmp_path, SMALL.replace("[wavefront]", f"{hits}[wavefront]"))
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert main(["simulate", scene, "--out", str(whole), "--quiet"]) == 0
+    assert main(["simulate", scene, *option, "--out", str(whole), "--quiet"]) == 0
     calls: list[int] = []
     real = Recorder.__call__
 
@@ -248,7 +253,7 @@ def test_run_that_is_cut_off_goes_on_to_the_same_bytes(
         return real(self, piece)
 
     monkeypatch.setattr(Recorder, "__call__", failing)
-    words = ["simulate", scene, "--out", str(cut), "--quiet"]
+    words = ["simulate", scene, *option, "--out", str(cut), "--quiet"]
     assert main(words) == 4
     assert 0 < len(list(cut.glob("*_calints.fits"))) < len(list(whole.glob("*_calints.fits")))
     begun = len(calls)
@@ -397,19 +402,21 @@ print(used() - before)
 """
 
 
-def peak_memory_mb(folder: Path, n_integrations: int) -> float:
+def peak_memory_mb(folder: Path, n_integrations: int, *options: str) -> float:
     text = '[star]\nmagnitude = 9.0\n[instrument]\nfilter = "F430M"\n[exposure]\nn_groups = 2\n'
-    text += f"n_integrations = {n_integrations}\n"
+    text += f'n_integrations = {n_integrations}\n[detector]\npreset = "realistic"\n'
+    text += "cosmic_rays_s = 1e-3\n"
     scene = write(folder, text, f"n{n_integrations}.toml")
-    words = ["simulate", scene, "--out", str(folder / "out"), "--quiet"]
+    words = ["simulate", scene, *options, "--out", str(folder / "out"), "--quiet"]
     ended = subprocess.run(
         [sys.executable, "-c", MEMORY, *words], capture_output=True, text=True, check=True
     )
     return float(ended.stdout)
 
 
-def test_memory_does_not_grow_with_the_exposure(tmp_path: Path) -> None:
-    short, long = (peak_memory_mb(tmp_path, n) for n in (100, 800))
+@pytest.mark.parametrize("option", [(), ("--ramps",)])
+def test_memory_does_not_grow_with_the_exposure(option: tuple[str, ...], tmp_path: Path) -> None:
+    short, long = (peak_memory_mb(tmp_path, n, *option) for n in (100, 800))
     assert long < 300.0
     assert long - short < 40.0  # the images alone would take 700 × 77 kB more
 
@@ -417,20 +424,6 @@ def test_memory_does_not_grow_with_the_exposure(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_memory_of_ten_thousand_integrations(tmp_path: Path) -> None:
     assert peak_memory_mb(tmp_path, 10000) < 300.0
-
-
-def test_simulated_ramps_are_read_as_the_simulated_slopes(tmp_path: Path) -> None:
-    text = SMALL.replace("roll_deg = [0.0, 60.0]\ndithers = 2", "ramps = true")
-    assert main(["simulate", write(tmp_path, text), "--out", str(tmp_path), "--quiet"]) == 0
-    slopes, ramps = (read_cube(tmp_path / f"AB_Dor_{kind}.fits") for kind in ("calints", "ramp"))
-    assert ramps.unit == slopes.unit == "electron/s"
-    assert ramps.orientation == slopes.orientation
-    assert ramps.pixel_scale_rad == pytest.approx(slopes.pixel_scale_rad)
-    both = ~(slopes.bad | ramps.bad)
-    assert slopes.error is not None
-    off = ((ramps.images - slopes.images) / slopes.error)[both]
-    # Dark, background and flat field are taken off the slopes only; weights differ a little.
-    assert np.median(np.abs(off)) < 0.5
 
 
 def test_map_of_the_wavefront_is_that_of_its_file(tmp_path: Path) -> None:

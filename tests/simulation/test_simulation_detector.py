@@ -23,7 +23,7 @@ from amibayes.simulation.ramps import (
     read_ramps,
     to_neighbours,
 )
-from amibayes.simulation.slopes import SlopeFit, electron_variance, slope_weights
+from amibayes.simulation.slopes import SlopeFit, electron_variance, group_flags, slope_weights
 
 QUIET = Detector(
     photon_noise=False, read_noise_e=0.0, dark_e_s=0.0, background_e_s=0.0, flat_error=0.0
@@ -142,6 +142,10 @@ def test_saturated_reads_are_left_out() -> None:
         SATURATED,
         0,
     ]
+    flags = group_flags(ramps, slopes)
+    assert flags.shape == (300, 7, 4, 4)
+    for k, good in enumerate((0, 1, 4, 7)):
+        assert flags[0, :, k, k].tolist() == [0] * good + [SATURATED] * (7 - good)
     assert np.isnan(slopes.images[:, 1, 1]).all()
     assert slopes.images[:, 2, 2].mean() == pytest.approx(rate[2, 2], rel=1e-3)
     ratio = slopes.images[:, 2, 2].var() / slopes.variance[0, 2, 2]
@@ -176,7 +180,10 @@ def test_ramp_with_a_jump_is_fitted_as_two_ramps() -> None:
     steps[2] += 5000.0
     reads = np.concatenate([[0.0], np.cumsum(steps)]).reshape(-1, 1, 1, 1)
     rate = np.full((1, 1), electrons / FRAME)
-    slopes = fit_of(rate, detector, m)(Ramps(reads, None))
+    ramps = Ramps(reads, None)
+    slopes = fit_of(rate, detector, m)(ramps)
+    # The third difference is that of the fourth read.
+    assert group_flags(ramps, slopes)[0, :, 0, 0].tolist() == [0, 0, 0, JUMP_DET, 0, 0, 0]
     keep = [0, 1, 3, 4, 5]
     covariance = dense_covariance(electrons, detector.single_read_noise_e, m)[np.ix_(keep, keep)]
     inverse = np.linalg.inv(covariance)
