@@ -11,7 +11,7 @@ from amibayes.calibration.applying import apply_response
 from amibayes.calibration.freedom import response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, foreign, keys_of
-from amibayes.calibration.narrowing import narrowed
+from amibayes.calibration.narrowing import Narrowed, narrowed
 from amibayes.calibration.population import population_response
 from amibayes.calibration.transfer import (
     Diameter,
@@ -72,6 +72,8 @@ class Calibration(Shown):
         Number of setups of each target.
     tau : (n, 2) float array, optional
         Posterior draws of both scatters.
+    told : Narrowed, optional
+        What calibrators of different charge told of errors that all data share.
     """
 
     observables: Observables
@@ -81,6 +83,7 @@ class Calibration(Shown):
     tau_closure_phase_rad: float | None
     n_setups: tuple[int, ...]
     tau: FloatArray | None = None
+    told: Narrowed | None = None
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
@@ -164,8 +167,7 @@ def calibrate(
         For an unknown method; for calibrators that are none, too few or do not belong here.
     """
     parts = [targets] if isinstance(targets, Observables) else list(targets)
-    _refuse_same(parts, calibrators := list(calibrators))
-    _refuse_other_extraction(target := join(parts), calibrators)
+    target = _joined(parts, calibrators := list(calibrators))
     keys = keys_of(target, window_days)
     seen = _transfers(calibrators, keys, diameters_mas)
     serving = _serving(target, calibrators, seen)
@@ -174,7 +176,7 @@ def calibrate(
     used = [calibrators[j] for j in serving]
     kept = _consistent([seen[j] for j in serving], keys, None if chosen == "population" else clip)
     mjd = [mean_mjd(c) for c in (target, *used)]
-    target, kept = _told(target, kept, covariate)
+    target, kept, told = _told(target, kept, covariate)
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response, notes = replace(response, freedom=response_freedom(used, kept)), _notes(used, keys)
     return Calibration(
@@ -184,6 +186,7 @@ def calibrate(
         *_tau(response),
         tuple(len(p.setups) for p in parts),
         response.tau,
+        told,
     )
 
 
@@ -193,12 +196,12 @@ def _notes(used: list[Observables], keys: Keys) -> tuple[str, ...]:
 
 def _told(
     target: Observables, kept: list[Transfer], covariate: FloatArray | None
-) -> tuple[Observables, list[Transfer]]:
+) -> tuple[Observables, list[Transfer], Narrowed | None]:
     """Shared errors narrowed by the calibrators; a response that goes with charge has its own."""
     told = narrowed(kept) if covariate is None else None
     if told is None:
-        return target, kept
-    return told.of_target(target), [told.of_transfer(t) for t in kept]
+        return target, kept, None
+    return told.of_target(target), [told.of_transfer(t) for t in kept], told
 
 
 def mean_mjd(observables: Observables) -> float:
@@ -219,6 +222,14 @@ def _method(
             remedy="give more of them, or use the weighted method",
         )
     return method or ("hierarchical" if together >= 3 else "weighted")
+
+
+def _joined(parts: list[Observables], calibrators: list[Observables]) -> Observables:
+    """Lay all targets together, and refuse calibrators that do not go with them."""
+    _refuse_same(parts, calibrators)
+    target = join(parts)
+    _refuse_other_extraction(target, calibrators)
+    return target
 
 
 def _refuse_same(parts: list[Observables], calibrators: list[Observables]) -> None:

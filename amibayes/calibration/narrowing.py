@@ -10,7 +10,7 @@ does not explain enlarges its error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +66,25 @@ class Narrowed:
             parts[name] = replace(measured, value=value)
         left = SharedErrors(self._renamed(), changes @ self.root)
         return replace(alone, **parts).with_shared_errors(left)
+
+    def number(self, steps: Mapping[str, float]) -> tuple[float, float] | None:
+        """Change of a number that these errors are of, and its standard deviation afterwards.
+
+        Parameters
+        ----------
+        steps : mapping of str to float
+            Changes of the number by one standard deviation of each error, by its name.
+
+        Returns
+        -------
+        (float, float) or None
+            None where one of its errors is none of these.
+        """
+        if not steps or not set(steps) <= set(self.names):
+            return None
+        step = np.array([steps.get(name, 0.0) for name in self.names])
+        # Data are off by what one took out of them too much: the number is less by that.
+        return -float(step @ self.mean), float(np.linalg.norm(step @ self.root))
 
     def _renamed(self) -> tuple[str, ...]:
         """Other names: one standard deviation is another one now, and mixes them."""

@@ -83,8 +83,9 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from amibayes.calibration import calibrate, diameters_of
-    from amibayes.extraction.reading import check_together, of_one_visit
+    from amibayes.extraction.reading import charge_of, check_together, of_one_visit
     from amibayes.kpfits import write_observables
+    from amibayes.report.noise import migration_json, migration_lines
     from amibayes.support.atomic_files import output_folder
 
     check_together(arguments.targets, arguments.cal)
@@ -108,8 +109,11 @@ def run(arguments: argparse.Namespace) -> int:
     write_observables(folder / RESULT, found.observables)
     if arguments.add_to_library is not None:
         _keep(arguments, calibrators, diameters)
-    content = _json(arguments, found, folder)
-    common.finish(arguments, content, lambda: _summary(found, folder))
+    charge = charge_of([*arguments.targets, *arguments.cal], images)
+    migration = migration_json(charge, found)
+    content = _json(arguments, found, folder) | {"charge_migration": migration}
+    taken_out = migration_lines(migration)
+    common.finish(arguments, content, lambda: _summary(found, folder, taken_out))
     return 0
 
 
@@ -204,12 +208,13 @@ def _written(found: Calibration, folder: Path) -> str:
     return str(folder / (KERNEL_RESULT if kernels else RESULT))
 
 
-def _summary(found: Calibration, folder: Path) -> list[str]:
+def _summary(found: Calibration, folder: Path, taken_out: list[str]) -> list[str]:
     used = found.observables
     lines = [
         f"data        {used.n_vis2} V2, {used.n_closure_phases} {used.phase_name}s, "
         f"{used.n_independent} independent ({used.covariance_kind} covariance)",
         f"method      {found.method}",
+        *taken_out,
     ]
     if found.tau_vis2 is not None:
         lines.append(f"scatter     {found.tau_vis2:.3g} in V2 between calibrators")

@@ -116,13 +116,14 @@ def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     """Measure the limits of one target and write their files, without printing."""
     batch.refuse_none(arguments)
     common.refuse_repeated([*arguments.targets, *arguments.cal])
+    from amibayes.plots.contrast_curve import MIGRATION
     from amibayes.support.atomic_files import output_folder
     from amibayes.support.request import refuse_other
 
     options = _options(arguments)
     names = _names(options, pictures=not arguments.no_pictures)
     overwrite = arguments.overwrite or arguments.resume
-    folder = output_folder(arguments.out, names, overwrite=overwrite)
+    folder = output_folder(arguments.out, [*names, MIGRATION], overwrite=overwrite)
     request = _request(arguments, options)
     content = _finished(folder, names, request) if arguments.resume else None
     if content is None:
@@ -192,10 +193,11 @@ def _measure(
 def _write(
     arguments: argparse.Namespace, report: LimitsReport, content: object, folder: Path
 ) -> None:
-    from amibayes.plots.contrast_curve import save_limits_pictures
+    from amibayes.plots.contrast_curve import MIGRATION, save_limits_pictures
     from amibayes.report import write_limits_table
     from amibayes.support.atomic_files import write_json
 
+    (folder / MIGRATION).unlink(missing_ok=True)  # of an older run, that had ramps
     if not arguments.no_pictures:
         draw(arguments, save_limits_pictures, report, folder)
     write_limits_table(folder / TABLE, report)

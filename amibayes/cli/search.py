@@ -125,8 +125,7 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     with Drawing(arguments, folder, journals.path / "pictures") as drawing:
         with journals.telling(folder / CHAIN):
             report = _search(arguments, options, folder, journals, drawing)
-        for stale in set(_names(type(options)(), calibrated=True, several=True)) - set(names):
-            (folder / stale).unlink(missing_ok=True)
+        _remove_stale(folder, names, report)
         content = _write(arguments, report, folder, asked, drawing)
     journals.remove()
     return report, folder, content
@@ -139,6 +138,17 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
     names = [RESULT, REPORT, *picture_names(options, calibrated=calibrated, several=several)]
     names += [CHAIN] if options.posterior else []
     return [*names, CALIBRATED, CALIBRATED_KP] if calibrated or options.library else names
+
+
+def _remove_stale(folder: Path, names: list[str], report: SearchReport) -> None:
+    """Remove what an older run left that this one has not, pictures of ramps without ramps too."""
+    from amibayes.pipeline.options import SearchOptions
+    from amibayes.plots.pictures import PICTURES, pictures_of
+
+    lacking = {p.file for p in PICTURES} - {p.file for p in pictures_of(report)}
+    every = set(_names(SearchOptions(), calibrated=True, several=True))
+    for stale in every - (set(names) - lacking):
+        (folder / stale).unlink(missing_ok=True)
 
 
 def request(arguments: argparse.Namespace) -> str:

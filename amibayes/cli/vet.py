@@ -62,17 +62,24 @@ def run(arguments: argparse.Namespace) -> int:
             source="--charge-levels",
         )
     from amibayes.calibration import diameters_of, reduce_data, without_disc
-    from amibayes.extraction.reading import check_together, read_observations
+    from amibayes.extraction.reading import (
+        charge_of,
+        check_together,
+        of_one_visit,
+        read_observations,
+    )
     from amibayes.pipeline.vetting import vet
     from amibayes.plots.style import save
+    from amibayes.report.noise import migration_json, migration_lines
     from amibayes.report.vetting import vetting_json, vetting_picture, vetting_table
     from amibayes.support.atomic_files import output_folder, write_json
 
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
     check_together([], arguments.calibrators)
+    images = of_one_visit(arguments.calibrators, common.image_options_of(arguments))
     data = read_observations(
         arguments.calibrators,
-        common.image_options_of(arguments),
+        images,
         one_star=False,
         insname=arguments.insname,
         closure_covariance=arguments.closure_covariance,
@@ -94,5 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     content = vetting_json(vetting)
     save(vetting_picture(vetting), folder / PICTURE)
     write_json(folder / RESULT, content)
-    common.finish(arguments, content, lambda: vetting_table(vetting, [f"written to {folder}"]))
+    charge = charge_of(arguments.calibrators, images)
+    last = [*migration_lines(migration_json(charge, None)), f"written to {folder}"]
+    common.finish(arguments, content, lambda: vetting_table(vetting, last))
     return 0

@@ -22,7 +22,8 @@ from amibayes.instrument import ChargeMigration, load_instrument
 from amibayes.ramps.converter import WAVES, WaveColumns, table
 from amibayes.ramps.correction import MigrationFree, electrons_of, slope_time_s
 from amibayes.ramps.curvature import Curvature, curvature_of
-from amibayes.ramps.fit import MigrationFit, fit_migration
+from amibayes.ramps.fit import EXPLAINED, MigrationFit, fit_migration
+from amibayes.ramps.header import P_VALUES, SOURCE, Cards, migration_cards, migration_of
 from amibayes.ramps.migration import Migration
 from amibayes.ramps.own_response import OwnResponse
 from amibayes.ramps.transfer import KINDS, gain
@@ -57,12 +58,42 @@ class CubeMigration:
         What a reader of the result has to know.
     waves : WaveColumns, optional
         What errors of the converter do to the ramps of this cube.
+    p_values : (float, float), optional
+        Those of a fit, of changes and of bends, that is known from the header of a file only.
     """
 
     migration: Migration | None = None
     fit: MigrationFit | None = None
     notes: tuple[str, ...] = ()
     waves: WaveColumns | None = None
+    p_values: tuple[float, float] | None = None
+
+    @classmethod
+    def of_header(cls, header: Mapping[str, Any]) -> CubeMigration | None:
+        """What a file says of the images it was made of; None where it does not."""
+        migration = migration_of(header)
+        if migration is None:
+            return cls() if header.get(SOURCE) == "off" else None
+        p, bend = (header.get(key) for key in P_VALUES)
+        if isinstance(p, int | float) and isinstance(bend, int | float):
+            return cls(migration, p_values=(float(p), float(bend)))
+        return cls(migration)
+
+    @property
+    def in_header(self) -> Cards:
+        """Keywords by which `of_header` knows it again."""
+        cards = migration_cards(self.migration)
+        tests = self._tests
+        if tests is not None:
+            cards |= {f"HIERARCH {k}": p for k, p in zip(P_VALUES, tests, strict=True)}
+        return cards
+
+    @property
+    def _tests(self) -> tuple[float, float] | None:
+        """Probabilities of larger changes, and bends, than the ramps of the fit have."""
+        if self.fit is None or self.migration is None or self.migration.source != "fit":
+            return self.p_values
+        return self.fit.p_value, self.fit.bend_p_value
 
     def applied(self, file: Source) -> Source:
         """The file without it."""
@@ -86,8 +117,14 @@ class CubeMigration:
         """Plain numbers: value, error, source, and the tests of a fit."""
         if self.migration is None:
             return {"value_per_e": 0.0, "error_per_e": 0.0, "source": "off"}
-        fitted = self.migration.source == "fit" and self.fit is not None
-        return self.fit.as_json() if fitted and self.fit else self.migration.as_json()
+        if self.migration.source == "fit" and self.fit is not None:
+            return self.fit.as_json()
+        if self.p_values is None:
+            return self.migration.as_json()
+        p, bend = self.p_values
+        explained = min(p, bend) > EXPLAINED
+        tests = {"p_value": p, "p_value_bend": bend, "explained": explained}
+        return self.migration.as_json() | tests
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,11 +330,8 @@ def shared_errors(parts: Sequence[tuple[Migration, FloatArray]]) -> SharedErrors
     """Sum of changes (n_observables, r) by each migration, under names that others share."""
     total: dict[str, FloatArray] = {}
     for migration, changes in parts:
-        what = ", ".join(
-            f"{k} {v:.9e}" for k, v in zip(migration.kinds, migration.value, strict=True)
-        )
-        for k, change in enumerate(changes.T, 1):
-            name = f"charge migration {k} ({what})"
+        names = migration.error_names(changes.shape[1])
+        for name, change in zip(names, changes.T, strict=True):
             total[name] = total.get(name, 0.0) + change
     if not total:
         return None

@@ -334,6 +334,27 @@ def uncalibrated_images(paths: Sequence[str | Path]) -> tuple[str, ...]:
     )
 
 
+def charge_of(paths: Sequence[str | Path], images: ImageOptions) -> CubeMigration | None:
+    """What was done about charge migration: in the first cube, or as the first file says.
+
+    Parameters
+    ----------
+    paths : sequence of path
+    images : ImageOptions
+        From `of_one_visit` of these.
+
+    Returns
+    -------
+    CubeMigration or None
+        None where all are files that were made of something else than images.
+    """
+    done = next(iter(images.charges.values()), None)
+    if done is not None:
+        return done
+    stated = (CubeMigration.of_header(contents_of(path).header) for path in paths)
+    return next((charge for charge in stated if charge is not None), None)
+
+
 def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None) -> ImageOptions:
     """Find what image cubes, target's and calibrators', share: the mask's map, and migration.
 

@@ -93,5 +93,6 @@ def header_of(extraction: Extraction) -> dict[str, str | int | float | bool]:
         header[f"HIERARCH AMIBAYES PIXEL{k}"] = operator.view.instrument.pixel_scale_rad
         header[f"HIERARCH AMIBAYES SCALE{k}"] = operator.geometry.scale
         header[f"HIERARCH AMIBAYES ROTATION{k}"] = operator.geometry.rotation_rad / DEGREE
+    header |= extraction.charge.in_header
     header["HIERARCH AMIBAYES CHARGE"] = float(extraction.operators[0].reference.image.max())
     return header

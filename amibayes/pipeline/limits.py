@@ -18,6 +18,7 @@ from amibayes.comparison.limits import LimitsBeside
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance, draws_needed, reachable
 from amibayes.errors import DataError, UsageError
+from amibayes.extraction.charge import CubeMigration
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.analytic import analytic_limit
 from amibayes.limits.completeness import detection_limit
@@ -128,6 +129,7 @@ class LimitsReport(Shown):
     timing_s: dict[str, float] = field(default_factory=dict)
     models: ModelComparison | None = None
     beside: LimitsBeside | None = None
+    charge_migration: CubeMigration | None = None
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
@@ -199,6 +201,7 @@ def measure_limits(
         run.seconds,
         models,
         beside,
+        ready.charge_migration,
     )
 
 

@@ -23,6 +23,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.reading import (
+    charge_of,
     check_together,
     of_one_visit,
     read_observations,
@@ -58,7 +59,7 @@ class Prepared:
     vetting : Vetting, optional
     warnings : tuple of str
     charge_migration : CubeMigration, optional
-        What was done about it in the first image cube.
+        What was done about it in the first image cube, or as the first file says.
     serving : tuple of Observables
         Calibrators that the targets were calibrated with.
     diameters_mas : tuple of (diameter, error)
@@ -120,7 +121,7 @@ def prepare(
         *(uncalibrated_images(targets) if ready.calibration is None else ()),
         *joined,
     )
-    charge = next(iter(images.charges.values()), None)
+    charge = charge_of([*targets, *calibrators], images)
     return replace(ready, references=tuple(references), warnings=warnings, charge_migration=charge)
 
 

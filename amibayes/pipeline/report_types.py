@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Self
 
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
@@ -70,6 +71,44 @@ class SearchReport(Shown):
             ("holds", ", ".join(["result", "observables", *kept])),
             *(("warning", text) for text in self.warnings),
         ]
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What a run holds, known before it begins: which pictures there will be.
+
+    Several files that are fitted together, calibrators, these stages, and ramps that charge
+    migration was fitted to.
+    """
+
+    several: bool = False
+    calibrated: bool = False
+    significance: bool = False
+    posterior: bool = False
+    limits: bool = False
+    models: bool = False
+    ramps: bool = False
+
+    @classmethod
+    def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Self:
+        """Those of a run that has yet to begin; whether there are ramps it tells when it has."""
+        tested = options.null_draws != 0
+        limits = options.limits and tested
+        models = options.models is not None
+        return cls(several, calibrated, tested, options.posterior, limits, models, ramps=True)
+
+    @classmethod
+    def of(cls, report: SearchReport) -> Self:
+        """Those of a run that has ended."""
+        return cls(
+            len(report.targets) > 1,
+            bool(report.calibrators),
+            report.significance is not None,
+            report.posterior is not None,
+            report.limits is not None,
+            report.models is not None,
+            report.charge_migration is not None and report.charge_migration.fit is not None,
+        )
 
 
 def calibrator_verdicts(report: SearchReport) -> list[dict[str, object]]:

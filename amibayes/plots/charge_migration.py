@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.image import AxesImage
 
 from amibayes.plots.style import (
@@ -19,36 +21,38 @@ from amibayes.plots.style import (
 )
 from amibayes.ramps.curvature import Curvature
 from amibayes.ramps.fit import MigrationFit
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 HALF_SIDE = 12
 """Pixels about the brightest that are drawn: fringes farther out change by less than noise."""
 
 BINS = 12
-"""Groups of pixels of like prediction, each with as much of the information as the others."""
+"""Groups of pixels of like prediction, none with more of the information than this part of it,
+but for single pixels that have more."""
 
 
 @styled()
 def migration_plot(fit: MigrationFit) -> Figure:
-    """Draw the change of the current in every pixel, measured and predicted, and along the ramp."""
+    """Draw the change of the current, measured and predicted.
+
+    In every pixel, across the fringes through the brightest one, against the prediction, and
+    along the ramp; where the converter's errors were fitted, what they make as well.
+    """
     best = max(fit.exposures, key=lambda e: float((fit.predicted(e)[e.used] ** 2).sum()))
-    predicted = fit.predicted(best)
     of_converter = fit.migration.of_converter is not None
-    figure = new_figure(8.6 if of_converter else 6.4)
-    grid = figure.add_gridspec(2 + of_converter, 2)
-    first, second, third, fourth = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
-    limit = float(np.abs(predicted).max()) or 1.0
-    for ax, image, title in (
-        (first, np.where(best.used, best.change, np.nan), "measured"),
-        (second, predicted, "predicted"),
-    ):
-        shown = _image(ax, image, best, limit, title)
-    bar = figure.colorbar(shown, ax=[first, second], shrink=0.9)
-    bar.set_label("Change of the current (e⁻ s⁻²)")
-    _per_pixel(third, fit)
-    _along_ramp(fourth, fit)
+    heights = [2.9, 3.0, 2.9] + [2.4] * of_converter
+    figure = new_figure(sum(heights) + 0.3)
+    # Rows are laid out apart: the bar of the images would make all others narrower.
+    rows = [
+        row[0] for row in figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)
+    ]
+    _images(rows[0], rows[0].subplots(1, 2), fit, best)
+    _across_fringes(rows[1].subplots(), fit, best)
+    per_pixel, along_ramp = rows[2].subplots(1, 2)
+    _per_pixel(per_pixel, fit)
+    _along_ramp(along_ramp, fit)
     if of_converter:
-        _of_converter(figure.add_subplot(grid[2, :]), fit)
+        _of_converter(rows[3].subplots(), fit)
     value, error = fit.migration.mean
     figure.suptitle(
         f"Charge migration {1e7 * value:.2f} ± {1e7 * error:.2f} · 10⁻⁷ pixels per electron, "
@@ -57,9 +61,24 @@ def migration_plot(fit: MigrationFit) -> Figure:
     return figure
 
 
+def _images(
+    figure: SubFigure, axes: Sequence[Axes], fit: MigrationFit, exposure: Curvature
+) -> None:
+    """Draw the change of every pixel about the star, measured and predicted, on one scale."""
+    predicted = fit.predicted(exposure)
+    limit = float(np.abs(predicted).max()) or 1.0
+    measured = np.where(exposure.used, exposure.change, np.nan)
+    for ax, image, title in zip(
+        axes, (measured, predicted), ("measured", "predicted"), strict=True
+    ):
+        shown = _image(ax, image, exposure, limit, title)
+    bar = figure.colorbar(shown, ax=list(axes), shrink=0.9)
+    bar.set_label("Change of the current\n(e⁻ s⁻²)")
+
+
 def _image(ax: Axes, image: FloatArray, exposure: Curvature, limit: float, title: str) -> AxesImage:
     """Draw the pixels about the star."""
-    y, x = np.unravel_index(int(exposure.current.argmax()), exposure.current.shape)
+    y, x = _brightest(exposure)
     shown = ax.imshow(image, origin="lower", cmap=DIVERGING, vmin=-limit, vmax=limit)
     ax.set_facecolor(LIGHT_GREY)
     ax.set_xlim(x - HALF_SIDE - 0.5, x + HALF_SIDE + 0.5)
@@ -68,6 +87,50 @@ def _image(ax: Axes, image: FloatArray, exposure: Curvature, limit: float, title
     ax.set_ylabel("y (pixels)")
     ax.set_title(title)
     return shown
+
+
+def _brightest(exposure: Curvature) -> tuple[int, int]:
+    """Row and column of the brightest pixel."""
+    row, column = np.unravel_index(int(exposure.current.argmax()), exposure.current.shape)
+    return int(row), int(column)
+
+
+def _across_fringes(ax: Axes, fit: MigrationFit, exposure: Curvature) -> None:
+    """Draw the change along the row and the column through the brightest pixel.
+
+    Bright fringes lose current to the dark ones beside them. Amplitudes of the baselines would
+    have the noise of all pixels in them, where a few have what migration does.
+    """
+    predicted, (row, column) = fit.predicted(exposure), _brightest(exposure)
+    lines = (
+        ("x", np.s_[row, :], column, BLUE, "o", "-", -0.12),
+        ("y", np.s_[:, column], row, VERMILLION, "s", "--", 0.12),
+    )
+    for name, line, middle, colour, marker, dash, aside in lines:
+        place = np.arange(len(predicted[line])) - middle
+        near = np.abs(place) <= HALF_SIDE
+        seen = near & exposure.used[line]
+        ax.plot(
+            place[near], predicted[line][near], color=colour, linestyle=dash,
+            label=f"prediction along {name}",
+        )  # fmt: skip
+        # Beside each other, for points of both lines at one place to be told apart.
+        ax.errorbar(
+            place[seen] + aside, exposure.change[line][seen], exposure.sigma[line][seen],
+            fmt=marker, markersize=4.0, elinewidth=1.0, color=colour,
+            label=f"measured along {name}",
+        )  # fmt: skip
+    ax.set_xlabel("Place across the fringes, from the brightest pixel (pixels)")
+    ax.set_ylabel("Change (e⁻ s⁻²)")
+    _legend_above(ax, 2)
+
+
+def _legend_above(ax: Axes, columns: int) -> None:
+    """Put the legend above the axes: anywhere within it might hide a datum."""
+    ax.legend(
+        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False,
+        columnspacing=1.0,
+    )  # fmt: skip
 
 
 def _per_pixel(ax: Axes, fit: MigrationFit) -> None:
@@ -104,16 +167,34 @@ def _differences(
 
 def _binned(ax: Axes, p: FloatArray, m: FloatArray, w: FloatArray) -> None:
     """Draw measured against predicted numbers, in groups of like prediction."""
-    order = np.argsort(p)
-    share = np.cumsum((w * p**2)[order])
-    group = np.minimum((BINS * share / max(share[-1], 1e-300)).astype(int), BINS - 1)
-    total = np.bincount(group, w[order], BINS)
-    seen = total > 0.0
-    x, y = (np.bincount(group, (w * a)[order], BINS)[seen] / total[seen] for a in (p, m))
+    group = _groups(p, w)
+    total = np.bincount(group, w)
+    x, y = (np.bincount(group, w * a) / total for a in (p, m))
     ends = np.array([x.min(), x.max()])
     ax.plot(ends, ends, color=GREY, label="prediction")
-    ax.errorbar(x, y, 1.0 / np.sqrt(total[seen]), fmt="o", color=BLUE, label="groups of pixels")
-    ax.legend(loc="lower right")
+    ax.errorbar(x, y, 1.0 / np.sqrt(total), fmt="o", color=BLUE, label="groups of pixels")
+    _legend_above(ax, 2)
+
+
+def _groups(p: FloatArray, w: FloatArray) -> IntArray:
+    """Number the groups of like prediction (n,) that numbers of weights (n,) are pooled in.
+
+    A number that has more of the information than a group may have stands alone, and no
+    group reaches over it.
+    """
+    order = np.argsort(p)
+    told = (w * p**2)[order]
+    told = told / max(float(told.sum()), 1e-300)
+    alone = told > 1.0 / BINS
+    rest = np.where(alone, 0.0, told)
+    # By the middle of each number's share: by its end the last of a group would be the next's.
+    part = (BINS * (np.cumsum(rest) - 0.5 * rest)).astype(int)
+    begins = alone.copy()
+    begins[1:] |= alone[:-1] | (np.diff(part) > 0)
+    begins[0] = False
+    group = np.empty(len(p), dtype=np.intp)
+    group[order] = np.cumsum(begins)
+    return group
 
 
 def _pixels(fit: MigrationFit, exposure: Curvature) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -124,6 +205,7 @@ def _pixels(fit: MigrationFit, exposure: Curvature) -> tuple[FloatArray, FloatAr
 
 def _along_ramp(ax: Axes, fit: MigrationFit) -> None:
     """Draw how much of the predicted pattern is in the current, from difference to difference."""
+    labelled = False
     for exposure in fit.exposures:
         pattern = fit.predicted(exposure)[exposure.used]
         weight = pattern * exposure.sigma[exposure.used] ** -2
@@ -134,12 +216,14 @@ def _along_ramp(ax: Axes, fit: MigrationFit) -> None:
         # A slope over these times is known to 1/√size; even weights share that out.
         error = float(np.sqrt((exposure.lag_s**2).sum() / size))
         ax.errorbar(
-            exposure.time_s + exposure.lag_s, found, error, fmt="o", color=VERMILLION, alpha=0.6
-        )
+            exposure.time_s + exposure.lag_s, found, error, fmt="o", color=VERMILLION, alpha=0.6,
+            label="" if labelled else "exposures",
+        )  # fmt: skip
+        labelled = True
     times = np.concatenate([e.time_s + e.lag_s for e in fit.exposures])
     middle = fit.exposures[0].time_s
     ends = np.array([times.min(), times.max()])
     ax.plot(ends, ends - middle, color=BLACK, label="prediction")
     ax.set_xlabel("Time from the reset (s)")
     ax.set_ylabel("Pattern in the current (s)")
-    ax.legend(loc="upper left")
+    _legend_above(ax, 2)

@@ -19,6 +19,7 @@ from amibayes.limits.limit import Limit
 from amibayes.limits.mass_table import MassTable
 from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.limits import NAMES, LimitsReport
+from amibayes.plots.charge_migration import migration_plot
 from amibayes.plots.style import (
     BLACK,
     DASHES,
@@ -265,6 +266,10 @@ def completeness_picture(limits: Limit) -> Figure:
     )
 
 
+MIGRATION = "charge_migration.png"
+"""Drawn where charge migration was fitted to ramps."""
+
+
 def limits_picture_names(method: str) -> list[str]:
     """List the files that `save_limits_pictures` will write."""
     return ["limits.png", "completeness.png"] if method == "injection" else ["limits.png"]
@@ -273,17 +278,23 @@ def limits_picture_names(method: str) -> list[str]:
 def save_limits_pictures(
     report: LimitsReport, folder: Path, executor: Executor | None = None
 ) -> None:
-    """Draw the curves of all limits, and the completeness map of the main one.
+    """Draw the curves of all limits, the completeness map of the main one, and what ramps tell.
 
-    Both at a time where there are workers.
+    All at a time where there are workers.
     """
     names = ["limits.png"] + ["completeness.png"] * (report.main.limit.cells() is not None)
+    charge = report.charge_migration
+    names += [MIGRATION] * (charge is not None and charge.fit is not None)
     list((executor or SerialExecutor()).map(partial(_save_picture, report, folder), names))
 
 
 def _save_picture(report: LimitsReport, folder: Path, name: str) -> None:
-    curves = name == "limits.png"
-    figure = limits_picture(report) if curves else completeness_picture(report.main.limit)
+    charge = report.charge_migration
+    if name == MIGRATION and charge is not None and charge.fit is not None:
+        figure = migration_plot(charge.fit)
+    else:
+        curves = name == "limits.png"
+        figure = limits_picture(report) if curves else completeness_picture(report.main.limit)
     save(figure, folder / name)
 
 

@@ -14,9 +14,10 @@ from amibayes.comparison.compare import ModelComparison
 from amibayes.detection.residuals_by_file import file_residuals
 from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.options import SearchOptions
-from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
+from amibayes.pipeline.report_types import SearchReport, Stages, calibrator_verdicts
 from amibayes.plots import models
 from amibayes.plots.calibration import calibrator_plot
+from amibayes.plots.charge_migration import migration_plot
 from amibayes.plots.contrast_curve import Curve, completeness_picture, limits_plot
 from amibayes.plots.corner_plot import corner_plot, trace_plot
 from amibayes.plots.coverage import coverage_plot
@@ -37,42 +38,6 @@ from amibayes.units import FloatArray, contrast_to_delta_mag
 
 MAPS = "maps.fits"
 """The numbers of the maps, beside the pictures."""
-
-
-@dataclass(frozen=True)
-class Stages:
-    """What a run holds, known before it begins: which pictures there will be.
-
-    Several files that are fitted together, calibrators, and these stages.
-    """
-
-    several: bool = False
-    calibrated: bool = False
-    significance: bool = False
-    posterior: bool = False
-    limits: bool = False
-    models: bool = False
-
-    @classmethod
-    def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Stages:
-        """Those of a run that has yet to begin."""
-        tested = options.null_draws != 0
-        limits = options.limits and tested
-        return cls(
-            several, calibrated, tested, options.posterior, limits, options.models is not None
-        )
-
-    @classmethod
-    def of(cls, report: SearchReport) -> Stages:
-        """Those of a run that has ended."""
-        return cls(
-            len(report.targets) > 1,
-            bool(report.calibrators),
-            report.significance is not None,
-            report.posterior is not None,
-            report.limits is not None,
-            report.models is not None,
-        )
 
 
 def always(run: Stages) -> bool:
@@ -114,7 +79,7 @@ class Picture:
 
 
 def picture_names(options: SearchOptions, *, calibrated: bool, several: bool = False) -> list[str]:
-    """List the files that `save_pictures` will write for a job."""
+    """List the files that `save_pictures` may write for a job: some need what a run finds."""
     run = Stages.asked(options, calibrated=calibrated, several=several)
     return [*(p.file for p in PICTURES if p.when(run)), MAPS]
 
@@ -169,6 +134,12 @@ def _nsigma(report: SearchReport) -> Figure:
 def _false_alarm(report: SearchReport) -> Figure:
     assert report.significance is not None
     return false_alarm_map(report.result, report.significance)
+
+
+def _migration(report: SearchReport) -> Figure:
+    assert report.charge_migration is not None
+    assert report.charge_migration.fit is not None
+    return migration_plot(report.charge_migration.fit)
 
 
 def _calibrators(report: SearchReport) -> Figure:
@@ -289,6 +260,17 @@ PICTURES = (
         "data",
         _calibrators,
         lambda run: run.calibrated,
+    ),
+    Picture(
+        "charge_migration",
+        "Charge migration",
+        "Change of the current along the ramps, measured and as charge migration has it: of every "
+        "pixel about the star, of the pixels across the fringes along a row and a column, of "
+        "groups of pixels with errors, and how far the predicted pattern is in the current with "
+        "time from the reset.",
+        "noise",
+        _migration,
+        lambda run: run.ramps,
     ),
     Picture(
         "null",

@@ -55,9 +55,14 @@ class Migration:
     @property
     def mean(self) -> tuple[float, float]:
         """Mean of the coefficients of the sides, per electron, and its standard deviation."""
-        weight = np.array([kind in SIDES for kind in self.kinds], dtype=float)
-        weight /= max(weight.sum(), 1.0)
+        weight = self._share
         return float(weight @ self.value), float(np.sqrt(weight @ self.covariance @ weight))
+
+    @property
+    def _share(self) -> FloatArray:
+        """(k,) weights of the coefficients in their mean."""
+        weight = np.array([kind in SIDES for kind in self.kinds], dtype=float)
+        return np.asarray(weight / max(weight.sum(), 1.0))
 
     @property
     def of_pixels(self) -> Migration:
@@ -89,7 +94,24 @@ class Migration:
         unit = np.where(self.error > 0.0, self.error, 1.0)
         eigenvalue, vector = np.linalg.eigh(self.covariance / np.outer(unit, unit))
         kept = eigenvalue > 1e-9 * max(float(eigenvalue.max(initial=0.0)), 1e-300)
-        return np.asarray(unit[:, None] * vector[:, kept] * np.sqrt(eigenvalue[kept]))
+        vector = vector[:, kept]
+        # Of either sign: one and the same for data that were extracted apart, and share errors.
+        first = np.argmax(np.abs(vector) > 0.5 * np.abs(vector).max(axis=0, initial=0.0), axis=0)
+        sign = np.sign(vector[first, np.arange(vector.shape[1])])
+        return np.asarray(unit[:, None] * vector * sign * np.sqrt(eigenvalue[kept]))
+
+    def error_names(self, count: int) -> list[str]:
+        """Names of ``count`` errors in common: along each of `directions`, then of pixels."""
+        pairs = zip(self.kinds, self.value, strict=True)
+        what = ", ".join(f"{kind} {value:.9e}" for kind, value in pairs)
+        return [f"charge migration {k} ({what})" for k in range(1, count + 1)]
+
+    @property
+    def steps(self) -> dict[str, float]:
+        """Changes of the first of `mean` by each of the errors in common, by their names."""
+        changed = self._share @ self.directions
+        names = self.error_names(len(changed))
+        return dict(zip(names, map(float, changed), strict=True))
 
     def as_json(self) -> dict[str, Any]:
         """Plain numbers."""

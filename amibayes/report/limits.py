@@ -13,6 +13,7 @@ from amibayes.limits.limit import Limit
 from amibayes.pipeline.limits import NAMES, LimitsReport, MeasuredLimit
 from amibayes.report.common import Json, data_json, inputs_json, number, numbers
 from amibayes.report.models import models_json
+from amibayes.report.noise import migration_json
 from amibayes.report.words import percent
 from amibayes.support.atomic_files import atomic_path
 from amibayes.support.terminal import row, with_warnings
@@ -51,6 +52,7 @@ def limits_report_json(report: LimitsReport, request: str = "") -> Json:
         "noise": {
             "extra_vis2": main.noise.vis2,
             "extra_closure_phase_deg": float(np.degrees(main.noise.closure_phase_rad)),
+            "charge_migration": migration_json(report.charge_migration, report.calibration),
         },
         "companion_detected": None if main.significance is None else main.significance.detected,
         **_curve(main, report),

@@ -20,20 +20,11 @@ from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.evidence import HALO_BACKGROUND, Evidence
 from amibayes.posterior.grid import GridPosterior, integrable
 from amibayes.posterior.priors import Prior
-from amibayes.report.common import (
-    NOISE_KEYS,
-    Json,
-    channel_correlation_json,
-    data_json,
-    in_errors_json,
-    inputs_json,
-    noise_interval,
-    number,
-    systematics_json,
-)
-from amibayes.report.joint import is_joint, joint_fit_json, noise_files_json, residuals_json
+from amibayes.report.common import Json, data_json, inputs_json, number
+from amibayes.report.joint import is_joint, joint_fit_json, residuals_json
 from amibayes.report.limits import limits_json, map_json
 from amibayes.report.models import models_json
+from amibayes.report.noise import noise_json
 from amibayes.units import contrast_to_delta_mag
 
 QUANTITIES = (
@@ -74,7 +65,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "bootstrap": _bootstrap(report),
         "calibration": _calibration(report),
         "limits": _limits(report),
-        "noise": _noise(report) | noise_files_json(report),
+        "noise": noise_json(report),
         "robust": _robust(report.result),
         "evidence": None
         if report.evidence is None
@@ -84,27 +75,6 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},
     } | ({"residuals": residuals_json(report)} if is_joint(report) else {})
-
-
-def _noise(report: SearchReport) -> Json:
-    """Extra noise: the most likely, and its posterior."""
-    found = report.noise_posterior or {}
-    posterior = {
-        key: noise_interval(found[name], unit)
-        for name, (key, unit) in NOISE_KEYS.items()
-        if name in found
-    }
-    return {
-        "extra_vis2": report.noise.vis2,
-        "extra_closure_phase_deg": float(np.degrees(report.noise.closure_phase_rad)),
-        "channel_correlation": channel_correlation_json(report.noise),
-        "systematics": systematics_json(report.noise),
-        **in_errors_json(report.noise, report.observables.only(report.options.observables)),
-        "posterior": posterior or None,
-        "charge_migration": None
-        if report.charge_migration is None
-        else report.charge_migration.as_json(),
-    }
 
 
 def _robust(result: SearchResult) -> Json | None:

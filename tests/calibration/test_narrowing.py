@@ -74,3 +74,27 @@ def test_scatter_between_calibrators_is_not_taken_for_the_constant() -> None:
     found = calibrate([star(change, 0, 0.0)], others, method="weighted").observables
     assert found.shared is not None
     assert np.abs(found.shared.changes[0, 0]) > 0.6 * change[0]
+
+
+def test_the_number_that_was_narrowed_is_told() -> None:
+    change, step, pulls = template(4.0), 1.2e-7, []
+    for seed in range(16):
+        constant = float(np.random.default_rng(700 + seed).standard_normal())
+        target = star(change, 3 * seed, constant)
+        others = [star(share * change, 3 * seed + k, constant) for k, share in ((1, 0.5), (2, 0.1))]
+        told = calibrate([target], others, method="weighted").told
+        assert told is not None
+        number = told.number({NAME: step})
+        assert number is not None
+        # What is taken out too much by one error makes data that are off by its change.
+        pulls.append((number[0] + constant * step) / number[1])
+    assert number[1] < 0.5 * step
+    assert np.sqrt(np.mean(np.square(pulls))) == pytest.approx(1.0, abs=0.7)
+    assert told.number({"another": step}) is None
+    assert told.number({}) is None
+
+
+def test_nothing_is_told_by_one_calibrator() -> None:
+    change = template(4.0)
+    found = calibrate([star(change, 0, 0.0)], [star(0.5 * change, 1, 0.0)], method="weighted")
+    assert found.told is None

@@ -24,7 +24,8 @@ from amibayes.cli.options import common
 from amibayes.errors import DataError
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.options import SearchOptions
-from amibayes.plots.pictures import PICTURES, Stages, picture_names
+from amibayes.pipeline.report_types import Stages
+from amibayes.plots.pictures import PICTURES, picture_names
 from amibayes.plots.style import save
 from amibayes.report import Column, Page, Section, Statement, Table, captioned, search_page
 from amibayes.report.page import Sky, page_html, read_figure
@@ -177,7 +178,7 @@ def runs_only_its_own_script(text: str) -> None:
 
 
 def test_every_picture_stands_in_a_section_and_is_drawn_by_some_run() -> None:
-    full = Stages(True, True, True, True, True, True)
+    full = Stages(True, True, True, True, True, True, True)
     assert len({p.name for p in PICTURES}) == len(PICTURES)
     for picture in PICTURES:
         assert picture.section in SECTIONS

@@ -42,17 +42,41 @@ def _charge_migration(found: Json | None) -> tuple[str, ...]:
         return ()
     if found["source"] == "off":
         return ("Charge migration between pixels was not taken out of the images.",)
-    value, error = 1e7 * found["value_per_e"], 1e7 * found["error_per_e"]
     origin = {"fit": "fitted to the ramps", "instrument": "of the instrument's file"}
     whence = origin.get(found["source"], found["source"])
     text = (
-        f"Charge migration of {plain(value)} ± {plain(error)} · 10⁻⁷ pixels per electron "
-        f"({whence}) was taken out of the images; what its error does to target and calibrators "
-        "alike is in the covariance."
+        f"Charge migration of {_per_e(found['value_per_e'], found['error_per_e'])} pixels per "
+        f"electron ({whence}) was taken out of the images; what its error does to target and "
+        "calibrators alike is in the covariance."
     )
-    if found.get("explained") is False:
-        text += " The ramps change in other ways too."
-    return (text,)
+    return (text + _explained(found) + _narrowed(found),)
+
+
+def _per_e(value: float, error: float) -> str:
+    return f"({fixed(1e7 * value, 2)} ± {fixed(1e7 * error, 2)}) · 10⁻⁷"
+
+
+def _narrowed(found: Json) -> str:
+    """Say what calibrators of different charge have made of the value."""
+    value, error = found.get("narrowed_value_per_e"), found.get("narrowed_error_per_e")
+    if value is None or error is None:
+        return ""
+    return (
+        f" Calibrators whose charges differ tell it as well: {_per_e(value, error)} with both "
+        "together, which target and calibrators were then corrected with."
+    )
+
+
+def _explained(found: Json) -> str:
+    """Say whether migration explains how the ramps change; nothing where none were fitted."""
+    p, bend = found.get("p_value"), found.get("p_value_bend")
+    if p is None or bend is None:
+        return ""
+    text = (
+        " Were it all that changes along the ramps, these would be as far from the fit with a "
+        f"probability of {chance(p)} (changes of the current) and {chance(bend)} (other bends)."
+    )
+    return text if found["explained"] else f"{text} The ramps change in other ways too."
 
 
 def _posterior(found: Json | None) -> tuple[Table, ...]:
