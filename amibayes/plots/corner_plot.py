@@ -69,13 +69,15 @@ def corner_plot(
     Raises
     ------
     ValueError
-        Where samples are not finite, fewer than dimensions, or do not match the labels.
+        Where samples are not finite, fewer than dimensions, or do not match the labels, and where
+        there is no parameter.
     """
     # corner loads ArviZ, where that is installed: half a second that most runs need not spend.
     import corner
 
     draws = np.array(samples, dtype=float)
-    if draws.ndim != 2 or draws.shape[1] != len(labels) or len(draws) <= draws.shape[1]:
+    matched = draws.ndim == 2 and 0 < draws.shape[1] == len(labels)
+    if not matched or len(draws) <= draws.shape[1]:
         raise ValueError(f"samples of shape {draws.shape} for {len(labels)} labels")
     if not np.isfinite(draws).all():
         raise ValueError("samples that are not finite")
@@ -100,6 +102,9 @@ def corner_plot(
     for values, colour, dash, marker in [(best, BLUE, "-", "s"), (truths, VERMILLION, "--", "o")]:
         if values is not None:
             at = np.asarray(values, dtype=float) * factor
+            if len(at) == 1:  # corner overplots figures of two and more parameters only
+                figure.axes[0].axvline(float(at[0]), color=colour, linestyle=dash, linewidth=1.2)
+                continue
             corner.overplot_lines(figure, at, color=colour, linestyle=dash, linewidth=1.2)
             corner.overplot_points(figure, at[None], color=colour, marker=marker, markersize=5)
     return figure

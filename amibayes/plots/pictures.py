@@ -43,7 +43,7 @@ MAPS = "maps.fits"
 class Stages:
     """What a run holds, known before it begins: which pictures there will be.
 
-    Several files that are fitted together, calibrators, and these stages.
+    Several files fitted together, calibrators, these stages, models of the sky with parameters.
     """
 
     several: bool = False
@@ -52,15 +52,14 @@ class Stages:
     posterior: bool = False
     limits: bool = False
     models: bool = False
+    fitted: bool = False
 
     @classmethod
     def asked(cls, options: SearchOptions, *, calibrated: bool, several: bool = False) -> Stages:
         """Those of a run that has yet to begin."""
-        tested = options.null_draws != 0
+        tested, models = options.null_draws != 0, options.models is not None
         limits = options.limits and tested
-        return cls(
-            several, calibrated, tested, options.posterior, limits, options.models is not None
-        )
+        return cls(several, calibrated, tested, options.posterior, limits, models, models)
 
     @classmethod
     def of(cls, report: SearchReport) -> Stages:
@@ -72,6 +71,7 @@ class Stages:
             report.posterior is not None,
             report.limits is not None,
             report.models is not None,
+            report.models is not None and any(m.names for m in report.models.models),
         )
 
 
@@ -390,11 +390,11 @@ PICTURES = (
     ),
     Picture(
         "models_corner",
-        "Posterior of the most probable model",
+        "Posterior of the most probable model that has parameters",
         "Marginal distributions of its parameters, one by one and in pairs; fluxes as logarithms.",
         "models",
         _of_models(models.model_corner),
-        lambda run: run.models,
+        lambda run: run.fitted,
     ),
 )
 """The pictures of a search, in the order of the report: a new one is one more line here."""

@@ -363,7 +363,15 @@ def test_a_parameter_that_never_moves_has_a_corner() -> None:
     assert "110" in corner_plot(draws, NAMES).axes[4].get_title()
 
 
-@pytest.mark.parametrize("shape", [(10, 2), (2, 3), (3, 3, 3)])
+def test_a_single_parameter_has_a_corner() -> None:
+    """corner overplots lines on figures of two and more parameters only."""
+    figure = corner_plot(samples()[:, :1], NAMES[:1], truths=[91.0], best=[90.0])
+    (panel,) = figure.axes
+    assert {90.0, 91.0} <= {float(np.mean(line.get_xdata())) for line in panel.lines}
+    assert panel.get_title().startswith("East (mas)\n$90.0")
+
+
+@pytest.mark.parametrize("shape", [(10, 2), (2, 3), (3, 3, 3), (10, 0)])
 def test_samples_that_do_not_fit_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="labels"):
         corner_plot(np.zeros(shape), NAMES)
