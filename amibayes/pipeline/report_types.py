@@ -65,6 +65,7 @@ class SearchReport(Shown):
             ("targets", ", ".join(self.targets)),
             ("calibrators", ", ".join(self.calibrators) or "none"),
             ("statement", "not tested" if self.verdict is None else self.verdict.statement),
+            *([] if self.models is None else [("models", self.models.verdict.statement)]),
             ("best fit", repr(self.result).strip("<>").removeprefix("SearchResult: ")),
             ("false alarm", "not tested" if chance is None else f"{chance.probability:.3g}"),
             ("holds", ", ".join(["result", "observables", *kept])),

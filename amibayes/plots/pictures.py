@@ -356,8 +356,8 @@ PICTURES = (
     Picture(
         "models_images",
         "Models of the sky",
-        "The best fit of each model without its star, on one scale, north up and east left, "
-        "with the beam in the lower left corner.",
+        "The best fit of each model without its star, on one scale of brightness, north up and "
+        "east left, with the beam in the lower left corner.",
         "models",
         _of_models(models.model_images),
         lambda run: run.models,
