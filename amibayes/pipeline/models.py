@@ -90,7 +90,8 @@ def with_models(
     report: SearchReport, found: ModelComparison | None, beside: LimitsBeside | None
 ) -> SearchReport:
     """Put a comparison of models, and what is to be warned of, in a report."""
-    warnings = (*report.warnings, *models_warnings(found, report.verdict))
+    # First: the summary has room for a few.
+    warnings = (*models_warnings(found, report.verdict), *report.warnings)
     return replace(report, models=found, limits_beside=beside, warnings=warnings)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -287,11 +286,11 @@ def model_odds(found: ModelComparison) -> Figure:
     _draw_odds(upper, found)
     columns, share = confusion.taken_for()
     drawn = lower.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    size = float(np.clip(90.0 / len(columns), 6.0, 11.0))  # as wide as a column
     for (i, j), value in np.ndenumerate(share):
         colour = PALE if value > 0.6 else BLACK
-        lower.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour)
-    labels = [fill(name, 14) for name in columns]
-    lower.set_xticks(range(len(columns)), labels, rotation=30, ha="right", rotation_mode="anchor")
+        lower.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=size)
+    lower.set_xticks(range(len(columns)), columns, rotation=45, ha="right", rotation_mode="anchor")
     lower.set_yticks(range(len(names)), names)
     lower.set_xlabel("taken for")
     lower.set_ylabel("simulated")
