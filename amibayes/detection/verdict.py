@@ -115,10 +115,8 @@ def verdict(
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
-        note = note_of(result, compared=compared)
-        if not note and within_calibration(
-            result.likelihood.observables, change_by_companion(result)
-        ):
+        note, data = note_of(result, compared=compared), result.likelihood.observables
+        if not note and within_calibration(data, change_by_companion(result)):
             note = SMALL
         left += f"; but {note}" if note else ""
         return Verdict("companion", _found(tested) + left, p_model, note)
