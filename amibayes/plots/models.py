@@ -99,7 +99,7 @@ def model_images(found: ModelComparison) -> Figure:
     scale = PowerNorm(0.5, 0.0, max(float(i.max()) for i in images) or 1.0)
     columns = 2 if len(images) in (2, 4) else min(len(images), COLUMNS)
     rows = int(np.ceil(len(images) / columns))
-    figure = new_figure(1.1 + (3.4 if columns == 2 else 2.45) * rows)
+    figure = new_figure(1.1 + (3.5 if columns == 2 else 2.7) * rows)
     axes = figure.subplots(rows, columns, squeeze=False)
     each = zip(axes.ravel(), found.models, images, shares, fields, extents, strict=False)
     for ax, model, image, share, field, extent in each:

@@ -132,6 +132,7 @@ def test_notes_and_legends_cover_nothing(found: ModelComparison, tmp_path: Path)
     figure = model_images(found)
     save(figure, tmp_path / "images.png")
     for ax in figure.axes:
+        assert ax.title.get_window_extent().y1 <= figure.bbox.y1
         for text in ax.texts:
             inside, panel = text.get_window_extent(), ax.get_window_extent()
             assert panel.x0 <= inside.x0
