@@ -125,7 +125,8 @@ def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str
     with Drawing(arguments, folder, journals.path / "pictures") as drawing:
         with journals.telling(folder / CHAIN):
             report = _search(arguments, options, folder, journals, drawing)
-        _remove_stale(folder, names, report)
+        for stale in _stale(names, report):
+            (folder / stale).unlink(missing_ok=True)
         content = _write(arguments, report, folder, asked, drawing)
     journals.remove()
     return report, folder, content
@@ -140,15 +141,13 @@ def _names(options: SearchOptions, *, calibrated: bool, several: bool) -> list[s
     return [*names, CALIBRATED, CALIBRATED_KP] if calibrated or options.library else names
 
 
-def _remove_stale(folder: Path, names: list[str], report: SearchReport) -> None:
-    """Remove what an older run left that this one has not, pictures of ramps without ramps too."""
-    from amibayes.pipeline.options import SearchOptions
+def _stale(names: list[str], report: SearchReport) -> set[str]:
+    """Files of earlier runs that this one has none of."""
     from amibayes.plots.pictures import PICTURES, pictures_of
 
-    lacking = {p.file for p in PICTURES} - {p.file for p in pictures_of(report)}
-    every = set(_names(SearchOptions(), calibrated=True, several=True))
-    for stale in every - (set(names) - lacking):
-        (folder / stale).unlink(missing_ok=True)
+    every, mine = {p.file for p in PICTURES}, {p.file for p in pictures_of(report)}
+    others = _names(type(report.options)(), calibrated=True, several=True)
+    return (every | set(others)) - set(names) | (every - mine)
 
 
 def request(arguments: argparse.Namespace) -> str:
@@ -210,14 +209,22 @@ def _write(
     drawing: Drawing,
 ) -> dict[str, object]:
     """Write everything but the chain; the result last: where it is, the run is finished."""
+    from amibayes.errors import AmibayesError
     from amibayes.kpfits import write_observables
     from amibayes.report import captioned, explorer_data, result_json, search_page, write_page
     from amibayes.support.atomic_files import write_json
 
     if report.calibration is not None:
         write_observables(folder / CALIBRATED, report.observables)
-    drawn = drawing.finish(report)
     content = result_json(report, request)
+    try:
+        drawn = drawing.finish(report)
+    except AmibayesError:
+        raise  # a full disk, say: --resume goes on once there is room
+    except Exception:
+        # A fault of a picture would end every further run too: the numbers need no picture.
+        write_json(folder / RESULT, content)
+        raise
     figures = captioned(folder, [path.name for path in drawn])
     words = common.command_line(arguments)
     write_page(folder / REPORT, search_page(content, figures, words, explorer_data(report)))

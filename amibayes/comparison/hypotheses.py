@@ -38,8 +38,14 @@ SMALLEST_SCALE = 0.25
 MORE_GENERAL = {"ring": "crescent"}
 """Kinds of light that are a special case of another."""
 
-FAMILIES = {"star": "star", "point": "companion", "extended": "extended light", "both": "both"}
-"""Kinds of models: what a verdict may name where models of one kind cannot be told apart."""
+FAMILIES = {
+    "star": "star",
+    "point": "one or two companions",
+    "extended": "extended light",
+    "both": "companions and extended light",
+}
+"""Kinds of models: what a verdict may name where models of one kind cannot be told apart. None of
+several models is called as one of them: shares of the confusion matrix go by these names."""
 
 
 @dataclass(frozen=True)

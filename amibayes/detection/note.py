@@ -9,14 +9,19 @@ LARGEST_STAR_MAS = 60.0
 """No star but the Sun looks larger: R Doradus has 57 ± 5 mas (Bedding et al. 1997,
 MNRAS 286, 957)."""
 
+SEE = "see the comparison of models"
+"""Where a run that compares models says more."""
 
-def note_of(result: SearchResult) -> str:
+
+def note_of(result: SearchResult, *, compared: bool = False) -> str:
     """Say why a point that fits may be no companion; empty where nothing speaks against one.
 
     A star is a uniform or darkened disc in the search. A spot on it is a point inside it; a ring
     or a crescent around it is taken for its disc, larger than any star, and a point; and
-    below λ/2B a point cannot be told from an elongated star.
+    below λ/2B a point cannot be told from an elongated star. Where models of the sky are
+    ``compared``, the reader is sent there.
     """
+    where = SEE if compared else "--models"
     rho = result.companion.separation_mas
     diameter = result.nuisance("diameter_mas")
     half = 0.5 * resolution_mas(result.likelihood)
@@ -25,11 +30,11 @@ def note_of(result: SearchResult) -> str:
     if diameter > LARGEST_STAR_MAS:
         return (
             f"the star's disc of {diameter:.3g} mas is larger than any star: light around it, such "
-            "as a crescent, may fit as well (--models)"
+            f"as a crescent, may fit as well ({where})"
         )
     if rho < half:
         return (
             f"it is nearer than λ/2B, {half:.3g} mas, where an elongated star or a crescent may "
-            "fit as well (--models)"
+            f"fit as well ({where})"
         )
     return ""

@@ -13,7 +13,7 @@ from amibayes.data.observables import Observables
 from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
 from amibayes.detection.false_alarm import Significance
-from amibayes.detection.note import note_of
+from amibayes.detection.note import SEE, note_of
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
 from amibayes.likelihood.likelihood import single_likelihood
@@ -70,6 +70,7 @@ def verdict(
     *,
     structured: bool = True,
     shape: float = 0.0,
+    compared: bool = False,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -88,6 +89,8 @@ def verdict(
         `within_calibration`. Structure that is not does not speak against the model.
     shape : float
         Of `fit_probability`: `SHAPE` where noise was fitted.
+    compared : bool
+        Whether models of the sky are compared too.
 
     Notes
     -----
@@ -112,17 +115,17 @@ def verdict(
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
-        note = note_of(result)
-        if not note and within_calibration(
-            result.likelihood.observables, change_by_companion(result)
-        ):
+        note, data = note_of(result, compared=compared), result.likelihood.observables
+        if not note and within_calibration(data, change_by_companion(result)):
             note = SMALL
         left += f"; but {note}" if note else ""
         return Verdict("companion", _found(tested) + left, p_model, note)
     return Verdict("no companion", _nothing(tested) + left, p_model)
 
 
-def without_companion(found: Verdict, other: Alternative, result: SearchResult) -> Verdict:
+def without_companion(
+    found: Verdict, other: Alternative, result: SearchResult, *, compared: bool = False
+) -> Verdict:
     """The verdict where a source without a companion fits as well as the one that was found.
 
     A star that changes with wavelength is one star; light around it is outside of the model.
@@ -130,7 +133,7 @@ def without_companion(found: Verdict, other: Alternative, result: SearchResult) 
     against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
     if other.kind == "chromatic star":
         return Verdict("no companion", f"{other.words}, {against}", found.p_model)
-    because = f"{other.words} {against}: compare by --models"
+    because = f"{other.words} {against}: {SEE if compared else 'compare by --models'}"
     return Verdict("model rejected", because, found.p_model)
 
 

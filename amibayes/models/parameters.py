@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from amibayes.models.bands import band_name
 from amibayes.units import MAS, IntArray
 
 Role = Literal["position", "flux", "rate", "shape", "nuisance"]
@@ -17,6 +18,10 @@ MAX_BACKGROUND = 10.0
 
 MAX_CONTRAST = 1.0
 """A companion brighter than its primary is the same binary seen from the other star."""
+
+
+UNITS = (("_mas_yr", " (mas/yr)"), ("_mas", " (mas)"), ("_deg", " (°)"))
+"""What names of parameters end with, and what a reader is shown."""
 
 
 @dataclass(frozen=True)
@@ -167,3 +172,13 @@ class Box:
     inner_mas: float
     outer_mas: float
     fringe_mas: float
+
+
+def parameter_words(name: str) -> str:
+    """Name of a parameter for a reader: ``east_mas_2`` is east of companion 2 (mas)."""
+    name, _, band = name.partition("[")
+    base, _, number = name.rpartition("_")
+    name, of = (base, f" of companion {number}") if number.isdigit() else (name, "")
+    ending, unit = next((pair for pair in UNITS if name.endswith(pair[0])), ("", ""))
+    words = name.removesuffix(ending).replace("_", " ")
+    return f"{words}{of}{unit}" + (f", {band_name(band.rstrip(']'))}" if band else "")

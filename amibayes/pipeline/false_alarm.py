@@ -167,7 +167,10 @@ def verdict_of(
     within = within_calibration(result.likelihood.observables, change)
     structured = rest.probability > options.alpha or not within
     shape = SHAPE if options.extra_noise else 0.0
-    said = verdict(result, tested, rest, splits, structured=structured, shape=shape)
+    compared = options.models is not None
+    said = verdict(
+        result, tested, rest, splits, structured=structured, shape=shape, compared=compared
+    )
     if said.statement == "companion" and (other := alternative(result)) is not None:
-        said = without_companion(said, other, result)
+        said = without_companion(said, other, result, compared=compared)
     return said, splits

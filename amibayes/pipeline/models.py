@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.field import default_separation
+from amibayes.comparison.agreement import REJECTED, agreement
 from amibayes.comparison.best_fits import NoiseSetting
 from amibayes.comparison.compare import ModelComparison, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES
@@ -90,17 +91,15 @@ def with_models(
     report: SearchReport, found: ModelComparison | None, beside: LimitsBeside | None
 ) -> SearchReport:
     """Put a comparison of models, and what is to be warned of, in a report."""
-    warnings = (*report.warnings, *models_warnings(found, report.verdict))
+    # First: the summary has room for a few.
+    warnings = (*models_warnings(found, report.verdict), *report.warnings)
     return replace(report, models=found, limits_beside=beside, warnings=warnings)
 
 
 def models_warnings(
     found: ModelComparison | None, verdict: Verdict | None = None
 ) -> tuple[str, ...]:
-    """Warn of what makes the comparison less than it seems.
-
-    The verdict on the data may be that the star alone, and that with a companion, are refused.
-    """
+    """Warn of what makes the comparison less than it seems, and where the verdict is another."""
     if found is None:
         return ()
     warnings = []
@@ -110,21 +109,8 @@ def models_warnings(
             f"{found.best.chi2:.4g} for {found.best.ndof} degrees of freedom; odds between models "
             "that do not fit mean little"
         )
-    refused = verdict is not None and verdict.statement in REFUSED
-    if verdict is not None and refused and found.best.name in JUDGED:
-        warnings.append(
-            f"{found.best.name} is the most probable of the models of the sky that were compared, "
-            f"but the verdict on it is: {verdict.statement}"
-        )
-    return tuple(warnings)
-
-
-REFUSED = ("model rejected", "inconsistent data")
-JUDGED = ("star", "companion")
-"""Models that the verdict is about, and what it says where neither is right."""
-
-REJECTED = 1e-3
-"""Probability of a χ² below which a model does not fit."""
+    beside = agreement(found, verdict).warning
+    return (*warnings, beside) if beside else tuple(warnings)
 
 
 def _default_field(found: FieldSearch, options: SearchOptions) -> tuple[float, float] | None:

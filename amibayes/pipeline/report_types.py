@@ -66,6 +66,7 @@ class SearchReport(Shown):
             ("targets", ", ".join(self.targets)),
             ("calibrators", ", ".join(self.calibrators) or "none"),
             ("statement", "not tested" if self.verdict is None else self.verdict.statement),
+            *([] if self.models is None else [("models", self.models.verdict.statement)]),
             ("best fit", repr(self.result).strip("<>").removeprefix("SearchResult: ")),
             ("false alarm", "not tested" if chance is None else f"{chance.probability:.3g}"),
             ("holds", ", ".join(["result", "observables", *kept])),
@@ -77,8 +78,8 @@ class SearchReport(Shown):
 class Stages:
     """What a run holds, known before it begins: which pictures there will be.
 
-    Several files that are fitted together, calibrators, these stages, and ramps that charge
-    migration was fitted to.
+    Several files that are fitted together, calibrators, these stages, models of the sky with
+    parameters, and ramps that charge migration was fitted to.
     """
 
     several: bool = False
@@ -87,6 +88,7 @@ class Stages:
     posterior: bool = False
     limits: bool = False
     models: bool = False
+    fitted: bool = False
     ramps: bool = False
 
     @classmethod
@@ -95,7 +97,7 @@ class Stages:
         tested = options.null_draws != 0
         limits = options.limits and tested
         models = options.models is not None
-        return cls(several, calibrated, tested, options.posterior, limits, models, ramps=True)
+        return cls(several, calibrated, tested, options.posterior, limits, models, models, True)
 
     @classmethod
     def of(cls, report: SearchReport) -> Self:
@@ -107,6 +109,7 @@ class Stages:
             report.posterior is not None,
             report.limits is not None,
             report.models is not None,
+            report.models is not None and any(m.names for m in report.models.models),
             report.charge_migration is not None and report.charge_migration.fit is not None,
         )
 

@@ -69,13 +69,15 @@ def corner_plot(
     Raises
     ------
     ValueError
-        Where samples are not finite, fewer than dimensions, or do not match the labels.
+        Where samples are not finite, fewer than dimensions, or do not match the labels, and where
+        there is no parameter.
     """
     # corner loads ArviZ, where that is installed: half a second that most runs need not spend.
     import corner
 
     draws = np.array(samples, dtype=float)
-    if draws.ndim != 2 or draws.shape[1] != len(labels) or len(draws) <= draws.shape[1]:
+    matched = draws.ndim == 2 and 0 < draws.shape[1] == len(labels)
+    if not matched or len(draws) <= draws.shape[1]:
         raise ValueError(f"samples of shape {draws.shape} for {len(labels)} labels")
     if not np.isfinite(draws).all():
         raise ValueError("samples that are not finite")
@@ -99,10 +101,19 @@ def corner_plot(
     _title(figure, draws, names)
     for values, colour, dash, marker in [(best, BLUE, "-", "s"), (truths, VERMILLION, "--", "o")]:
         if values is not None:
-            at = np.asarray(values, dtype=float) * factor
-            corner.overplot_lines(figure, at, color=colour, linestyle=dash, linewidth=1.2)
-            corner.overplot_points(figure, at[None], color=colour, marker=marker, markersize=5)
+            _mark(figure, np.asarray(values, dtype=float) * factor, colour, dash, marker)
     return figure
+
+
+def _mark(figure: Figure, at: FloatArray, colour: str, dash: str, marker: str) -> None:
+    """Draw lines through values of the parameters (n_dim,), and points where they cross."""
+    import corner
+
+    if len(at) == 1:  # corner overplots figures of two and more parameters only
+        figure.axes[0].axvline(float(at[0]), color=colour, linestyle=dash, linewidth=1.2)
+        return
+    corner.overplot_lines(figure, at, color=colour, linestyle=dash, linewidth=1.2)
+    corner.overplot_points(figure, at[None], color=colour, marker=marker, markersize=5)
 
 
 def _scales(draws: FloatArray, labels: Sequence[str]) -> tuple[FloatArray, list[str]]:

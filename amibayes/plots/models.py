@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import Compared, ModelComparison
+from amibayes.models.brightness import brightness, points
 from amibayes.models.extended import Extended
 from amibayes.models.light_points import light_points
+from amibayes.models.parameters import parameter_words
 from amibayes.plots.corner_plot import corner_plot
 from amibayes.plots.style import (
     BLACK,
@@ -23,7 +31,7 @@ from amibayes.plots.style import (
     new_figure,
     styled,
 )
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 PIXELS = 121
 """Pixels along a side of a model's image."""
@@ -39,93 +47,148 @@ CORNER_SAMPLES = 20_000
 
 def sources_of(model: Compared) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points of all that is around the star in the best fit: east, north (mas), light."""
+    parts = [np.array(_companions(model))]
+    parts += [np.array(light_points(part, values)) for part, values in _extended(model)]
+    east, north, light = np.concatenate(parts, axis=1)
+    return east, north, light
+
+
+def _companions(model: Compared) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """East, north (mas) and contrast of each companion."""
     parameters, theta = model.fit.model.likelihood.parameters, model.theta
     found = [
         (*theta[parameters.place(k)], theta[parameters.columns("flux", component=k)[0]])
         for k in range(1, parameters.companions + 1)
     ]
-    parts = [np.array(found).reshape(-1, 3).T]
+    east, north, contrast = np.array(found).reshape(-1, 3).T
+    return east, north, contrast
+
+
+def _extended(model: Compared) -> Iterator[tuple[Extended, FloatArray]]:
+    """Each disc or ring around the star, with its best parameters."""
+    parameters = model.fit.model.likelihood.parameters
     for part in model.fit.model.likelihood.model.surroundings:
         if isinstance(part, Extended):
-            values = theta[[parameters.index(p.name) for p in part.parameters]]
-            parts.append(np.array(light_points(part, values)))
-    east, north, light = np.concatenate(parts, axis=1)
-    return east, north, light
+            yield part, model.theta[[parameters.index(p.name) for p in part.parameters]]
+
+
+def image_of(model: Compared, reach: float, beam: float) -> FloatArray:
+    """Light per beam around the star in the best fit, (north, east reversed), out to ``reach``."""
+    grid = np.linspace(-reach, reach, PIXELS)
+    parts = [points(*_companions(model))]
+    parts += [brightness(part, values, beam) for part, values in _extended(model)]
+    image = sum((part.through(beam, grid) for part in parts), np.zeros((PIXELS, PIXELS)))
+    return np.asarray(image[:, ::-1])
 
 
 @styled()
 def model_images(found: ModelComparison) -> Figure:
-    """Draw the best fit of every model without its star, on one scale, with the beam.
+    """Draw the best fit of every model without its star, with the beam.
 
     Light is convolved with a Gaussian of FWHM λ/2B; colours give it per beam, in units of the
-    star's.
+    star's. All have one field, but those whose light lies mostly outside of it.
     """
     beam = 0.5 * resolution_mas(found.models[0].fit.model.likelihood)
-    sources = [sources_of(m) for m in found.models]
     shares = found.probability
-    # The scale is that of models that count; what lies outside of it is told in words.
-    extents = np.array([_extent(*s) for s in sources])
+    # The field is that of models that count.
+    extents = np.array([_extent(*sources_of(m), 0.95) for m in found.models])
     reach = max(3.0 * beam, 1.3 * float(extents[shares > 0.01].max(initial=0.0)))
-    grid = np.linspace(-reach, reach, PIXELS)
-    images = [_blurred(grid, *s, beam) for s in sources]
-    brightest = max(float(i.max()) for i in images) or 1.0
+    middle = np.array([_extent(*sources_of(m), 0.5) for m in found.models])
+    fields = np.where(middle > reach, 1.3 * extents, reach)
+    images = [image_of(m, field, beam) for m, field in zip(found.models, fields, strict=True)]
+    scale = PowerNorm(0.5, 0.0, max(float(i.max()) for i in images) or 1.0)
     columns = 2 if len(images) in (2, 4) else min(len(images), COLUMNS)
     rows = int(np.ceil(len(images) / columns))
-    figure = new_figure(0.7 + (2.9 if columns == 2 else 2.2) * rows)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    for ax in axes.ravel()[len(images) :]:
-        ax.axis("off")
-    scale = PowerNorm(0.5, 0.0, brightest)
-    each = zip(axes.ravel(), found.models, images, shares, extents, strict=False)
-    for ax, model, image, share, extent in each:
-        drawn = ax.imshow(
-            image,
-            origin="lower",
-            extent=(reach, -reach, -reach, reach),
-            cmap=SEQUENTIAL,
-            norm=scale,
+    figure = new_figure(1.1 + (3.5 if columns == 2 else 2.7) * rows)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    each = zip(axes.ravel(), found.models, images, shares, fields, extents, strict=False)
+    for ax, model, image, share, field, extent in each:
+        drawn = _draw_image(ax, image, field, beam, scale)
+        ax.set_title(
+            f"{model.name}: {_percent(share)}\nχ² {model.chi2:.4g}, {model.ndof} dof", fontsize=9.5
         )
-        drawn_over = {"color": "white", "mec": BLACK, "ms": 10, "ls": ""}
-        # imshow puts the first column at the left: east is there.
-        ax.plot(0.0, 0.0, "*", **drawn_over)
-        if extent > 1.2 * reach:
-            far = f"light out to {extent:.0f} mas"
-            ax.text(0.5, 0.9, far, color=PALE, ha="center", transform=ax.transAxes)
-        ax.add_patch(Circle((0.8 * reach, -0.8 * reach), 0.5 * beam, fill=False, ec=PALE))
-        ax.set_title(f"{model.name}: {_percent(share)}\nχ² {model.chi2:.4g}, {model.ndof} dof")
-    for ax in axes[-1]:
-        ax.set_xlabel("East (mas)")
-    for ax in axes[:, 0]:
-        ax.set_ylabel("North (mas)")
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.8)
+        notes = _notes(model, extent, field, own=field != reach)
+        ax.text(0.5, 0.97, notes, transform=ax.transAxes, **NOTE)
+    _label_axes(axes, fields == reach)
+    bar = figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.8, aspect=35)
+    bar.locator = MaxNLocator(4)
+    bar.update_ticks()
     bar.set_label("Light per beam (star = 1)")
     return figure
 
 
-def _extent(east: FloatArray, north: FloatArray, light: FloatArray) -> float:
-    """Radius that holds all but a twentieth of the light."""
+def _label_axes(axes: Any, common: BoolArray) -> None:
+    """Number the first panel of each row and the last of each column that have the common field."""
+    shown = np.zeros(axes.shape, dtype=bool)
+    shown.ravel()[: len(common)] = common
+    for i, j in np.ndindex(*axes.shape):
+        ax = axes[i, j]
+        if i * axes.shape[1] + j >= len(common):
+            ax.axis("off")
+        elif not shown[i, j]:
+            ax.set_xticks([])
+            ax.set_yticks([])
+        else:
+            left, lowest = not shown[i, :j].any(), not shown[i + 1 :, j].any()
+            ax.tick_params(labelleft=left, labelbottom=lowest)
+            ax.set_ylabel("North (mas)" if left else "")
+            ax.set_xlabel("East (mas)" if lowest else "")
+
+
+NOTE: dict[str, Any] = {
+    "color": PALE,
+    "ha": "center",
+    "va": "top",
+    "fontsize": 7.5,
+    "bbox": {"fc": BLACK, "alpha": 0.5, "ec": "none", "pad": 1.5},
+}
+"""How a note is written in a panel."""
+
+
+def _draw_image(ax: Axes, image: FloatArray, field: float, beam: float, scale: Any) -> AxesImage:
+    """One image, its star and the beam; imshow puts the first column at the left: east."""
+    extent = (field, -field, -field, field)
+    drawn = ax.imshow(image, origin="lower", extent=extent, cmap=SEQUENTIAL, norm=scale)
+    ax.plot(0.0, 0.0, "*", color="white", mec=BLACK, ms=10)
+    ax.add_patch(Circle((0.8 * field, -0.8 * field), 0.5 * beam, fill=False, ec=PALE))
+    return drawn
+
+
+def _notes(model: Compared, extent: float, field: float, *, own: bool) -> str:
+    """What an image does not show: light farther out, light without a shape, or that there is none.
+
+    A field of its own is told too.
+    """
+    likelihood, notes = model.fit.model.likelihood, []
+    if "background" in likelihood.parameters.names:
+        halo = float(model.theta[likelihood.parameters.index("background")])
+        notes.append(f"+ {100.0 * halo:.1f} % over-resolved")
+    elif extent == 0.0:
+        notes.append("nothing around")
+    if own:
+        notes.append(f"field of ±{field:.3g} mas")
+    elif extent > 1.2 * field:
+        notes.append(f"light out to {extent:.3g} mas")
+    return "\n".join(notes)
+
+
+def _extent(east: FloatArray, north: FloatArray, light: FloatArray, share: float) -> float:
+    """Radius that holds a share of the light."""
     if not light.sum() > 0.0:
         return 0.0
     radius = np.hypot(east, north)
     order = np.argsort(radius)
     reached = np.cumsum(light[order]) / light.sum()
-    return float(radius[order][np.searchsorted(reached, 0.95)])
-
-
-def _blurred(
-    grid: FloatArray, east: FloatArray, north: FloatArray, light: FloatArray, beam: float
-) -> FloatArray:
-    """Image (north, east reversed) of points seen through a Gaussian of a FWHM."""
-    sigma = beam / np.sqrt(8.0 * np.log(2.0))
-    along = np.exp(-0.5 * ((grid[::-1, None] - east) / sigma) ** 2)
-    up = np.exp(-0.5 * ((grid[:, None] - north) / sigma) ** 2)
-    return np.asarray((up * light) @ along.T)
+    return float(radius[order][np.searchsorted(reached, share)])
 
 
 def _percent(share: float) -> str:
     if share > 0.9995:
         return "> 99.9 %"
-    return f"{100.0 * share:.2g} %" if share >= 1e-3 else "< 0.1 %"
+    if share < 1e-3:
+        return "< 0.1 %"
+    # Two digits, but three where the second one would make it certain.
+    return f"{100.0 * share:.{3 if share >= 0.995 else 2}g} %"
 
 
 @styled()
@@ -149,7 +212,8 @@ def model_visibilities(found: ModelComparison) -> Figure:
             colour, marker = marker_of(k)
             ax.plot(x, value[part] * unit, marker, color=colour, mfc="none", ms=5, label=model.name)
         ax.margins(y=0.08)
-    axes[0].legend(ncols=3, loc="best")
+    # Above the data: inside there is no place that is free for every data set.
+    axes[0].legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.01))
     if "vis2" in kinds:
         axes[0].set_xlabel("Position angle of the baseline (° east of north)")
         axes[0].set_ylabel("V²")
@@ -222,10 +286,11 @@ def model_odds(found: ModelComparison) -> Figure:
     _draw_odds(upper, found)
     columns, share = confusion.taken_for()
     drawn = lower.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    size = float(np.clip(90.0 / len(columns), 6.0, 11.0))  # as wide as a column
     for (i, j), value in np.ndenumerate(share):
         colour = PALE if value > 0.6 else BLACK
-        lower.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour)
-    lower.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
+        lower.text(j, i, f"{value:.2f}", ha="center", va="center", color=colour, fontsize=size)
+    lower.set_xticks(range(len(columns)), columns, rotation=45, ha="right", rotation_mode="anchor")
     lower.set_yticks(range(len(names)), names)
     lower.set_xlabel("taken for")
     lower.set_ylabel("simulated")
@@ -270,8 +335,7 @@ def model_corner(found: ModelComparison) -> Figure:
 
 
 def _label(name: str, logarithmic: bool) -> str:
-    for ending, unit in (("_mas", " (mas)"), ("_deg", " (°)")):
-        if name.endswith(ending):
-            name = name.removesuffix(ending) + unit
-    words = name.replace("_", " ").replace("position angle", "PA")
+    words = parameter_words(name).replace("position angle", "PA")
+    # On two lines: a panel is no wider than a few words.
+    words = re.sub(r" (of companion \d+)( \(.*\))?$", r"\2\n\1", words)
     return f"log10 {words}" if logarithmic else words

@@ -338,8 +338,8 @@ PICTURES = (
     Picture(
         "models_images",
         "Models of the sky",
-        "The best fit of each model without its star, on one scale, north up and east left, "
-        "with the beam in the lower left corner.",
+        "The best fit of each model without its star, on one scale of brightness, north up and "
+        "east left, with the beam in the lower left corner.",
         "models",
         _of_models(models.model_images),
         lambda run: run.models,
@@ -372,11 +372,11 @@ PICTURES = (
     ),
     Picture(
         "models_corner",
-        "Posterior of the most probable model",
+        "Posterior of the most probable model that has parameters",
         "Marginal distributions of its parameters, one by one and in pairs; fluxes as logarithms.",
         "models",
         _of_models(models.model_corner),
-        lambda run: run.models,
+        lambda run: run.fitted,
     ),
 )
 """The pictures of a search, in the order of the report: a new one is one more line here."""

@@ -92,9 +92,13 @@ def _sky(
         ax.plot(0.0, 0.0, "*", color="white", mec=BLACK, ms=11)
     ax.set_xlabel("East (mas)")
     ax.set_ylabel("North (mas)")
-    bar = figure.colorbar(drawn, ax=ax, label=label, location="bottom", shrink=0.7, aspect=30)
+    # Powers of ten stand in the label: numbers with their own run into each other.
+    power = int(np.floor(np.log10(float(np.abs(drawn.get_clim()).max()) or 1.0)))
+    power = 0 if -2 <= power < 3 else power
+    named = f"{label} (10$^{{{power}}}$)" if power else label
+    bar = figure.colorbar(drawn, ax=ax, label=named, location="bottom", shrink=0.7, aspect=30)
     bar.locator = MaxNLocator(3)
-    bar.formatter = FuncFormatter(lambda value, _: f"{value:.2g}".replace("-", "−"))
+    bar.formatter = FuncFormatter(lambda value, _: f"{value / 10.0**power:.2g}".replace("-", "−"))
     bar.update_ticks()
 
 

@@ -354,9 +354,7 @@ def edit_prior(
     nuisance: Iterable[str],
     others: Iterable[str] = (),
 ) -> Prior:
-    """Change a prior as the settings say; ``nuisance`` names its nuisance parameters.
-
-    ``others`` may be named too, elsewhere: they are offered where a name is not known.
+    """Change a prior as the settings say; names of its nuisance parameters, and of other models'.
 
     Raises
     ------

@@ -7,15 +7,17 @@ from dataclasses import asdict
 import numpy as np
 
 from amibayes.companion_search.field import resolution_mas
+from amibayes.comparison.agreement import REJECTED, agreement, model_words
 from amibayes.comparison.compare import Compared, ModelComparison
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.comparison.summary import intervals
-from amibayes.models.parameters import Parameter
+from amibayes.detection.verdict import Verdict
+from amibayes.models.parameters import Parameter, Parameters, parameter_words
 from amibayes.posterior.evidence import Evidence
 from amibayes.posterior.priors import Prior, Range
 from amibayes.report.common import Json, number
 from amibayes.report.page import Column, Section, Table
-from amibayes.report.words import chance, count, fixed, measured, percent, plain
+from amibayes.report.words import capital, chance, count, fixed, measured, percent, plain
 from amibayes.support.options import SKY_MODELS
 from amibayes.support.terminal import row
 
@@ -27,7 +29,9 @@ BY_EVIDENCE = {0: "star", 1: "companion", 2: "two"}
 """Names of the models that the evidence of companions is of."""
 
 
-def models_json(found: ModelComparison | None, evidence: Evidence | None) -> Json:
+def models_json(
+    found: ModelComparison | None, evidence: Evidence | None, verdict: Verdict | None = None
+) -> Json:
     """Build ``models``, ``confusion`` and ``model_verdict`` of ``result.json``.
 
     Where no models were asked for, ``models`` are those of the evidence of companions.
@@ -36,11 +40,16 @@ def models_json(found: ModelComparison | None, evidence: Evidence | None) -> Jso
         known = [] if evidence is None else _of_evidence(evidence)
         return {"models": known or None, "confusion": None, "model_verdict": None}
     shares = zip(found.models, found.probability, strict=True)
+    beside = agreement(found, verdict)
     return {
         "models": [_model(m, float(p)) for m, p in shares],
         "confusion": _confusion(found),
         "model_verdict": {
             **asdict(found.verdict),
+            "summary": beside.summary,
+            "agrees": beside.agrees,
+            "leads": beside.leads,
+            "fits": found.best.p_fit >= REJECTED,
             "p_confused": number(found.verdict.p_confused),
             "half_resolution_mas": 0.5 * resolution_mas(found.best.fit.model.likelihood),
             "n_simulated": 0 if found.confusion is None else found.confusion.n_draws,
@@ -91,20 +100,34 @@ def _model(model: Compared, probability: float) -> Json:
 
 
 def _prior(model: Compared) -> Json:
-    """Prior of every parameter in words."""
+    """Prior of every parameter, and of what is derived from them, in words."""
     parameters, prior = model.fit.model.likelihood.parameters, model.fit.model.prior
     nuisance = [parameters[k] for k in parameters.nuisance]
     found = {p.name: _range(p, r) for p, r in zip(nuisance, prior.ranges, strict=True)}
-    return _companion_prior(prior) | found if parameters.companions else found
+    for name in [n for n in found if n.endswith("_axis_ratio")]:
+        label = name.replace("_axis_ratio", "_inclination_deg")
+        found[label] = f"that of its cosine, the axis ratio: {found[name]}"
+    return _companion_prior(parameters, prior) | found if parameters.companions else found
 
 
-def _companion_prior(prior: Prior) -> Json:
+def _companion_prior(parameters: Parameters, prior: Prior) -> Json:
+    """Priors of companions, every one by its own names."""
     low, high = f"{prior.contrast_min:.3g}", f"{prior.contrast_max:.3g}"
     field = f"{prior.inner_mas:.4g} to {prior.outer_mas:.4g} mas"
-    return {
-        "position": f"uniform in {prior.position_form}, {field}",
-        "contrast": f"{prior.contrast_form}, {low} to {high}",
-    }
+    position = f"uniform in {prior.position_form}, {field}"
+    contrast = f"{prior.contrast_form}, {low} to {high}"
+    rate = f"uniform in area, up to {prior.fastest_mas_yr:.3g} mas/yr"
+    place = f"that of the position: {position}"
+    of = {"position": place, "flux": contrast, "rate": rate}
+    found = {"position": position}
+    for k in range(1, parameters.companions + 1):
+        shapes = iter(prior.shapes)
+        for p in (parameters[i] for i in parameters.companion(k)):
+            found[p.name] = of.get(p.role) or _range(p, Range(*next(shapes)))
+        suffix = "" if k == 1 else f"_{k}"
+        found[f"separation_mas{suffix}"] = place
+        found[f"position_angle_deg{suffix}"] = "uniform, 0 to 360 deg"
+    return found
 
 
 def _range(parameter: Parameter, one: Range) -> str:
@@ -167,7 +190,7 @@ def _beside_text(limits: Json | None) -> list[str]:
 def headline(verdict: Json) -> str:
     """What the comparison says, in a word."""
     stated = verdict["statement"]
-    return str(SKY_MODELS.get(stated, stated)).capitalize()
+    return capital(SKY_MODELS.get(stated) or model_words(stated))
 
 
 def degenerate_text(verdict: Json) -> str:
@@ -218,7 +241,7 @@ def _parameters(models: list[Json]) -> list[Table]:
             continue
         rows = tuple(
             (
-                name.replace("_", " "),
+                parameter_words(name),
                 plain(i["median"], 4),
                 f"{plain(i['lower'], 4)} to {plain(i['upper'], 4)}",
                 plain(i["best"], 4),

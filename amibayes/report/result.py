@@ -70,7 +70,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "evidence": None
         if report.evidence is None
         else evidence_json(report.evidence, report.second_significance),
-        **models_json(report.models, report.evidence),
+        **models_json(report.models, report.evidence, report.verdict),
         "limits_beside": _limits_beside(report.limits_beside),
         "warnings": list(report.warnings),
         "timing_s": {name: round(seconds, 3) for name, seconds in report.timing_s.items()},

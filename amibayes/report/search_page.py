@@ -22,7 +22,7 @@ from amibayes.report.page import (
 )
 from amibayes.report.sections import fit as fit_sections
 from amibayes.report.sections.noise import noise
-from amibayes.report.statement import false_alarm, field, sky_of, statement_of
+from amibayes.report.statement import by_comparison, false_alarm, field, sky_of, statement_of
 from amibayes.report.words import chance, count, fixed, measured, plain, sentence
 
 Json = dict[str, Any]
@@ -121,6 +121,7 @@ def _tiles(content: Json) -> tuple[Fact, ...]:
     if fit["contrast"] <= 0.0:
         return (alarm,)
     label = "" if content["significance"]["detected"] else " (best fit)"
+    label = " (of one companion)" if by_comparison(content) else label
     place = (
         Fact(f"{name}{label}", measured(fit[key], errors[key], unit))
         for name, key, unit in (

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from amibayes.report.page import Mark, Sky, Statement
-from amibayes.report.words import chance, count, fixed, measured, plain
+from amibayes.comparison.agreement import model_words
+from amibayes.comparison.verdict import UNDECIDED
+from amibayes.report.page import Kind, Mark, Sky, Statement
+from amibayes.report.words import capital, chance, count, fixed, measured, plain, sentence
 from amibayes.units import offset
 
 Json = dict[str, Any]
@@ -35,6 +37,8 @@ def statement_of(content: Json) -> Statement:
     content : dict
         As `amibayes.report.result_json` gives it.
     """
+    if by_comparison(content):
+        return _compared(content)
     refused = _refused(content)
     if refused is not None:
         return refused
@@ -43,6 +47,7 @@ def statement_of(content: Json) -> Statement:
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
     sentences = [
         _note(content),
+        _summary(content),
         _chance(content),
         _others(content),
         _limits(content),
@@ -57,14 +62,46 @@ def _refused(content: Json) -> Statement | None:
     if verdict is None or verdict["statement"] not in REFUSED:
         return None
     label, advice = REFUSED[verdict["statement"]]
-    because = f"{verdict['because'][0].upper()}{verdict['because'][1:]}."
-    return Statement("open", label, because, (advice, _chance(content)))
+    sentences = (advice, _summary(content), _chance(content))
+    return Statement("open", label, sentence(verdict["because"]), tuple(s for s in sentences if s))
+
+
+def by_comparison(content: Json) -> bool:
+    """Whether the comparison of models is the answer, and not a star with one companion."""
+    return bool((content.get("model_verdict") or {}).get("leads"))
+
+
+def _compared(content: Json) -> Statement:
+    """The statement where the comparison of models has the answer."""
+    compared, verdict = content["model_verdict"], content.get("verdict")
+    stated = compared["statement"]
+    label = "Undecided" if stated == UNDECIDED else capital(model_words(stated))
+    kind: Kind = "none" if stated == "star" else "found"
+    if stated == UNDECIDED or not compared["fits"]:
+        kind = "open"
+    searched = f"With one companion and nothing else the best fit is at {place(content)}."
+    if verdict is not None and verdict["statement"] == "model rejected":
+        searched = f"A star with at most one companion is rejected: {verdict['because']}."
+    elif verdict is not None and verdict["statement"] == "no companion":
+        searched = _nothing(content)
+    elif content["fit"]["contrast"] <= 0.0:
+        searched = _unjudged(content)
+    sentences = [searched, _chance(content)]
+    if compared["agrees"]:
+        sentences += [_limits(content), _upper_limit(content)]
+    return Statement(kind, label, _summary(content), tuple(s for s in sentences if s))
+
+
+def _summary(content: Json) -> str:
+    """What the comparison of models says, and where to read of it."""
+    found = (content.get("model_verdict") or {}).get("summary", "")
+    return sentence(f"{found} (see Companion or disc)") if found else ""
 
 
 def _note(content: Json) -> str:
     """What else may look like the companion that is stated."""
     note = (content.get("verdict") or {}).get("note", "")
-    return f"{note[0].upper()}{note[1:]}." if note else ""
+    return sentence(note) if note else ""
 
 
 def place(content: Json) -> str:
@@ -203,7 +240,8 @@ def _upper_limit(content: Json) -> str:
 def sky_of(content: Json) -> Sky:
     """Sketch the field, the best fit and the other modes."""
     inner, outer = content["data"]["separation_mas"]
-    fit, detected = content["fit"], content["significance"]["detected"]
+    fit = content["fit"]
+    detected = content["significance"]["detected"] and not by_comparison(content)
     marks = []
     for mode in content["modes"][1:]:
         east, north = offset(mode["separation_mas"], mode["position_angle_deg"])

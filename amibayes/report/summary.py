@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.companion_search.result import RIVAL, SearchResult
+from amibayes.comparison.agreement import Agreement, agreement
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.tails import Tail
 from amibayes.limits.limit import DetectionLimit
@@ -16,7 +17,7 @@ from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.models import models_lines
 from amibayes.report.result import upper_limit
-from amibayes.report.words import FARTHEST_TOLD, percent, places_of
+from amibayes.report.words import FARTHEST_TOLD, capital, percent, places_of
 from amibayes.support.terminal import row, with_warnings
 
 EVEN = 0.5
@@ -59,16 +60,27 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
 
 
 def _statement(report: SearchReport) -> list[str]:
-    """The verdict, with its reason."""
-    found = report.verdict
-    return [] if found is None else [row("verdict", f"{found.statement.upper()}: {found.because}")]
+    """The verdict with its reason, after the comparison of models where that is the answer."""
+    found, beside = report.verdict, _beside(report)
+    words = "" if found is None else f"{found.statement.upper()}: {found.because}"
+    if beside is None or not beside.leads:
+        return [row("verdict", words)] if words else []
+    first = row("verdict", f"{capital(beside.summary)} (models)")
+    return [first, row("search", f"for one companion at most: {words}")] if words else [first]
+
+
+def _beside(report: SearchReport) -> Agreement | None:
+    return None if report.models is None else agreement(report.models, report.verdict)
 
 
 def _best_fit(report: SearchReport) -> list[str]:
     """Place and contrast; not those of a model that was rejected."""
     c, found = report.result.companion, report.verdict
+    beside = _beside(report)
+    apart = beside is not None and beside.agrees is False
     if found is not None and found.statement == "model rejected":
-        return [row("best fit", "not stated: the model is rejected (amibayes export, for images)")]
+        why = "see the models" if apart else "the model is rejected (amibayes export, for images)"
+        return [row("best fit", f"not stated: {why}")]
     contrast = row(
         "contrast",
         f"{with_error(c.contrast, c.contrast_error, largest=1.0)} "
@@ -87,6 +99,8 @@ def _best_fit(report: SearchReport) -> list[str]:
     )
     if found is not None and found.statement == "no companion":
         place = f"{place}: no more than noise gives"
+    if apart:
+        place = f"with one companion and nothing else: {place}"
     return [row("best fit", place), contrast]
 
 

@@ -85,6 +85,10 @@ def count(number: int, one: str, many: str | None = None) -> str:
 
 def sentence(text: str) -> str:
     """Begin with a capital and end with a stop."""
-    text = text.strip()
-    text = text[:1].upper() + text[1:]
+    text = capital(text.strip())
     return text if text.endswith((".", "!", "?")) else text + "."
+
+
+def capital(text: str) -> str:
+    """Begin with a capital, and leave names as they are."""
+    return text[:1].upper() + text[1:]

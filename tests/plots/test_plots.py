@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
@@ -27,6 +28,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.statistic import statistic_of
 from amibayes.errors import RunError
+from amibayes.imaging import reconstruct_image
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.mass_table import MassTable
 from amibayes.models.binary import BinaryModel
@@ -44,6 +46,7 @@ from amibayes.plots.maps import (
     sky_map,
 )
 from amibayes.plots.null_plot import null_plot
+from amibayes.plots.reconstruction import image_plot
 from amibayes.plots.residual_corr import correlation_plot
 from amibayes.plots.style import save
 from amibayes.support.atomic_files import short_names
@@ -363,7 +366,15 @@ def test_a_parameter_that_never_moves_has_a_corner() -> None:
     assert "110" in corner_plot(draws, NAMES).axes[4].get_title()
 
 
-@pytest.mark.parametrize("shape", [(10, 2), (2, 3), (3, 3, 3)])
+def test_a_single_parameter_has_a_corner() -> None:
+    """corner overplots lines on figures of two and more parameters only."""
+    figure = corner_plot(samples()[:, :1], NAMES[:1], truths=[91.0], best=[90.0])
+    (panel,) = figure.axes
+    assert {90.0, 91.0} <= {float(np.mean(line.get_xdata())) for line in panel.lines}
+    assert panel.get_title().startswith("East (mas)\n$90.0")
+
+
+@pytest.mark.parametrize("shape", [(10, 2), (2, 3), (3, 3, 3), (10, 0)])
 def test_samples_that_do_not_fit_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="labels"):
         corner_plot(np.zeros(shape), NAMES)
@@ -477,3 +488,17 @@ def test_residuals_of_angles_go_the_short_way_round() -> None:
     np.testing.assert_allclose(angles.residual(model), [-2.0, 1.0, 2.0, -0.5])
     plain = _Kind("V²", "", nothing, observed, sigma, nothing, nothing)
     np.testing.assert_allclose(plain.residual(model), (observed - model) / sigma)
+
+
+def test_numbers_of_colour_bars_stay_apart(tmp_path: Path) -> None:
+    """A companion far outside of the stated star's light: 21 000 of its flux in a pixel."""
+    data = simulated(niriss(), [110.0, -75.0, 0.02], np.random.default_rng(3))
+    found = reconstruct_image(data, weight=10.0, rng=np.random.default_rng(4))
+    bright = replace(found, light=found.light * 21_000.0 / found.light.max())
+    figure = image_plot(bright)
+    save(figure, tmp_path / "image.png")
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    assert "Flux per pixel (10$^{4}$)" in [bar.get_xlabel() for bar in bars]
+    for bar in bars:
+        ends = [t.get_window_extent() for t in bar.get_xticklabels() if t.get_text()]
+        assert all(one.x1 < other.x0 for one, other in pairwise(ends))

@@ -178,7 +178,7 @@ def runs_only_its_own_script(text: str) -> None:
 
 
 def test_every_picture_stands_in_a_section_and_is_drawn_by_some_run() -> None:
-    full = Stages(True, True, True, True, True, True, True)
+    full = Stages(*[True] * 8)
     assert len({p.name for p in PICTURES}) == len(PICTURES)
     for picture in PICTURES:
         assert picture.section in SECTIONS
