@@ -83,3 +83,9 @@ def largest_that_fits(
         if passed[k] and p_fit(term, term.chi2(problem.visibility(values))) >= REJECTED:
             return float(weights[k]), values
     return float(weights[best]), kept[best]
+
+
+def before(problem: Problem, term: DataTerm, weight: float) -> FloatArray:
+    """Variables (n,) that the image of a weight begins with: those of the larger weights."""
+    larger = [w for w in WEIGHTS if w > 1.001 * weight]
+    return [problem.first(term), *problem.path(term, larger)][-1]

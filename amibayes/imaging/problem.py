@@ -29,6 +29,10 @@ DIAMETER_STEP = 0.25
 """Of the diameters that the first fit begins with, in λ/B of the longest baseline: a fourth of
 the distance of the lobes of a disc."""
 
+DARK = 0.25
+"""Distance from a star whose diameter is free, in λ/B of the longest baseline, within which the
+image stays dark: the data do not tell light there from a wider disc of the star."""
+
 SMALLEST_DISC = 1e-3
 """Diameter in λ/B of the longest baseline below which a disc is a point."""
 
@@ -117,6 +121,9 @@ class Problem:
         bounds = [(low, np.inf)] * self.n_pixels
         if self.frequency is not None:
             unit[-1] = (0.5 / self.frequency.max() / MAS) ** 2
+            near = np.hypot(self.grid.east_mas, self.grid.north_mas) * self.frequency.max() * MAS
+            for k in np.flatnonzero(near <= DARK):
+                bounds[k] = (low, low)
             bounds.append((0.0, self.largest_disc_mas**2 / unit[-1]))
 
         def scaled(x: FloatArray) -> tuple[float, FloatArray]:

@@ -15,10 +15,10 @@ import numpy as np
 from amibayes.companion_search.field import refuse_no_length, resolves_stars
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError, UsageError
-from amibayes.imaging.choice import WEIGHTS, cross_validated, largest_that_fits, p_fit
+from amibayes.imaging.choice import before, cross_validated, largest_that_fits, p_fit
 from amibayes.imaging.data_term import DataTerm
 from amibayes.imaging.field import choose_grid
-from amibayes.imaging.grid import pixel_response
+from amibayes.imaging.grid import PixelGrid, pixel_response
 from amibayes.imaging.problem import FIRST_FLUX, Problem
 from amibayes.imaging.regularisers import REGULARISERS
 from amibayes.imaging.result import ReconstructedImage
@@ -77,33 +77,41 @@ def reconstruct_image(
     DataError
         Where the data are too few for any image.
     """
-    if regulariser not in REGULARISERS:
-        raise UsageError(
-            f"{regulariser!r} is no regulariser", remedy=f"one of {', '.join(REGULARISERS)}"
-        )
     likelihood = Likelihood(observables)
     data, samples = likelihood.observables, likelihood.samples
     _refuse_few(likelihood)
     diameter = _diameter(likelihood, diameter_mas, star)
-    free = diameter == "free"
     grid = choose_grid(samples, field_mas, pixel_mas)
-    size = 0.0 if diameter == "free" else diameter
-    response = pixel_response(samples, grid, star=star, diameter_mas=size)
-    fixed = FIRST_FLUX if star and not data.n_vis2 else None
-    penalty = REGULARISERS[regulariser](grid, fixed)
-    frequency = samples.frequency if free else None
-    problem = Problem(response, grid, penalty, regulariser == "entropy", frequency)
+    problem = _problem(likelihood, grid, regulariser, star, diameter)
     table, term = np.empty((3, 0)), DataTerm.of(data, samples)
     if weight is None:
         rng = rng or np.random.default_rng(1)
         table = cross_validated(problem, data, samples, rng, progress)
         weight, start = largest_that_fits(problem, term, table)
     else:
-        start = problem.first(term)
-        for start in problem.path(term, [w for w in WEIGHTS if w > 1.001 * weight]):
-            pass
+        start = before(problem, term, weight)
     values = problem.solve(term, weight, start)
-    return _result(values, problem, term, likelihood, (regulariser, weight, table, size))
+    return _result(values, problem, term, likelihood, (regulariser, weight, table, diameter))
+
+
+def _problem(
+    likelihood: Likelihood,
+    grid: PixelGrid,
+    regulariser: str,
+    star: bool,
+    diameter: float | Literal["free"],
+) -> Problem:
+    if regulariser not in REGULARISERS:
+        raise UsageError(
+            f"{regulariser!r} is no regulariser", remedy=f"one of {', '.join(REGULARISERS)}"
+        )
+    samples, free = likelihood.samples, diameter == "free"
+    size = 0.0 if diameter == "free" else diameter
+    response = pixel_response(samples, grid, star=star, diameter_mas=size)
+    flux = FIRST_FLUX if star and not likelihood.observables.n_vis2 else None
+    penalty = REGULARISERS[regulariser](grid, flux)
+    frequency = samples.frequency if free else None
+    return Problem(response, grid, penalty, regulariser == "entropy", frequency)
 
 
 def _refuse_few(likelihood: Likelihood) -> None:
@@ -137,12 +145,12 @@ def _result(
     problem: Problem,
     term: DataTerm,
     likelihood: Likelihood,
-    choice: tuple[str, float, FloatArray, float],
+    choice: tuple[str, float, FloatArray, float | Literal["free"]],
 ) -> ReconstructedImage:
     regulariser, weight, table, diameter = choice
     data, samples = likelihood.observables, likelihood.samples
     response, n = problem.at(values)[0], problem.grid.n
-    free, light = problem.frequency is not None, values[: n**2]
+    light = values[: n**2]
     value, total = response.visibility(light)
     everything = np.ones(len(data.vis2), bool), np.ones(len(data.closure_phase), bool)
     nothing = np.zeros_like(everything[0]), np.zeros_like(everything[1])
@@ -166,8 +174,8 @@ def _result(
         term.noise.n_independent,
         0.5 / float(samples.frequency.max()) / MAS,
         bool(response.star_flux),
-        problem.diameter_mas(values) if free else diameter,
-        free,
+        problem.diameter_mas(values) if diameter == "free" else diameter,
+        diameter == "free",
         problem.ends(values),
         value,
         samples,

@@ -1,4 +1,4 @@
-"""What of an image is not to be believed: what it is, a colon, and why."""
+"""What to hold against an image: what it is, a colon, and why."""
 
 from __future__ import annotations
 

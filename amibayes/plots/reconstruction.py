@@ -70,13 +70,12 @@ def image_plot(image: ReconstructedImage) -> Figure:
     _residuals(axes[2, 0], image)
     _choice(axes[2, 1], image)
     star = f", star apart, {image.flux:.3g} of its flux around" if image.star else ""
-    doubts = [warning.split(":")[0] for warning in warnings_of(image)]
-    lines = textwrap.wrap("; ".join(doubts), LINE)
-    warned = "".join(f"\n{line}" for line in [*(["Not to be trusted:"] if lines else []), *lines])
+    warned = [warning.split(":")[0] for warning in warnings_of(image)]
+    lines = textwrap.wrap(f"Not to be trusted: {'; '.join(warned)}" if warned else "", LINE)
     figure.suptitle(
         f"For looking: {'total variation' if image.regulariser == 'tv' else 'maximum entropy'}, "
         f"weight {image.weight:.3g}{star}\nχ² {image.chi2:.4g} of {image.n_independent} numbers"
-        + warned
+        + "".join(f"\n{line}" for line in lines)
     )
     return figure
 
@@ -103,16 +102,18 @@ def _sky(
     ax.set_xlabel("East (mas)")
     ax.set_ylabel("North (mas)")
     low, high = drawn.get_clim()
-    ticks, power = _colour_ticks(low or 0.0, high or 1.0, drawn.norm)
+    ticks, power = _colour_ticks(
+        low or 0.0, high or 1.0, lambda value: float(np.asarray(drawn.norm(np.array(value))).item())
+    )
     label += f" (10{str(power).translate(RAISED)})" if power else ""
     bar = figure.colorbar(drawn, ax=ax, label=label, location="bottom", shrink=0.7, aspect=30)
-    names = [f"{t / 10.0**power:.3g}".replace("-", "−") for t in ticks]
+    names = [f"{round(t / 10.0**power, 6) + 0.0:.3g}".replace("-", "−") for t in ticks]
     bar.set_ticks(ticks, labels=names)
 
 
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-APART = 0.2
+APART = 0.24
 """Least distance of two numbers beside a colour bar, as part of its length."""
 
 
@@ -123,11 +124,11 @@ def _colour_ticks(
     kept: list[float] = []
     for value in map(float, MaxNLocator(5).tick_values(low, high)):
         inside = low <= value <= high
-        if inside and (not kept or float(norm(value)) - float(norm(kept[-1])) >= APART):
+        if inside and (not kept or norm(value) - norm(kept[-1]) >= APART):
             kept.append(value)
     most = max(abs(low), abs(high))
     power = int(np.floor(np.log10(most))) if most > 0.0 else 0
-    return kept, power if not -2 <= power <= 2 else 0
+    return kept, power if not -1 <= power <= 2 else 0
 
 
 def _residuals(ax: Axes, image: ReconstructedImage) -> None:
