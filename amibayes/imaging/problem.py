@@ -29,10 +29,6 @@ DIAMETER_STEP = 0.25
 """Of the diameters that the first fit begins with, in λ/B of the longest baseline: a fourth of
 the distance of the lobes of a disc."""
 
-DARK = 0.25
-"""Distance from a star whose diameter is free, in λ/B of the longest baseline, within which the
-image stays dark: the data do not tell light there from a wider disc of the star."""
-
 SMALLEST_DISC = 1e-3
 """Diameter in λ/B of the longest baseline below which a disc is a point."""
 
@@ -56,6 +52,8 @@ class Problem:
         Keep pixels above 0, where the logarithm of the entropy is steep.
     frequency : (n_points,) float array, optional
         Of the points, cycles per radian, where the diameter is free.
+    dark_mas : float
+        Distance from the star within which there is no light; negative: there may be anywhere.
     """
 
     response: PixelResponse
@@ -63,6 +61,7 @@ class Problem:
     regulariser: Regulariser
     positive: bool
     frequency: FloatArray | None = None
+    dark_mas: float = -1.0
 
     @property
     def n_pixels(self) -> int:
@@ -118,12 +117,10 @@ class Problem:
         """Variables (n,) of least objective from a start, by L-BFGS-B."""
         low = 1e-6 if self.positive else 0.0
         unit = np.full(len(start), FIRST_FLUX / self.n_pixels)  # variables of order 1
-        bounds = [(low, np.inf)] * self.n_pixels
+        from_star = np.hypot(self.grid.east_mas, self.grid.north_mas)
+        bounds = [(low, low if r <= self.dark_mas else np.inf) for r in from_star.tolist()]
         if self.frequency is not None:
             unit[-1] = (0.5 / self.frequency.max() / MAS) ** 2
-            near = np.hypot(self.grid.east_mas, self.grid.north_mas) * self.frequency.max() * MAS
-            for k in np.flatnonzero(near <= DARK):
-                bounds[k] = (low, low)
             bounds.append((0.0, self.largest_disc_mas**2 / unit[-1]))
 
         def scaled(x: FloatArray) -> tuple[float, FloatArray]:

@@ -29,6 +29,10 @@ from amibayes.units import MAS, BoolArray, ComplexArray, FloatArray
 FEWEST_DATA = 4
 """Of which an image is made: one point of light already has a place and a flux."""
 
+DARK = 0.25
+"""Distance from a star with a disc that V² resolves, in λ/B of the longest baseline, within which
+the image stays dark: the data do not tell light there from a wider disc of the star."""
+
 Diameter = float | Literal["free"] | None
 
 
@@ -111,7 +115,9 @@ def _problem(
     flux = FIRST_FLUX if star and not likelihood.observables.n_vis2 else None
     penalty = REGULARISERS[regulariser](grid, flux)
     frequency = samples.frequency if free else None
-    return Problem(response, grid, penalty, regulariser == "entropy", frequency)
+    disc = bool(diameter) and (free or resolves_stars(likelihood))
+    dark = DARK / float(samples.frequency.max()) / MAS if disc else -1.0
+    return Problem(response, grid, penalty, regulariser == "entropy", frequency, dark)
 
 
 def _refuse_few(likelihood: Likelihood) -> None:

@@ -71,7 +71,7 @@ def image_plot(image: ReconstructedImage) -> Figure:
     _choice(axes[2, 1], image)
     star = f", star apart, {image.flux:.3g} of its flux around" if image.star else ""
     warned = [warning.split(":")[0] for warning in warnings_of(image)]
-    lines = textwrap.wrap(f"Not to be trusted: {'; '.join(warned)}" if warned else "", LINE)
+    lines = textwrap.wrap(f"Warning: {'; '.join(warned)}" if warned else "", LINE)
     figure.suptitle(
         f"For looking: {'total variation' if image.regulariser == 'tv' else 'maximum entropy'}, "
         f"weight {image.weight:.3g}{star}\nχ² {image.chi2:.4g} of {image.n_independent} numbers"

@@ -62,6 +62,13 @@ def test_a_resolved_star_keeps_its_light() -> None:
     assert not image.bounds
 
 
+def test_a_star_of_a_given_diameter_keeps_its_light() -> None:
+    image = ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0, diameter_mas=1.0)
+    assert image.beside_star == 0.0
+    assert image.flux == pytest.approx(COMPANION[2], rel=0.4)
+    assert image.p_fit > 1e-3
+
+
 def test_the_diameter_of_a_star_alone_is_fitted() -> None:
     sheet = interferometer.four_telescopes(3, vis2_error=0.01)
     data = interferometer.observed(
