@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from amibayes.cli.options import common, data_options
-from amibayes.errors import UsageError
 from amibayes.support.options import OBSERVABLES
 
 if TYPE_CHECKING:
@@ -50,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--field",
         type=common.positive_float,
         metavar="MAS",
-        help="side of the image (default: λ/B of the shortest baseline)",
+        help="side of the image (default: λ/B of the shortest baseline to either side, less where "
+        "the sky repeats itself)",
     )
     group.add_argument(
         "--pixel",
@@ -67,9 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--diameter",
         type=common.number_or_free,
-        default=0.0,
         metavar="MAS|free",
-        help="of the star, a uniform disc; it is not fitted here (default: 0)",
+        help="of the star, a uniform disc; free: fitted with the image (default: free where V2 "
+        "would notice 0.3 mas, else 0)",
     )
     common.add_seed_option(group)
     _add_data(parser.add_argument_group("data"))
@@ -99,12 +99,6 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.support.atomic_files import output_folder, write_json
     from amibayes.support.request import request_of
 
-    if arguments.diameter == "free":
-        raise UsageError(
-            "is not fitted by an image",
-            source="--diameter",
-            remedy="give what search finds, in mas",
-        )
     options = _options(arguments)
     folder = output_folder(arguments.out, [RESULT, IMAGE, PICTURE], overwrite=arguments.overwrite)
     with common.stages_of(arguments) as progress:

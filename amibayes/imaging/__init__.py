@@ -1,5 +1,6 @@
 """Light image reconstruction: for looking, not for measuring."""
 
-from amibayes.imaging.reconstruct import ReconstructedImage, reconstruct_image
+from amibayes.imaging.reconstruct import reconstruct_image
+from amibayes.imaging.result import ReconstructedImage
 
 __all__ = ["ReconstructedImage", "reconstruct_image"]

@@ -7,136 +7,33 @@ looking: which structure the data ask for, and none that is measured.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
-from scipy.optimize import minimize
 
+from amibayes.companion_search.field import refuse_no_length, resolves_stars
 from amibayes.data.observables import Observables
-from amibayes.errors import UsageError
+from amibayes.errors import DataError, UsageError
+from amibayes.imaging.choice import before, cross_validated, largest_that_fits, p_fit
 from amibayes.imaging.data_term import DataTerm
-from amibayes.imaging.folds import folds_of
-from amibayes.imaging.grid import PixelGrid, PixelResponse, pixel_response
-from amibayes.imaging.regularisers import REGULARISERS, Regulariser, default_image
-from amibayes.models.uv_points import UVPoints, uv_points_of
-from amibayes.units import MAS, ComplexArray, FloatArray, freeze
+from amibayes.imaging.field import choose_grid
+from amibayes.imaging.grid import PixelGrid, pixel_response
+from amibayes.imaging.problem import FIRST_FLUX, Problem
+from amibayes.imaging.regularisers import REGULARISERS
+from amibayes.imaging.result import ReconstructedImage
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.uv_points import UVPoints
+from amibayes.units import MAS, BoolArray, ComplexArray, FloatArray
 
-WEIGHTS = tuple(10.0 ** np.arange(3.5, -0.6, -0.5))
-"""Weights that are tried, the smoothest image first: each begins at the one before."""
+FEWEST_DATA = 4
+"""Of which an image is made: one point of light already has a place and a flux."""
 
-PIXELS_PER_BEAM = 4.0
-"""Pixels across λ/2B: finer ones are filled by the regulariser alone."""
+DARK = 0.25
+"""Distance from a star with a disc that V² resolves, in λ/B of the longest baseline, within which
+the image stays dark: the data do not tell light there from a wider disc of the star."""
 
-MAX_SIDE = 101
-"""Pixels along a side: more take minutes and show no more."""
-
-MAX_NUMBERS = 4e7
-"""Entries of the transform of all pixels, 16 bytes each."""
-
-FIRST_FLUX = 0.05
-"""Light of the image that the first fit begins with, in units of the star's."""
-
-ITERATIONS, FEWER_ITERATIONS = 400, 150
-"""Of the image itself, and of those that are compared with data left out: correlations with the
-truth of simulated scenes differ by 0.02 at most."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReconstructedImage:
-    """An image, how well it fits, and how it was chosen.
-
-    Parameters
-    ----------
-    light : (n, n) float array
-        Flux of each pixel, rows to the north and columns to the east, in units of the star's
-        (where there is no star, of all light).
-    grid : PixelGrid
-    regulariser : str
-    weight : float
-    weights, scores, score_errors : (m,) float array
-        Weights that were tried, and the deviance of data left out per datum with its standard
-        error; empty where the weight was given.
-    chi2_vis2, chi2_phase, chi2 : float
-        Of V² and of phases by themselves, and of both with their covariance; NaN where there are
-        none.
-    chi2_star : float
-        Of the star alone.
-    n_vis2, n_phases, n_independent : int
-        Numbers that these are of.
-    beam_mas : float
-        λ/2B of the longest baseline.
-    star : bool
-    diameter_mas : float
-        Of the star.
-    visibility : (n_points,) complex array
-    samples : UVPoints
-    observables : Observables
-        Unflagged.
-    back_projected : (n, n) float array
-        Residuals projected back: the change of χ²/2 by light added to each pixel, with the
-        opposite sign, in units of what noise alone makes of it.
-    """
-
-    light: FloatArray
-    grid: PixelGrid
-    regulariser: str
-    weight: float
-    weights: FloatArray
-    scores: FloatArray
-    score_errors: FloatArray
-    chi2_vis2: float
-    chi2_phase: float
-    chi2: float
-    chi2_star: float
-    n_vis2: int
-    n_phases: int
-    n_independent: int
-    beam_mas: float
-    star: bool
-    diameter_mas: float
-    visibility: ComplexArray
-    samples: UVPoints
-    observables: Observables
-    back_projected: FloatArray
-
-    def __post_init__(self) -> None:
-        freeze(self)
-
-    @property
-    def flux(self) -> float:
-        """Light of the image in units of the star's."""
-        return float(self.light.sum())
-
-    @property
-    def chi2r(self) -> float:
-        """χ² of all data over their number."""
-        return self.chi2 / max(self.n_independent, 1)
-
-    def convolved(self, fwhm_mas: float | None = None) -> FloatArray:
-        """The image seen with a Gaussian beam, by default of λ/2B, (n, n); the flux stays."""
-        sigma = (fwhm_mas or self.beam_mas) / np.sqrt(8.0 * np.log(2.0))
-        apart = self.grid.offset_mas[:, None] - self.grid.offset_mas
-        kernel = np.exp(-0.5 * (apart / sigma) ** 2)
-        kernel /= kernel[len(kernel) // 2].sum()
-        return np.asarray(kernel @ self.light @ kernel)
-
-    def dirty_beam(self) -> FloatArray:
-        """What the sampled points make of a point in the middle, 1 there, (n, n)."""
-        return self._synthesised(np.ones(len(self.samples), dtype=complex))
-
-    def dirty_image(self) -> FloatArray:
-        """What they make of the image without its star, light per dirty beam, (n, n)."""
-        whole = self.flux + float(self.star)
-        of_star = float(self.star) * np.ones(len(self.samples))
-        return self._synthesised(self.visibility * whole - of_star)
-
-    def _synthesised(self, visibility: ComplexArray) -> FloatArray:
-        turn = 2j * np.pi * MAS
-        along = np.exp(turn * np.outer(self.samples.u, self.grid.offset_mas))
-        up = np.exp(turn * np.outer(self.samples.v, self.grid.offset_mas))
-        made = np.einsum("iy,i,ix->yx", up, visibility, along, optimize=True)
-        return np.asarray(made.real / len(self.samples))
+Diameter = float | Literal["free"] | None
 
 
 def reconstruct_image(
@@ -147,7 +44,7 @@ def reconstruct_image(
     field_mas: float | None = None,
     pixel_mas: float | None = None,
     star: bool = True,
-    diameter_mas: float = 0.0,
+    diameter_mas: Diameter = None,
     rng: np.random.Generator | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ReconstructedImage:
@@ -159,15 +56,18 @@ def reconstruct_image(
     regulariser : {"tv", "entropy"}
         Total variation keeps edges; maximum entropy is smooth.
     weight : float, optional
-        Of the regulariser; by default the largest whose image predicts data left out as well as
-        the best, within one standard error.
+        Of the regulariser; by default the largest whose image fits the data, and predicts data
+        left out as well as the best does within one standard error.
     field_mas : float, optional
-        Side of the image, by default twice λ/2 of the shortest baseline.
+        Side of the image, by default λ/B of the shortest baseline to either side of the star,
+        less where the sky repeats itself before (at least λ/B in all).
     pixel_mas : float, optional
         By default a quarter of λ/2B, or what makes 101 pixels of the field.
     star : bool
         A point, or a disc of ``diameter_mas``, of flux 1 stands in the middle beside the image.
-    diameter_mas : float
+    diameter_mas : float or "free", optional
+        Fitted with the image where it is free. By default free where V² would notice a disc of
+        0.3 mas, else 0.
     rng : numpy.random.Generator, optional
         How the data are split.
     progress : callable, optional
@@ -176,168 +76,92 @@ def reconstruct_image(
     Raises
     ------
     UsageError
-        For a regulariser that is not known, or sizes that make no image.
+        For a regulariser that is not known, sizes that make no image, or a diameter that the
+        data cannot tell.
+    DataError
+        Where the data are too few for any image.
     """
+    likelihood = Likelihood(observables)
+    data, samples = likelihood.observables, likelihood.samples
+    _refuse_few(likelihood)
+    diameter = _diameter(likelihood, diameter_mas, star)
+    grid = choose_grid(samples, field_mas, pixel_mas)
+    problem = _problem(likelihood, grid, regulariser, star, diameter)
+    table, term = np.empty((3, 0)), DataTerm.of(data, samples)
+    if weight is None:
+        rng = rng or np.random.default_rng(1)
+        table = cross_validated(problem, data, samples, rng, progress)
+        weight, start = largest_that_fits(problem, term, table)
+    else:
+        start = before(problem, term, weight)
+    values = problem.solve(term, weight, start)
+    return _result(values, problem, term, likelihood, (regulariser, weight, table, diameter))
+
+
+def _problem(
+    likelihood: Likelihood,
+    grid: PixelGrid,
+    regulariser: str,
+    star: bool,
+    diameter: float | Literal["free"],
+) -> Problem:
     if regulariser not in REGULARISERS:
         raise UsageError(
             f"{regulariser!r} is no regulariser", remedy=f"one of {', '.join(REGULARISERS)}"
         )
-    data = observables.unflagged()
-    samples = uv_points_of(data)
-    grid = choose_grid(samples, field_mas, pixel_mas)
-    response = pixel_response(samples, grid, star=star, diameter_mas=diameter_mas)
-    fixed = FIRST_FLUX if star and not data.n_vis2 else None
-    penalty = REGULARISERS[regulariser](grid, fixed)
-    problem = Problem(response, grid, penalty, regulariser == "entropy")
-    table = np.empty((3, 0))
-    if weight is None:
-        rng = rng or np.random.default_rng(1)
-        table = _cross_validated(problem, data, samples, rng, progress)
-        weight = _chosen(*table)
-    term = DataTerm.of(data, samples)
-    falling = [w for w in WEIGHTS if w > 1.001 * weight]
-    first = problem.path(term, falling, FEWER_ITERATIONS)[-1] if falling else problem.first
-    light = problem.solve(term, weight, first)
-    return _result(light, problem, term, data, samples, (regulariser, weight, table, diameter_mas))
+    samples, free = likelihood.samples, diameter == "free"
+    size = 0.0 if diameter == "free" else diameter
+    response = pixel_response(samples, grid, star=star, diameter_mas=size)
+    flux = FIRST_FLUX if star and not likelihood.observables.n_vis2 else None
+    penalty = REGULARISERS[regulariser](grid, flux)
+    frequency = samples.frequency if free else None
+    disc = bool(diameter) and (free or resolves_stars(likelihood))
+    dark = DARK / float(samples.frequency.max()) / MAS if disc else -1.0
+    return Problem(response, grid, penalty, regulariser == "entropy", frequency, dark)
 
 
-def choose_grid(
-    samples: UVPoints, field_mas: float | None = None, pixel_mas: float | None = None
-) -> PixelGrid:
-    """Choose pixels that the data can tell apart, over the field that they can see.
+def _refuse_few(likelihood: Likelihood) -> None:
+    """Raise a `DataError` where the data are no more than the numbers that say what a point is."""
+    if likelihood.n_independent < FEWEST_DATA:
+        raise DataError(
+            f"holds {likelihood.n_independent} independent data, of which no image can be made",
+            source=likelihood.observables.source,
+            remedy=f"give {FEWEST_DATA} or more",
+        )
+    refuse_no_length(likelihood)
 
-    Raises
-    ------
-    UsageError
-        Where there would be too few or too many pixels.
-    """
-    frequency = samples.frequency[samples.frequency > 0.0]
-    beam = 0.5 / float(frequency.max()) / MAS
-    field = field_mas or 1.0 / float(frequency.min()) / MAS
-    pixel = pixel_mas or max(beam / PIXELS_PER_BEAM, field / MAX_SIDE)
-    n = int(np.ceil(field / pixel)) // 2 * 2 + 1
-    if n < 5 or float(n) ** 2 * len(samples) > MAX_NUMBERS:
+
+def _diameter(likelihood: Likelihood, asked: Diameter, star: bool) -> float | Literal["free"]:
+    """The star's diameter, or that it is fitted."""
+    if not star:
+        if asked:
+            raise UsageError("is that of no star", source="--diameter", remedy="without --no-star")
+        return 0.0
+    if asked is None:
+        return "free" if resolves_stars(likelihood) else 0.0
+    if asked == "free" and not likelihood.observables.n_vis2:
         raise UsageError(
-            f"an image of {n} pixels a side for {len(samples)} points of the (u, v) plane",
-            remedy="give other --field and --pixel, or average channels with --bin-channels",
+            "is not told by phases alone", source="--diameter", remedy="give it in mas"
         )
-    return PixelGrid(n, pixel)
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What is minimised: pixels, their transform and the regulariser.
-
-    Parameters
-    ----------
-    response : PixelResponse
-    grid : PixelGrid
-    regulariser : callable
-    positive : bool
-        Keep pixels above 0, where the logarithm of the entropy is steep.
-    """
-
-    response: PixelResponse
-    grid: PixelGrid
-    regulariser: Regulariser
-    positive: bool
-
-    def objective(
-        self, term: DataTerm, weight: float, light: FloatArray
-    ) -> tuple[float, FloatArray]:
-        """Deviance + 2 · weight · regulariser of light (n_pixels,), and its gradient."""
-        value, total = self.response.visibility(light)
-        deviance, pull = term.with_pull(value)
-        penalty, slope = self.regulariser(light)
-        gradient = self.response.pulled(pull, value, total) + 2.0 * weight * slope
-        return deviance + 2.0 * weight * penalty, gradient
-
-    def solve(
-        self, term: DataTerm, weight: float, start: FloatArray, iterations: int = ITERATIONS
-    ) -> FloatArray:
-        """Light (n_pixels,) of least objective from a start, by L-BFGS-B."""
-        unit = FIRST_FLUX / self.grid.n**2  # so that variables are of order 1
-        low = 1e-6 if self.positive else 0.0
-
-        def scaled(x: FloatArray) -> tuple[float, FloatArray]:
-            value, gradient = self.objective(term, weight, unit * x)
-            return value, unit * gradient
-
-        found = minimize(
-            scaled,
-            np.maximum(start / unit, low),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(low, None)] * len(start),
-            options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20},
-        )
-        return np.asarray(unit * found.x)
-
-    @property
-    def first(self) -> FloatArray:
-        """Where the first fit begins: a round Gaussian, (n_pixels,)."""
-        flux = FIRST_FLUX if self.response.star_flux else 1.0
-        return flux * default_image(self.grid)
-
-    def path(
-        self, term: DataTerm, weights: Sequence[float], iterations: int = ITERATIONS
-    ) -> list[FloatArray]:
-        """Images of falling weights, each from the one before."""
-        light, found = self.first, []
-        for weight in weights:
-            light = self.solve(term, weight, light, iterations)
-            found.append(light)
-        return found
-
-
-def _cross_validated(
-    problem: Problem,
-    data: Observables,
-    samples: UVPoints,
-    rng: np.random.Generator,
-    progress: Callable[[int, int], None] | None,
-) -> FloatArray:
-    """Weights, mean deviance per datum left out, and its standard error, (3, n_weights)."""
-    splits = folds_of(data, rng)
-    scores = np.empty((len(splits), len(WEIGHTS)))
-    for k, (kept, out) in enumerate(splits):
-        fitted, rest = (DataTerm.of(data, samples, part) for part in (kept, out))
-        for j, light in enumerate(problem.path(fitted, WEIGHTS, FEWER_ITERATIONS)):
-            left = rest.deviance(problem.response.visibility(light)[0])
-            scores[k, j] = left / rest.noise.n_independent
-        if progress is not None:
-            progress(k + 1, len(splits))
-    error = scores.std(axis=0, ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else 0.0
-    return np.stack([WEIGHTS, scores.mean(axis=0), np.broadcast_to(error, len(WEIGHTS))])
-
-
-def _chosen(weights: FloatArray, scores: FloatArray, errors: FloatArray) -> float:
-    """The largest weight whose score is within one standard error of the best."""
-    best = int(np.argmin(scores))
-    enough = scores <= scores[best] + errors[best]
-    return float(weights[enough].max())
+    return asked
 
 
 def _result(
-    light: FloatArray,
+    values: FloatArray,
     problem: Problem,
     term: DataTerm,
-    data: Observables,
-    samples: UVPoints,
-    choice: tuple[str, float, FloatArray, float],
+    likelihood: Likelihood,
+    choice: tuple[str, float, FloatArray, float | Literal["free"]],
 ) -> ReconstructedImage:
     regulariser, weight, table, diameter = choice
-    response, n = problem.response, problem.grid.n
+    data, samples = likelihood.observables, likelihood.samples
+    response, n = problem.at(values)[0], problem.grid.n
+    light = values[: n**2]
     value, total = response.visibility(light)
     everything = np.ones(len(data.vis2), bool), np.ones(len(data.closure_phase), bool)
     nothing = np.zeros_like(everything[0]), np.zeros_like(everything[1])
-    alone = [
-        DataTerm.of(data, samples, chosen).chi2(value)
-        if chosen[0].any() or chosen[1].any()
-        else np.nan
-        for chosen in ((everything[0], nothing[1]), (nothing[0], everything[1]))
-    ]
     slope = -0.5 * response.pulled(term.with_pull(value)[1], value, total)
+    chi2 = term.chi2(value)
     return ReconstructedImage(
         light.reshape(n, n),
         problem.grid,
@@ -346,21 +170,36 @@ def _result(
         table[0],
         table[1],
         table[2],
-        alone[0],
-        alone[1],
-        term.chi2(value),
+        _chi2_of(data, samples, (everything[0], nothing[1]), value),
+        _chi2_of(data, samples, (nothing[0], everything[1]), value),
+        chi2,
         term.chi2(response.star.astype(complex)) if response.star_flux else float("nan"),
+        p_fit(term, chi2),
         data.n_vis2,
         data.n_closure_phases,
         term.noise.n_independent,
         0.5 / float(samples.frequency.max()) / MAS,
         bool(response.star_flux),
-        diameter,
+        problem.diameter_mas(values) if diameter == "free" else diameter,
+        diameter == "free",
+        problem.ends(values),
         value,
         samples,
         data,
         (slope / _noise_of_slope(term, problem, value, total)).reshape(n, n),
     )
+
+
+def _chi2_of(
+    data: Observables,
+    samples: UVPoints,
+    chosen: tuple[BoolArray, BoolArray],
+    visibility: ComplexArray,
+) -> float:
+    """χ² of V² or phases by themselves; NaN where there are none."""
+    if not (chosen[0].any() or chosen[1].any()):
+        return float("nan")
+    return DataTerm.of(data, samples, chosen).chi2(visibility)
 
 
 def _noise_of_slope(

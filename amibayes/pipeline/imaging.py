@@ -10,6 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from amibayes.imaging import ReconstructedImage, reconstruct_image
+from amibayes.imaging.warnings import warnings_of
 from amibayes.parallel import Progress
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.prepare import prepare
@@ -77,7 +78,6 @@ def make_image(
         search = replace(options.search, limits=False, posterior=False)
         ready = prepare(targets, calibrators, search, first, run)
         data = ready.observables.only(search.observables)
-        diameter = search.diameter
         with run.stage("image"):
             image = reconstruct_image(
                 data,
@@ -86,7 +86,7 @@ def make_image(
                 field_mas=options.field_mas,
                 pixel_mas=options.pixel_mas,
                 star=options.star,
-                diameter_mas=diameter if isinstance(diameter, float) else 0.0,
+                diameter_mas=search.diameter,
                 rng=second,
                 progress=progress,
             )
@@ -95,6 +95,6 @@ def make_image(
         options,
         tuple(str(p) for p in targets),
         tuple(str(p) for p in calibrators),
-        tuple(dict.fromkeys((*ready.warnings, *data.notes))),
+        tuple(dict.fromkeys((*warnings_of(image), *ready.warnings, *data.notes))),
         run.seconds,
     )

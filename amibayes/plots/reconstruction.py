@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import CenteredNorm, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from amibayes.imaging import ReconstructedImage
 from amibayes.imaging.data_term import DataTerm
+from amibayes.imaging.warnings import warnings_of
 from amibayes.plots.fit import longest_baseline_m
 from amibayes.plots.style import (
     BLACK,
@@ -26,6 +29,9 @@ from amibayes.plots.style import (
     styled,
 )
 from amibayes.units import FloatArray
+
+LINE = 90
+"""Letters of a line of the title."""
 
 
 @styled()
@@ -64,9 +70,12 @@ def image_plot(image: ReconstructedImage) -> Figure:
     _residuals(axes[2, 0], image)
     _choice(axes[2, 1], image)
     star = f", star apart, {image.flux:.3g} of its flux around" if image.star else ""
+    warned = [warning.split(":")[0] for warning in warnings_of(image)]
+    lines = textwrap.wrap(f"Warning: {'; '.join(warned)}" if warned else "", LINE)
     figure.suptitle(
         f"For looking: {'total variation' if image.regulariser == 'tv' else 'maximum entropy'}, "
         f"weight {image.weight:.3g}{star}\nχ² {image.chi2:.4g} of {image.n_independent} numbers"
+        + "".join(f"\n{line}" for line in lines)
     )
     return figure
 
@@ -92,14 +101,34 @@ def _sky(
         ax.plot(0.0, 0.0, "*", color="white", mec=BLACK, ms=11)
     ax.set_xlabel("East (mas)")
     ax.set_ylabel("North (mas)")
-    # Powers of ten stand in the label: numbers with their own run into each other.
-    power = int(np.floor(np.log10(float(np.abs(drawn.get_clim()).max()) or 1.0)))
-    power = 0 if -2 <= power < 3 else power
-    named = f"{label} (10$^{{{power}}}$)" if power else label
-    bar = figure.colorbar(drawn, ax=ax, label=named, location="bottom", shrink=0.7, aspect=30)
-    bar.locator = MaxNLocator(3)
-    bar.formatter = FuncFormatter(lambda value, _: f"{value / 10.0**power:.2g}".replace("-", "−"))
-    bar.update_ticks()
+    low, high = drawn.get_clim()
+    ticks, power = _colour_ticks(
+        low or 0.0, high or 1.0, lambda value: float(np.asarray(drawn.norm(np.array(value))).item())
+    )
+    label += f" (10{str(power).translate(RAISED)})" if power else ""
+    bar = figure.colorbar(drawn, ax=ax, label=label, location="bottom", shrink=0.7, aspect=30)
+    names = [f"{round(t / 10.0**power, 6) + 0.0:.3g}".replace("-", "−") for t in ticks]
+    bar.set_ticks(ticks, labels=names)
+
+
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+APART = 0.24
+"""Least distance of two numbers beside a colour bar, as part of its length."""
+
+
+def _colour_ticks(
+    low: float, high: float, norm: Callable[[float], float]
+) -> tuple[list[float], int]:
+    """Values beside a colour bar, far enough apart, and the power of ten that they share."""
+    kept: list[float] = []
+    for value in map(float, MaxNLocator(5).tick_values(low, high)):
+        inside = low <= value <= high
+        if inside and (not kept or norm(value) - norm(kept[-1]) >= APART):
+            kept.append(value)
+    most = max(abs(low), abs(high))
+    power = int(np.floor(np.log10(most))) if most > 0.0 else 0
+    return kept, power if not -1 <= power <= 2 else 0
 
 
 def _residuals(ax: Axes, image: ReconstructedImage) -> None:

@@ -43,8 +43,11 @@ def imaging_json(report: ImagingReport, request: str) -> dict[str, Any]:
         "beam_mas": image.beam_mas,
         "star": image.star,
         "diameter_mas": image.diameter_mas,
+        "diameter_free": image.diameter_free,
         "flux": image.flux,
+        "flux_beside_star": image.beside_star,
         "chi2": image.chi2,
+        "p_fit": image.p_fit,
         "chi2_star": _number(image.chi2_star),
         "chi2_vis2": _number(image.chi2_vis2),
         "chi2_closure_phase": _number(image.chi2_phase),
@@ -61,7 +64,11 @@ def _number(value: float) -> float | None:
 def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
     """Sum the result up in at most 20 lines."""
     data = content["data"]
-    around = f"{content['flux']:.3g} of the star's flux" if content["star"] else "no star apart"
+    around = (
+        f"{content['flux']:.3g} of the star's flux{_disc(content)}"
+        if content["star"]
+        else "no star apart"
+    )
     tried = content["cross_validation"]
     chosen = "given" if not tried else "by cross-validation"
     lines = [
@@ -80,6 +87,13 @@ def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"left out    chi2 {best:.2f} per datum that the image was not made of")
     lines += [f"WARNING     {w}" for w in content["warnings"][: 18 - len(lines)]]
     return [*lines, f"written to  {folder}"]
+
+
+def _disc(content: dict[str, Any]) -> str:
+    """The star's diameter in words, where it has one."""
+    fitted = " (fitted)" if content["diameter_free"] else ""
+    has_disc = fitted or content["diameter_mas"]
+    return f", a disc of {content['diameter_mas']:.3g} mas{fitted}" if has_disc else ""
 
 
 def save_image_fits(path: str | Path, image: ReconstructedImage) -> None:

@@ -498,7 +498,7 @@ def test_numbers_of_colour_bars_stay_apart(tmp_path: Path) -> None:
     figure = image_plot(bright)
     save(figure, tmp_path / "image.png")
     bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
-    assert "Flux per pixel (10$^{4}$)" in [bar.get_xlabel() for bar in bars]
+    assert "Flux per pixel (10⁴)" in [bar.get_xlabel() for bar in bars]
     for bar in bars:
         ends = [t.get_window_extent() for t in bar.get_xticklabels() if t.get_text()]
         assert all(one.x1 < other.x0 for one, other in pairwise(ends))
