@@ -18,6 +18,10 @@ MAX_SIDE = 101
 MAX_NUMBERS = 4e7
 """Entries of the transform of all pixels, 16 bytes each."""
 
+WIDE_NUMBERS = 1e7
+"""Entries up to which the default field is wider than λ/B_min in all: with more, of thousands of
+spectral channels, an image would take a quarter of an hour."""
+
 SAME_PLACE = 0.9
 """Height of the dirty beam beside its middle with which the sky repeats itself. The holes of
 NIRISS are on a lattice: 0.98. Four stations at one time reach 0.93, at four times 0.6."""
@@ -49,13 +53,13 @@ def default_field(samples: UVPoints) -> float:
     """Side of the field, mas: λ/B_min either way, as in a search, if that is without repetition.
 
     Two places of a square are as far apart as its side along one of the axes at most. The field
-    ends where the dirty beam comes back within that, but not before λ/B_min; and where pixels
-    of a quarter of λ/2B would be too many for the points.
+    ends where the dirty beam comes back within that, and where pixels of a quarter of λ/2B would
+    be too many for the points, but not before λ/B_min.
     """
     wide = 1.0 / float(samples.frequency.min()) / MAS
     beam = 0.5 / float(samples.frequency.max()) / MAS
-    affordable = beam / PIXELS_PER_BEAM * (np.sqrt(MAX_NUMBERS / len(samples)) - 2.0)
-    return float(max(min(2.0 * wide, repetition_mas(samples), affordable), min(wide, affordable)))
+    affordable = beam / PIXELS_PER_BEAM * np.sqrt(WIDE_NUMBERS / len(samples))
+    return float(max(min(2.0 * wide, repetition_mas(samples), affordable), wide))
 
 
 def repetition_mas(samples: UVPoints) -> float:
