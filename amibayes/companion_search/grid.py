@@ -61,17 +61,19 @@ class Grid:
         """Number of lattice points from the star to the edge of the map."""
         return int(self.outer_mas / self.step_mas)
 
-    def half_plane(self, n_samples: int) -> list[IntArray]:
-        """Positions of one half plane, in square tiles of an even number of positions a side.
+    def half_plane(self, n_samples: int, *, tiles: bool = False) -> list[IntArray]:
+        """Positions of one half plane, in pieces whose fringes at so many points stay in cache.
 
-        Their fringes at so many points stay in cache.
+        With ``tiles``, in squares with an even number of positions a side; those at the edges
+        of the annulus have fewer.
         """
-        half, width = len(self) // 2, int(np.clip(CACHED // n_samples, *WIDTHS))
+        half, width = np.arange(len(self) // 2), int(np.clip(CACHED // n_samples, *WIDTHS))
+        if not tiles or not len(half):
+            return np.split(half, range(width, len(half), width)) if len(half) else []
         side = int(np.sqrt(width)) // 2 * 2
-        tile = np.stack([self.rows[:half], self.columns[:half]]) // side
+        tile = np.stack([self.rows[half], self.columns[half]]) // side
         label = np.unique(tile, axis=1, return_inverse=True)[1].ravel()
-        ends = np.cumsum(np.bincount(label))[:-1]
-        return np.split(np.argsort(label, kind="stable"), ends) if half else []
+        return np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
 
     def coarse(self, tile: IntArray) -> BoolArray:
         """Which positions (n,) of a tile are every second one along each axis, (n,).

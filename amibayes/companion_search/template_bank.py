@@ -234,7 +234,7 @@ class TemplateBank:
         self, rows: DataRows, weights: GroupWeights | None
     ) -> Iterator[IntArray | slice]:
         """Yield, for every piece, which data sets may have their largest gain in it."""
-        if self.joint or self.n_rows < MANY_ROWS or not self._fits:
+        if not self._coarse_first:
             return repeat(slice(None))
         if self._coarse is None:
             pieces = [(index, templates) for index, _, templates in self._at_rest()]
@@ -319,6 +319,11 @@ class TemplateBank:
                 yield both, rates, self._in_bands(cosine, sine, mirrored=True)
 
     @property
+    def _coarse_first(self) -> bool:
+        """Whether products with the data are most of the work, and templates are kept."""
+        return not self.joint and self.n_rows >= MANY_ROWS and self._fits
+
+    @property
     def _fits(self) -> bool:
         """Whether templates of the whole grid are kept."""
         return len(self) * self.n_rows <= 2 * NUMBERS_KEPT
@@ -356,7 +361,7 @@ class TemplateBank:
         ``drift`` is how far east and north, mas, the companion has moved at each sample.
         """
         places = self.grid.places
-        for index in self.grid.half_plane(len(self._samples)):
+        for index in self.grid.half_plane(len(self._samples), tiles=self._coarse_first):
             east, north = places[:, index]
             if drift is not None:
                 east, north = east + drift[0][:, None], north + drift[1][:, None]

@@ -126,7 +126,7 @@ def test_every_second_position_leads_to_the_largest_gain(weighted: bool, rng) ->
 
 def test_tiles_have_a_coarse_position_beside_every_position() -> None:
     grid = make_grid(40.0, 300.0, 9.0)
-    tiles = grid.half_plane(900)
+    tiles = grid.half_plane(900, tiles=True)
     assert sorted(np.concatenate(tiles)) == list(range(len(grid) // 2))
     for tile in tiles:
         coarse = tile[grid.coarse(tile)]
