@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from amibayes.extraction import extract_all
+    from amibayes.extraction.reading import check_together
     from amibayes.support.atomic_files import output_folder, write_json
 
     images = common.image_options_of(arguments)
@@ -90,6 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
         geometry=arguments.geometry,
     )
     options.refuse_unused()
+    check_together(arguments.cubes)
     stems = _stems(arguments.cubes)
     names = [SUMMARY, *(n for stem in stems for n in _names(stem, arguments))]
     folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)

@@ -11,13 +11,11 @@ from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.hypotheses import FAMILIES, Hypothesis
 from amibayes.comparison.verdict import UNDECIDED
 from amibayes.detection.verdict import Statement, Verdict
+from amibayes.likelihood.chi2 import REJECTED
 from amibayes.support.options import SKY_MODELS
 
-REJECTED = 1e-3
-"""Probability of a χ² below which a model does not fit."""
-
 REFUSED = ("model rejected", "inconsistent data")
-JUDGED = ("star", "companion")
+OF_ONE = ("star", "companion")
 """Models that the verdict is about, and what it says where neither is right."""
 
 SHORT = {"ring": "a ring", "crescent": "a crescent", "halo": "over-resolved light"}
@@ -113,7 +111,7 @@ def _agrees(found: ModelComparison, statement: Statement) -> bool:
 
 def _warning(found: ModelComparison, statement: Statement, summary: str) -> str:
     best = found.best
-    if statement in REFUSED and best.name in JUDGED:
+    if statement in REFUSED and best.name in OF_ONE:
         return (
             f"{best.name} is the most probable of the models of the sky that were compared, but "
             f"the verdict on it is: {statement}"

@@ -11,15 +11,12 @@ from amibayes.errors import DataError
 from amibayes.imaging.data_term import DataTerm
 from amibayes.imaging.folds import folds_of
 from amibayes.imaging.problem import FEWER_ITERATIONS, Problem
-from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.likelihood.chi2 import REJECTED, chi2_survival
 from amibayes.models.uv_points import UVPoints
 from amibayes.units import BoolArray, FloatArray
 
 WEIGHTS = tuple(10.0 ** np.arange(3.5, -0.6, -0.5))
 """Weights that are tried, the smoothest image first: each begins at the one before."""
-
-REJECTED = 1e-3
-"""Probability of a χ² below which an image does not fit, as a model of `search`."""
 
 
 def cross_validated(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from amibayes.imaging.choice import REJECTED
 from amibayes.imaging.problem import MAX_FLUX
 from amibayes.imaging.result import ReconstructedImage
+from amibayes.likelihood.chi2 import REJECTED
 
 NOT_PREDICTED = 3.0
 """χ² per datum left out beyond which data do not predict each other: simulated scenes that are

@@ -14,6 +14,9 @@ LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 CONTINUED_FRACTION_TERMS = 500
 
+REJECTED = 1e-3
+"""Probability of a χ² below which a model, or an image, does not fit."""
+
 
 def log_chi2_survival(x: ArrayLike, dof: float) -> FloatArray:
     """Logarithm of the probability that χ² of ``dof`` degrees exceeds ``x`` (any shape).

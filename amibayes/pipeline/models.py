@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.companion_search.field import default_separation
-from amibayes.comparison.agreement import REJECTED, agreement
+from amibayes.comparison.agreement import agreement
 from amibayes.comparison.best_fits import NoiseSetting
 from amibayes.comparison.compare import ModelComparison, compare_sky_models
 from amibayes.comparison.hypotheses import FAMILIES
 from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
 from amibayes.detection.verdict import Verdict
+from amibayes.likelihood.chi2 import REJECTED
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.field import FieldSearch, noise_prior
 from amibayes.pipeline.options import SearchOptions

@@ -7,11 +7,12 @@ from dataclasses import asdict
 import numpy as np
 
 from amibayes.companion_search.field import resolution_mas
-from amibayes.comparison.agreement import REJECTED, agreement, model_words
+from amibayes.comparison.agreement import agreement, model_words
 from amibayes.comparison.compare import Compared, ModelComparison
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.comparison.summary import intervals
 from amibayes.detection.verdict import Verdict
+from amibayes.likelihood.chi2 import REJECTED
 from amibayes.models.parameters import Parameter, Parameters, parameter_words
 from amibayes.posterior.evidence import Evidence
 from amibayes.posterior.priors import Prior, Range
