@@ -55,7 +55,7 @@ PATIENCE = 3.0
 
 # As a plugin of pytest, under `coverage run`: which test runs which line, and how long it takes.
 
-_seconds: dict[str, float] = {}
+_failed: set[str] = set()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -69,17 +69,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     try:
         return (yield)
     finally:
-        _seconds[item.nodeid] = time.process_time() - start
+        seconds = np.inf if item.nodeid in _failed else time.process_time() - start
+        with open(os.environ["TEST_SECONDS"], "a", encoding="utf-8") as stream:
+            stream.write(json.dumps([item.nodeid, seconds]) + "\n")
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     if report.outcome != "passed":
-        _seconds[report.nodeid] = np.inf
-
-
-def pytest_runtest_logfinish(nodeid: str) -> None:
-    with open(os.environ["TEST_SECONDS"], "a", encoding="utf-8") as stream:
-        stream.write(json.dumps([nodeid, _seconds[nodeid]]) + "\n")
+        _failed.add(report.nodeid)
 
 
 class Work:

@@ -126,8 +126,8 @@ def run_command(words: list[str]) -> int:
     words : list of str
         The command and its arguments.
     """
+    from amibayes.parallel.memory import keep_memory
     from amibayes.support.atomic_files import output_locks
-    from amibayes.support.memory import keep_memory
 
     keep_memory()
     command = next((word for word in words if word in COMMANDS), None)

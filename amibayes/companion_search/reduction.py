@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amibayes.likelihood.linear_response import Part
+from amibayes.support.evenly import evenly
 from amibayes.units import FloatArray, IntArray
 
 TOLERANCE = 1e-5
@@ -29,8 +30,6 @@ those of all groups."""
 
 Roots = tuple[tuple[IntArray, FloatArray], ...]
 """Rows of data that are correlated with each other, and a root of their covariance, (n, n)."""
-
-GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +149,7 @@ def reduction_of(
     groups = tuple(np.flatnonzero(label == k) for k in range(int(label.max(initial=0)) + 1))
     wanted = FIRST_TEMPLATES
     while wanted <= WORTH * len(label):
-        tried = np.unique((np.arange(wanted) * GOLDEN % 1.0 * n_positions).astype(np.intp))
+        tried = np.unique((evenly(wanted) * n_positions).astype(np.intp))
         found = templates(tried)
         size = float((found**2).sum())
         least = TOLERANCE**2 * size / found.shape[1]

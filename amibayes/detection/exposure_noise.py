@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amibayes.companion_search.reduction import GOLDEN, Roots
+from amibayes.companion_search.reduction import Roots
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.channel_noise import ChannelCovariance
 from amibayes.likelihood.channel_rows import ChannelRows, channel_layout, independent_rows
 from amibayes.likelihood.exposure_rows import Drift, Series, drift_of, series_of, turned_rows
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise import GaussianNoise
+from amibayes.support.evenly import evenly
 from amibayes.units import FloatArray
 
 DRAWN = 32
@@ -105,7 +106,7 @@ def _turned(
     These for κ and τ of equal probability.
     """
     # The kinds' shares do not depend on each other: those of closure phases come in another order.
-    mixed = np.argsort(np.arange(DRAWN) * GOLDEN % 1.0)
+    mixed = np.argsort(evenly(DRAWN))
     nodes = {
         kind: [drift.nodes(DRAWN)[k] for k in (np.arange(DRAWN) if kind else mixed)]
         for kind, drift in ((True, vis2), (False, closure))

@@ -36,6 +36,7 @@ class Rotations(ErrorTreatment):
 
     null: RotationNull
     null_rests_on_residuals = True
+    linear_noise = False
 
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets (n_data, n) that the bank's own estimate whitened."""

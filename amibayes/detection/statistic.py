@@ -155,6 +155,11 @@ class Statistic(Protocol):
         """Whether `with_noise_of` other residuals changes the distribution of null draws."""
         ...
 
+    @property
+    def linear_noise(self) -> bool:
+        """Whether `noise` is linear in the unit normals that it is made of."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class BankStatistic:
@@ -296,6 +301,11 @@ class BankStatistic:
     def null_rests_on_residuals(self) -> bool:
         """Whether `with_noise_of` other residuals changes the distribution of null draws."""
         return self.treatment.null_rests_on_residuals
+
+    @property
+    def linear_noise(self) -> bool:
+        """Whether `noise` is linear in the unit normals that it is made of."""
+        return self.treatment.linear_noise
 
 
 @checks_arguments

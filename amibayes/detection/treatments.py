@@ -105,6 +105,11 @@ class ErrorTreatment(Protocol):
         return False
 
     @property
+    def linear_noise(self) -> bool:
+        """Whether noise is linear in the unit normals that it is made of."""
+        return True
+
+    @property
     def of_nulls(self) -> Self:
         """The same for null sets, with numbers rounded that hardly matter."""
         return self

@@ -20,6 +20,7 @@ from amibayes.detection.statistic import Statistic
 from amibayes.detection.tails import pareto_quantile
 from amibayes.errors import UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.limits.components import over_components
 from amibayes.limits.critical import CriticalContrasts, Draws, critical_contrasts
 from amibayes.limits.limit import SHARES, DetectionLimit
 from amibayes.limits.pooled import Pooled, quantiles
@@ -38,9 +39,9 @@ beams of the outermost ring need not be resolved for."""
 LEAST_PER_PLACE = 2
 """Draws of noise at every place: their differences are the Monte Carlo error."""
 
-AFFORDABLE, SIGNAL_WORK = 1e11, 2000.0
+AFFORDABLE, SIGNAL_WORK = 5e10, 2000.0
 """Positions times data of all injected companions together, and how many of them the visibility of
-a companion at one point is worth: some five seconds of one core. Large data on wide fields get
+a companion at one point is worth: some two seconds of one core. Large data on wide fields get
 fewer companions."""
 
 COMPLETENESS = 0.95
@@ -251,7 +252,7 @@ def _spread(critical: CriticalContrasts) -> FloatArray:
     At one position recovery depends on the contrast in units of its error there, c/σ(angle):
     a quantile of that gives every direction its own limit.
     """
-    in_errors = critical.located / critical.sigma[:, :, None]
+    in_errors = over_components(critical)
     wanted = np.array([COMPLETENESS])
     at = np.array([quantiles(ring, wanted) for ring in in_errors])
     out = np.quantile(critical.sigma, SPREAD, axis=1).T * at

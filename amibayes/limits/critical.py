@@ -55,6 +55,9 @@ class CriticalContrasts:
         where detection alone counts.
     sigma : (n_rings, n_angles) float array
         Error of a faint companion's contrast.
+    component, width : (n_rings, n_angles, n_noise) float array
+        Component of the noise along the companion's template, in its standard deviations, and
+        these in the noise's expected ones: 0 where noise is not linear in the component.
     ambiguous : (n_rings,) float array
         Share of the directions in which a typical companion is taken for one nearer in.
     by_detection : (n_rings,) bool array
@@ -64,6 +67,8 @@ class CriticalContrasts:
     detected: FloatArray
     located: FloatArray
     sigma: FloatArray
+    component: FloatArray
+    width: FloatArray
     ambiguous: FloatArray
     by_detection: BoolArray
 
@@ -134,11 +139,12 @@ def critical_contrasts(
             progress=progress,
         )
     )
-    detected, located = (
+    detected, located, component, width = (
         np.concatenate([d[key] for d in done]).reshape(*shape, -1)
-        for key in ("detected", "located")
+        for key in ("detected", "located", "component", "width")
     )
-    return CriticalContrasts(detected, located, sigma.reshape(shape), lost, by_detection)
+    sigma = sigma.reshape(shape)
+    return CriticalContrasts(detected, located, sigma, component, width, lost, by_detection)
 
 
 def _parts(shape: tuple[int, int], draws: Draws, n_data: int) -> list[IntArray]:
@@ -174,22 +180,23 @@ def _piece(
     test: Statistic, threshold: float, draws: Draws, n_angles: int, part: _Part
 ) -> dict[str, FloatArray]:
     """Critical contrasts of whole rings of places."""
-    noise, along = _noise(test, draws, n_angles, part)
+    noise, along, width = _noise(test, draws, n_angles, part)
     trial = np.repeat(np.arange(len(part.number)), draws.per_place)
     trials = _Trials(test, threshold, part.at(trial), noise, along)
     detected, right = trials.detected()
     located = trials.located(detected, right)
-    shape = (len(part.number), draws.per_place)
-    return {"detected": detected.reshape(shape), "located": located.reshape(shape)}
+    numbers = {"detected": detected, "located": located, "component": along, "width": width}
+    return {key: x.reshape(len(part.number), draws.per_place) for key, x in numbers.items()}
 
 
 def _noise(
     test: Statistic, draws: Draws, n_angles: int, part: _Part
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Noise (n_data, n) of all trials, place by place, and its components along the templates.
 
-    The components decide most. On every ring each realisation has one from every n_angles-th of
-    the normal distribution, which takes their chance out of the limit.
+    And their standard deviations, which the drawn scatter sets. The components decide most. On
+    every ring each realisation has one from every n_angles-th of the normal distribution, which
+    takes their chance out of the limit.
     """
     rng = np.random.default_rng([draws.seed, int(part.number[0])])
     shape = (len(part.number) // n_angles, draws.per_place, n_angles)
@@ -200,7 +207,8 @@ def _noise(
     normals = test.bank.normals(len(along), rng)
     normals += own * (along - (own * normals).sum(axis=0))
     scatter = test.scatter_posterior(len(along), rng, stated_probable=draws.stated_probable)
-    return test.noise(normals * scatter, rng), along
+    width = (own**2 * scatter).sum(axis=0) if test.linear_noise else np.zeros(len(along))
+    return test.noise(normals * scatter, rng), along, width
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.limits.components import over_components
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.units import BoolArray, FloatArray, IntArray
+
+FAINTEST = 1e-3
+"""Contrast, in units of a ring's typical error, that counts as none: noise alone was detected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +24,9 @@ class Pooled:
 
     Parameters
     ----------
-    values : (n_rings, n_angles, n_noise) float array
-        ln of c in units of the ring's typical error.
+    values : (n_rings, n, n_noise) float array
+        ln of c for all position angles and components of the noise, in units of the ring's
+        typical error.
     typical : (n_rings,) float array
         ln of that error, the median over the position angle.
     kind : (n_rings,) bool array
@@ -36,8 +41,9 @@ class Pooled:
     def of(cls, critical: CriticalContrasts) -> Pooled:
         """Take logarithms."""
         typical = np.median(critical.sigma, axis=1)
-        values = np.log(critical.located / typical[:, None, None])
-        return cls(values, np.log(typical), critical.by_detection)
+        values = over_components(critical) * (critical.sigma / typical[:, None])[..., None, None]
+        merged = np.maximum(values, FAINTEST).reshape(len(values), -1, values.shape[3])
+        return cls(np.log(merged), np.log(typical), critical.by_detection)
 
     def contrast(self, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Contrasts above which shares of companions are recovered; NaN where none up to 1 is.

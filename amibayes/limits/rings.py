@@ -11,14 +11,12 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.support.arguments import in_range
+from amibayes.support.evenly import evenly
 from amibayes.support.options import LIMITS_SEPARATIONS
 from amibayes.units import FloatArray, offset
 
 MIN_ANGLES, MAX_ANGLES = 90, 720
 ANGLES_PER_FRINGE = 2.0
-
-GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-"""Turns every ring against the last one, so that no direction is favoured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +73,7 @@ def make_rings(
     around = 2.0 * np.pi * rho.max() / resolution_mas(result.likelihood)
     n = int(np.clip(np.ceil(ANGLES_PER_FRINGE * around), MIN_ANGLES, MAX_ANGLES))
     n = min(n, most_angles)
-    turned = np.arange(len(rho))[:, None] * GOLDEN
-    angle = 360.0 * ((np.arange(n)[None] + turned % 1.0) / n)
+    # Every ring is turned against the last one, so that no direction is favoured.
+    turned = evenly(len(rho))[:, None]
+    angle = 360.0 * ((np.arange(n)[None] + turned) / n)
     return Rings(rho, *offset(rho[:, None], angle))

@@ -24,9 +24,9 @@ from types import FrameType
 from typing import Any
 
 from amibayes.errors import RunError
+from amibayes.parallel.memory import keep_memory
 from amibayes.parallel.threads import run_in_worker
 from amibayes.support.atomic_files import HALF_WRITTEN
-from amibayes.support.memory import keep_memory
 
 ATTEMPTS = 3
 """How many workers a piece may lose before the run gives up."""

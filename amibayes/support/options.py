@@ -115,8 +115,8 @@ LIMITS_NULL_DRAWS = 20_000
 LIMITS_SEPARATIONS = 24
 """Rings of a detection limit."""
 
-LIMITS_TRIALS = 900
-"""Companions injected per separation: a limit is then known to 0.02 mag."""
+LIMITS_TRIALS = 450
+"""Companions injected per separation: a limit is then known to 0.01 mag."""
 
 VETTING_ALPHA = 0.003
 """Probability of each test below which a calibrator is dropped."""
