@@ -21,7 +21,7 @@ from amibayes.companion_search.field import (
 from amibayes.companion_search.optimise import fit_single, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
-from amibayes.companion_search.search import search
+from amibayes.companion_search.search import search, with_global_check
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import systematics_of
@@ -131,7 +131,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
                 f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: near {place:.1f} "
                 "mas, outside the default one, a companion fits better than anywhere inside"
             ]
-    first = search(likelihood, field)
+    first = search(likelihood, field, check=False)
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
     first = _with_its_disc(likelihood, first, options)
@@ -157,7 +157,7 @@ def _in_wider_field(
 ) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
     for field in wider_fields(first):
-        found = search(likelihood, field)
+        found = search(likelihood, field, check=False)
         if found.chi2_binary < EXPLAINED * first.chi2_binary:
             place = found.companion.separation_mas
             return _with_its_disc(likelihood, found, options), [
@@ -191,7 +191,7 @@ def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihoo
     ):
         return likelihood, free
     point = likelihood.with_model(replace(likelihood.model, diameter_mas=0.0))
-    found = search(point, (free.grid.inner_mas, free.grid.outer_mas))
+    found = search(point, (free.grid.inner_mas, free.grid.outer_mas), check=False)
     names = single_likelihood(free.likelihood).parameters.names
     alone = float(free.single_theta[names.index("diameter_mas")])
     fits = (free.chi2_binary, free.nuisance("diameter_mas")), (free.chi2_single, alone)
@@ -230,11 +230,14 @@ def _search_for_disc(likelihood: Likelihood, point: SearchResult) -> SearchResul
     disc, grid = likelihood.with_model(free), point.grid
     box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
     known = np.array([with_disc(disc, np.array(m.theta), box) for m in point.modes])
-    return search(disc, (grid.inner_mas, grid.outer_mas), known=known)
+    return search(disc, (grid.inner_mas, grid.outer_mas), known=known, check=False)
 
 
 def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult, ExtraNoise]:
-    """Search the field of a search with stated errors with the noise that was asked for."""
+    """Search the field of a search with stated errors with the noise that was asked for.
+
+    The global check is one of the search that stands.
+    """
     apart = options.file_noise is not False
     likelihood, field = first.likelihood, (first.grid.inner_mas, first.grid.outer_mas)
     prior = noise_prior(likelihood.observables, options)
@@ -243,7 +246,7 @@ def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult
         return search_robust(likelihood, field, free_scale=free, per_file=apart, prior=prior)
     if options.extra_noise or options.channel_noise or prior.floors:
         return search_with_noise(likelihood, field, per_file=apart, prior=prior, first=first)
-    return first, ExtraNoise()
+    return first if first.global_check is not None else with_global_check(first), ExtraNoise()
 
 
 def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
