@@ -58,9 +58,9 @@ LEVELS = (0.4, 4.0)
 """Contrasts of the completeness map, in units of the one that linear theory detects half of the
 time."""
 
-NULL_DRAWS, FRESH_WORK = 20_000, 8e10
+NULL_DRAWS, FRESH_WORK = 20_000, 5e10
 """Null searches from which the threshold is known to 0.01 mag, and positions times data of those
-that are added to the ones of the search: some two seconds of one core."""
+that are added to the ones of the search: some one second of one core."""
 
 BOOTSTRAPS = 40
 """Resampled thresholds: their error is then known to a tenth."""

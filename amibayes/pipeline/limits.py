@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,6 @@ from amibayes.parallel import (
     ForkExecutor,
     Journals,
     Progress,
-    SerialExecutor,
     run_job,
 )
 from amibayes.pipeline.false_alarm import false_alarm
@@ -262,7 +261,8 @@ def _all_limits(
 ) -> tuple[tuple[MeasuredLimit, ...], list[str]]:
     """Measure the main limit, and the others over the field and with the disc of the main one.
 
-    They need its search only: where processes can be forked all are then measured at a time.
+    They need its search only: where processes can be forked one is measured on each core, after
+    those that are too many for that, which share all cores.
     """
     data = ready.observables
     choices = [
@@ -273,29 +273,24 @@ def _all_limits(
     data = main.observables  # the same rows for all
     alike = [replace(c, search=_alike(c.search, main.result)) for c in choices[1:]]
     choices = [replace(choices[0], found=main), *alike]
-    with _at_once(run, choices) as (executor, choices):
-        work = partial(_measured, data, options, choices)
-        done = list(run_job(work, range(len(choices)), executor))
+    first = len(choices) - _at_once(run, len(choices))
+    done = [_measured(data, options, choices, k) for k in range(first)]
+    if first < len(choices):
+        executor = ForkExecutor(run.executor.workers, first_here=False)
+        choices = [replace(c, run=c.run.alone()) for c in choices]
+        with run.stage("other limits" if first else "limits"), closing(executor):
+            work = partial(_measured, data, options, choices)
+            done += list(run_job(work, range(first, len(choices)), executor))
     for _, _, seconds in done:
         run.seconds.update(seconds)
     limits = tuple(limit for limit, _, _ in done if limit is not None)
     return limits, [note for _, notes, _ in done for note in notes]
 
 
-@contextmanager
-def _at_once(run: Run, choices: list[_Choice]) -> Iterator[tuple[Executor, list[_Choice]]]:
-    """Open processes for the choices, which have no workers themselves, and tell nothing meanwhile.
-
-    Where the workers are others, or more than choices, these are measured here, one after the
-    other.
-    """
+def _at_once(run: Run, n: int) -> int:
+    """Number of limits, of the last, that are measured at a time: one in each process, or none."""
     workers = run.executor.workers if isinstance(run.executor, ForkExecutor) else 0
-    if not 1 < workers <= len(choices):
-        yield SerialExecutor(), choices
-        return
-    executor = ForkExecutor(workers, first_here=False)
-    with run.stage("limits"), closing(executor):
-        yield executor, [replace(c, run=c.run.alone()) for c in choices]
+    return n - n % workers if workers > 1 else 0
 
 
 def _measured(
