@@ -276,7 +276,7 @@ def _all_limits(
     first = len(choices) - _at_once(run, len(choices))
     done = [_measured(data, options, choices, k) for k in range(first)]
     if first < len(choices):
-        executor = ForkExecutor(run.executor.workers, first_here=False)
+        executor = ForkExecutor(len(choices) - first, first_here=False)
         choices = [replace(c, run=c.run.alone()) for c in choices]
         with run.stage("other limits" if first else "limits"), closing(executor):
             work = partial(_measured, data, options, choices)

@@ -56,8 +56,6 @@ class GridPosterior:
         Share of each box; adds up to ``probability``.
     nuisance : Nuisance
     nuisance_probability : (n_nodes,) float array
-    n_evaluations : int
-        Number of parameter sets at which the likelihood was formed.
     """
 
     prior: Prior
@@ -70,7 +68,6 @@ class GridPosterior:
     contrast_probability: FloatArray = field(repr=False)
     nuisance: Nuisance = field(repr=False)
     nuisance_probability: FloatArray = field(repr=False)
-    n_evaluations: int = 0
 
     @property
     def parameters(self) -> Parameters:
@@ -292,5 +289,4 @@ def _finished(work: Integrand, cells: Cells, shares: Shares) -> GridPosterior:
         contrast,
         work.nuisance,
         nodes / nodes.sum(),
-        work.n_evaluations,
     )

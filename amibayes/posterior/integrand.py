@@ -173,7 +173,6 @@ class Integrand:
         self.log_z_none = log_evidence_none(likelihood, prior, self.single)
         without, left = alone.chi2(self.single[None])[0], likelihood.chi2(self._best[None])[0]
         self.most = max(float((without - left) / likelihood.noise.inflation(left)), 0.0)
-        self.n_evaluations = 0
 
     def _scan(self) -> None:
         """Best contrast and gain in χ² of the linear theory over a lattice of the field."""
@@ -240,7 +239,6 @@ class Integrand:
         bright = self.likelihood.parameters.contrasts
         theta[:, :, np.delete(np.arange(theta.shape[2]), bright)] = sites[:, None]
         theta[:, :, bright[0]] = contrast
-        self.n_evaluations += n * k
         return theta.reshape(n * k, -1)
 
     def _best_contrast(self, sites: FloatArray) -> tuple[FloatArray, FloatArray]:
