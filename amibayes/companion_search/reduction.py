@@ -8,7 +8,7 @@ and noise is drawn in them directly: normal deviates, and the root of a χ² for
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,27 +95,41 @@ class Reduction:
         left = [rng.chisquare(d, n) if d > 0.0 else np.zeros(n) for d in self.degrees]
         return np.concatenate([held, np.sqrt(left)])
 
-    def roots(self, roots: Roots) -> Roots:
-        """Roots of the covariance of the rows, from those of the data that are correlated.
+    def roots(self, several: Sequence[Roots]) -> tuple[Roots, ...]:
+        """Roots of covariances of the rows, from those of the data that are correlated.
 
         Of groups by themselves. What combinations have more of the variance, the rest has less.
+        ``several`` have the same rows of data.
         """
-        found: list[tuple[IntArray, FloatArray]] = []
+        found: list[list[tuple[IntArray, FloatArray]]] = [[] for _ in several]
         first = 0
         for k, (rows, basis) in enumerate(zip(self.rows, self.bases, strict=True)):
-            covariance = np.eye(basis.shape[1])
-            for own, root in roots:
-                at = np.minimum(np.searchsorted(rows, own), len(rows) - 1)
-                held = np.where((rows[at] == own)[:, None], basis[at], 0.0)
-                covariance += (root.T @ held).T @ (root.T @ held) - held.T @ held
-            here = np.arange(first, first + len(covariance))
+            covariance = self._covariances(rows, basis, several)
+            here = np.arange(first, first + basis.shape[1])
             lower = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(here)))
-            found.append((here, np.asarray(lower, dtype=float)))
             first += len(here)
-            if self.degrees[k]:
-                rest = max(len(rows) - float(np.trace(covariance)), 0.0) / self.degrees[k]
-                found.append((np.array([k - len(self.bases)]), np.array([[np.sqrt(rest)]])))
-        return tuple(found)
+            rest = len(rows) - np.trace(covariance, axis1=1, axis2=2)
+            scatter = np.sqrt(np.maximum(rest, 0.0) / max(self.degrees[k], 1.0))
+            for own, root, size in zip(found, lower, scatter, strict=True):
+                own.append((here, np.asarray(root)))
+                if self.degrees[k]:
+                    own.append((np.array([k - len(self.bases)]), np.array([[size]])))
+        return tuple(map(tuple, found))
+
+    def _covariances(
+        self, rows: IntArray, basis: FloatArray, several: Sequence[Roots]
+    ) -> FloatArray:
+        """Covariances of the combinations of one group, (n, n_combinations, n_combinations)."""
+        out = np.broadcast_to(np.eye(basis.shape[1]), (len(several), *(basis.shape[1],) * 2)).copy()
+        for same in zip(*several, strict=True):
+            own = same[0][0]
+            at = np.minimum(np.searchsorted(rows, own), len(rows) - 1)
+            inside = rows[at] == own
+            if inside.any():
+                held = np.where(inside[:, None], basis[at], 0.0)
+                turned = np.stack([root.T for _, root in same]) @ held
+                out += turned.swapaxes(1, 2) @ turned - held.T @ held
+        return out
 
     def added(self, noise: FloatArray, signal: FloatArray) -> FloatArray:
         """Data of noise and signal, (n_rows, n) each.

@@ -64,7 +64,7 @@ class ExposureNoise:
         """The same for the rows of a bank."""
         if bank.reduction is None:
             return self
-        return replace(self, roots=tuple(map(bank.reduction.roots, self.roots)))
+        return replace(self, roots=bank.reduction.roots(self.roots))
 
 
 def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise | None:

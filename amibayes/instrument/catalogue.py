@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -231,17 +231,26 @@ def recognised(header: Mapping[str, Any], source: str) -> tuple[str, HeaderRules
     return stated, HeaderRules()
 
 
-@lru_cache(maxsize=1)
 def _all_rules() -> dict[str, HeaderRules]:
     """Rules of the package's own instruments, by the names of their files."""
-    return {name: header_rules(name) for name in instrument_names()}
+    return {name: _own_rules(name) for name in instrument_names()}
 
 
 def header_rules(name: str) -> HeaderRules:
     """Rules of an instrument by name or file; none where the package does not know it."""
-    if name.lower() not in instrument_names() and not name.endswith(".toml"):
-        return HeaderRules()
-    top = read_toml(_path(name))
+    if name.lower() in instrument_names():
+        return _own_rules(name.lower())
+    return _rules_in(_path(name)) if name.endswith(".toml") else HeaderRules()
+
+
+@cache
+def _own_rules(name: str) -> HeaderRules:
+    """Rules of one of the package's own instruments: each cube asks for them several times."""
+    return _rules_in(_path(name))
+
+
+def _rules_in(path: Path) -> HeaderRules:
+    top = read_toml(path)
     return rules_of(top.section("header")) if "header" in top else HeaderRules()
 
 

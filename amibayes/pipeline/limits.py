@@ -261,8 +261,8 @@ def _all_limits(
 ) -> tuple[tuple[MeasuredLimit, ...], list[str]]:
     """Measure the main limit, and the others over the field and with the disc of the main one.
 
-    They need its search only: where processes can be forked one is measured on each core, after
-    those that are too many for that, which share all cores.
+    They need its search only: then all are measured at a time, each in a process of its own, which
+    two cores share evenly. Where there are more cores than limits each limit has all of them.
     """
     data = ready.observables
     choices = [
@@ -273,24 +273,19 @@ def _all_limits(
     data = main.observables  # the same rows for all
     alike = [replace(c, search=_alike(c.search, main.result)) for c in choices[1:]]
     choices = [replace(choices[0], found=main), *alike]
-    first = len(choices) - _at_once(run, len(choices))
-    done = [_measured(data, options, choices, k) for k in range(first)]
-    if first < len(choices):
-        executor = ForkExecutor(len(choices) - first, first_here=False)
-        choices = [replace(c, run=c.run.alone()) for c in choices]
-        with run.stage("other limits" if first else "limits"), closing(executor):
-            work = partial(_measured, data, options, choices)
-            done += list(run_job(work, range(first, len(choices)), executor))
+    workers = run.executor.workers if isinstance(run.executor, ForkExecutor) else 0
+    if 1 < workers <= len(choices):
+        alone = [replace(c, run=c.run.alone()) for c in choices]
+        work = partial(_measured, data, options, alone)
+        executor = ForkExecutor(len(choices), first_here=False)
+        with run.stage("limits"), closing(executor):
+            done = list(run_job(work, range(len(choices)), executor))
+    else:
+        done = [_measured(data, options, choices, k) for k in range(len(choices))]
     for _, _, seconds in done:
         run.seconds.update(seconds)
     limits = tuple(limit for limit, _, _ in done if limit is not None)
     return limits, [note for _, notes, _ in done for note in notes]
-
-
-def _at_once(run: Run, n: int) -> int:
-    """Number of limits, of the last, that are measured at a time: one in each process, or none."""
-    workers = run.executor.workers if isinstance(run.executor, ForkExecutor) else 0
-    return n - n % workers if workers > 1 else 0
 
 
 def _measured(
