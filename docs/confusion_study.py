@@ -261,7 +261,7 @@ def main() -> int:
     for k in range(len(known_answers(CASES)), arguments.cases):
         if time.process_time() > 60.0 * arguments.minutes:
             break
-        keep_answer(CASES, case(k))
+        keep_answer(CASES, case(k), SCRIPT)
     if not arguments.no_tables:
         write_tables(known_answers(CASES))
     return 0
@@ -276,7 +276,7 @@ def write_tables(cases: Sequence[Answer]) -> None:
         "cost": cost_table(cases),
     }
     for name, lines in tables.items():
-        put_table(PAGE, lines, f"{name}: {SCRIPT}")
+        put_table(PAGE, lines, f"{name}: {SCRIPT}", cases)
 
 
 if __name__ == "__main__":

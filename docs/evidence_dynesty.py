@@ -101,8 +101,9 @@ def main() -> int:
     for k in range(len(known_answers(CASES)), arguments.cases):
         if time.process_time() > 60.0 * arguments.minutes:
             break
-        keep_answer(CASES, case(k))
-    put_table(PAGE, table(known_answers(CASES)), f"dynesty: {SCRIPT}")
+        keep_answer(CASES, case(k), SCRIPT)
+    cases = known_answers(CASES)
+    put_table(PAGE, table(cases), f"dynesty: {SCRIPT}", cases)
     return 0
 
 

@@ -24,7 +24,8 @@ from brute_force import COVERAGES, Compared, case, compared  # noqa: E402
 from pages import put_table  # noqa: E402
 from trials import keep_answer, known_answers  # noqa: E402
 
-PAGE, MARK = "statistics.md", "table: docs/global_search.py"
+PAGE, SCRIPT = "statistics.md", "docs/global_search.py"
+MARK = f"table: {SCRIPT}"
 
 STARTS, FIRST_SEED = 300, 1000
 """Fits of brute force for each binary, and seeds that no test uses."""
@@ -74,8 +75,8 @@ def main(results: Path, n: int) -> None:
         begin = time.process_time()
         found[name, k] = one(name, k)
         row = {"name": name, "k": k, "compared": vars(found[name, k])}
-        keep_answer(results, row | {"cpu_s": time.process_time() - begin})
-    put_table(PAGE, list(table(found)), MARK)
+        keep_answer(results, row | {"cpu_s": time.process_time() - begin}, SCRIPT)
+    put_table(PAGE, list(table(found)), MARK, known_answers(results))
 
 
 if __name__ == "__main__":

@@ -48,6 +48,13 @@ def changed() -> dict[str, list[str]]:
     return found
 
 
+@cache
+def code_of(script: Path | str) -> str:
+    """One digest of all that a script uses, which goes with each answer that it keeps."""
+    parts = digests((ROOT / script).resolve())
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
+
+
 def digests(script: Path) -> dict[str, str]:
     """A digest for each package that a script uses, and for the script itself."""
     trees = defaultdict(list)

@@ -36,7 +36,7 @@ from benchmarks.charge_migration import MOVING, PLAIN, calibrated, n_integration
 from benchmarks.statements import errors_of, searched
 
 FILE = Path(__file__).with_name("static") / "migration_trials.jsonl"
-PAGE = "howto/charge_migration.md"
+PAGE, SCRIPT = "howto/charge_migration.md", "docs/migration_trials.py"
 
 PHOTONS, RATIOS = (1e7, 1e8, 1e9), (1.0, 0.5, 0.25)
 """Of the target; and of a calibrator's brightness to the target's."""
@@ -110,7 +110,7 @@ def run(minutes: float, kinds: list[str], photons: list[float]) -> None:
         if time.process_time() > 60.0 * minutes:
             return
         before = time.process_time()
-        keep_answer(FILE, trial(*key))
+        keep_answer(FILE, trial(*key), SCRIPT)
         print(*key, f"{time.process_time() - before:.1f} s", flush=True)
 
 
@@ -218,7 +218,7 @@ def main() -> int:
     for name, table in TABLES.items():
         lines = table(known_answers(FILE))
         if len(lines) > len(("head", "rule")):
-            put_table(PAGE, lines, f"{name}: docs/migration_trials.py")
+            put_table(PAGE, lines, f"{name}: {SCRIPT}", known_answers(FILE))
     return 0
 
 

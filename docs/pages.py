@@ -11,14 +11,17 @@ folder call `put_table` themselves.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import made_with
 
 
-def put_table(page: str, lines: Sequence[str], mark: str) -> None:
+def put_table(
+    page: str, lines: Sequence[str], mark: str, answers: Sequence[Mapping[str, Any]] = ()
+) -> None:
     """Replace what is between ``<!-- mark -->`` and ``<!-- end of mark -->``.
 
     With which code it was made is recorded, see `made_with`.
@@ -30,6 +33,9 @@ def put_table(page: str, lines: Sequence[str], mark: str) -> None:
     lines : sequence of str
     mark : str
         Name of the table and the script that makes it: ``table: docs/power.py``.
+    answers : sequence of mapping
+        Kept answers that it is made of (`trials`). Where some are older than the code, so is the
+        table, and nothing is recorded.
 
     Raises
     ------
@@ -44,7 +50,9 @@ def put_table(page: str, lines: Sequence[str], mark: str) -> None:
         raise ValueError(f"{page} has no lines {begin.strip()} and {end.strip()}")
     text = "\n".join([begin, *lines, "", end])
     path.write_text(head + text + tail, encoding="utf-8")
-    made_with.record(mark.partition(": ")[2].split()[0])
+    script = mark.partition(": ")[2].split()[0]
+    if all(answer.get("code") == made_with.code_of(script) for answer in answers):
+        made_with.record(script)
 
 
 def put_tables(page: str, printed: Iterable[str], mark: str) -> None:

@@ -34,7 +34,8 @@ from amibayes.plots.models import (
 )
 
 KEPT = Path(__file__).with_name("static") / "public_models.jsonl"
-PAGE, MARK = "howto/companion_or_disc.md", "public: docs/public_models.py"
+PAGE, SCRIPT = "howto/companion_or_disc.md", "docs/public_models.py"
+MARK = f"public: {SCRIPT}"
 MODELS = ("star", "companion", "disc", "ring", "crescent")
 WRONG = {
     "companion": ("star", "disc", "ring", "crescent", "extended light"),
@@ -129,11 +130,12 @@ def main() -> int:
     for case in FILES:
         done = {a["name"] for a in known_answers(KEPT)}
         if case.name not in done and (arguments.only or "") in case.name:
-            keep_answer(KEPT, answer(case, arguments.data, arguments.pictures))
+            keep_answer(KEPT, answer(case, arguments.data, arguments.pictures), SCRIPT)
             print(row(case, known_answers(KEPT)[-1]), flush=True)
     kept = {a["name"]: a for a in known_answers(KEPT)}
     there = [case for case in FILES if case.name in kept]
-    put_table(PAGE, [*HEAD, *(row(case, kept[case.name]) for case in there)], MARK)
+    rows = [row(case, kept[case.name]) for case in there]
+    put_table(PAGE, [*HEAD, *rows], MARK, list(kept.values()))
     wrong = [case.name for case in there if is_wrong(case, kept[case.name])]
     print(f"wrong: {', '.join(wrong)}" if wrong else "nothing wrong is stated")
     return 1 if wrong else 0

@@ -1,4 +1,8 @@
-"""Answers of many trials, kept in a file as they come: a script that was cut off goes on."""
+"""Answers of many trials, kept in a file as they come: a script that was cut off goes on.
+
+Each answer has a digest of the code that it was found with (``code``): a table of older answers
+does not count as made with the code of today.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from made_with import code_of
 
 Answer = dict[str, Any]
 
@@ -16,11 +22,11 @@ def known_answers(path: Path) -> list[Answer]:
     return [json.loads(line) for line in lines]
 
 
-def keep_answer(path: Path, answer: Answer) -> None:
-    """Put one more answer into a file."""
+def keep_answer(path: Path, answer: Answer, script: str) -> None:
+    """Put one more answer of a script, relative to the root of the clone, into a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8") as stream:
-        stream.write(json.dumps(answer, default=float) + "\n")
+        stream.write(json.dumps(answer | {"code": code_of(script)}, default=float) + "\n")
 
 
 def forget_answers(path: Path, which: Callable[[Answer], bool]) -> None:
@@ -29,7 +35,7 @@ def forget_answers(path: Path, which: Callable[[Answer], bool]) -> None:
     path.write_text("".join(json.dumps(answer) + "\n" for answer in kept), encoding="utf-8")
 
 
-def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
+def answers(path: Path, n: int, trial: Callable[[int], Answer], script: str) -> list[Answer]:
     """Give the answers of trials 0 to n − 1: those of the file, then new ones, put there at once.
 
     Parameters
@@ -38,12 +44,13 @@ def answers(path: Path, n: int, trial: Callable[[int], Answer]) -> list[Answer]:
     n : int
     trial : callable
         Its answer depends on the number alone, so that any n goes on from any other.
+    script : str
+        As for `keep_answer`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     known = known_answers(path)
     whole = "".join(json.dumps(answer) + "\n" for answer in known)
     path.write_text(whole, encoding="utf-8")
     for k in range(len(known), n):
-        known.append(trial(k))
-        keep_answer(path, known[-1])
-    return known[:n]
+        keep_answer(path, trial(k), script)
+    return known_answers(path)[:n]

@@ -38,7 +38,7 @@ from amibayes.validation.tables import SimulatedTable  # noqa: E402
 from amibayes.validation.tally import FALSE_ALARMS, Check, tally  # noqa: E402
 from amibayes.validation.trial import COVERED, run_trial  # noqa: E402
 
-DOCS = Path(__file__).parent
+DOCS, SCRIPT = Path(__file__).parent, "docs/validation.py"
 PICTURES = ("ranks", "coverage", "false_alarms", "completeness")
 CYCLE = ("alone", "bright", "alone", "alone", "middling", "alone", "alone", "faint", "alone")
 FULL = 334 * len(CYCLE)
@@ -101,7 +101,9 @@ def run(folder: Path, stars: int, minutes: float) -> None:
         name = min(open_ones, key=lambda n: spent[n])
         number = list(CONDITIONS).index(name)
         done[name] += 1
-        found = answers(file_of(folder, name), done[name], partial(trial, number, CONDITIONS[name]))
+        found = answers(
+            file_of(folder, name), done[name], partial(trial, number, CONDITIONS[name]), SCRIPT
+        )
         spent[name] += found[-1]["seconds"]
 
 
@@ -195,7 +197,8 @@ def main(arguments: Any) -> None:
         run(folder, FULL, np.inf if arguments.full else arguments.minutes)
     found = {name: known_answers(file_of(folder, name)) for name in CONDITIONS}
     kept = {name: a for name, a in found.items() if a}
-    put_table("validation.md", lines_of(kept), "table: docs/validation.py")
+    every = [answer for found in kept.values() for answer in found]
+    put_table("validation.md", lines_of(kept), f"table: {SCRIPT}", every)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,8 @@ from trials import Answer, answers, known_answers  # noqa: E402
 
 from amibayes.data.observables import Observables, join  # noqa: E402
 
-PAGE, MARK = "public_verdicts.md", "table: docs/verdict_confusion.py"
+PAGE, SCRIPT = "public_verdicts.md", "docs/verdict_confusion.py"
+MARK = f"table: {SCRIPT}"
 STATEMENTS = ("companion", "no companion", "model rejected", "inconsistent data")
 
 SEED = 78
@@ -137,13 +138,15 @@ HEAD = ("object", "cases", "companion", "companion, with a note", *STATEMENTS[1:
 
 def main(n: int, folder: Path) -> None:
     """Write the table, of the answers that are there for n = 0."""
-    rows = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
+    rows, every = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"], list[Answer]()
     for number, (name, make) in enumerate(OBJECTS.items()):
         path = folder / f"{number:02d}.jsonl"
         ask = partial(answer, number, make)
-        rows.append(row_of(name, answers(path, n, ask) if n else known_answers(path)))
+        found = answers(path, n, ask, SCRIPT) if n else known_answers(path)
+        rows.append(row_of(name, found))
+        every += found
         print(rows[-1], flush=True)
-    put_table(PAGE, rows, MARK)
+    put_table(PAGE, rows, MARK, every)
 
 
 if __name__ == "__main__":

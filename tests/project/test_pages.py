@@ -89,3 +89,26 @@ def test_scripts_are_found_with_what_they_measure() -> None:
     assert {"companion_search", "detection"} <= made_with.digests(ROOT / "docs/power.py").keys()
     for name in json.loads(made_with.KEPT.read_text(encoding="utf-8")):
         assert (ROOT / name).is_file(), f"{name} has gone: take it out of docs/made_with.json"
+
+
+def test_a_table_of_older_answers_is_not_new(made_with: ModuleType, monkeypatch) -> None:
+    """Each answer has the digest of its code: one from before a change keeps the table old."""
+    pages, trials = script_of_docs("pages"), script_of_docs("trials")
+    monkeypatch.setattr(pages, "made_with", made_with)
+    monkeypatch.setattr(trials, "code_of", made_with.code_of)
+    monkeypatch.setattr(pages, "__file__", str(made_with.ROOT / "docs" / "pages.py"))
+    path, script = made_with.ROOT / "answers.jsonl", "docs/script.py"
+
+    def written() -> dict[str, list[str]]:
+        pages.put_table("page.md", ["| x |"], f"table: {script}", trials.known_answers(path))
+        return made_with.changed()
+
+    trials.keep_answer(path, {"k": 0}, script)
+    assert written() == {script: []}
+    (made_with.ROOT / "amibayes/deeper/part.py").write_text("def g(): return 2\n")
+    made_with._tree.cache_clear()
+    made_with.code_of.cache_clear()
+    trials.keep_answer(path, {"k": 1}, script)
+    assert written() == {script: ["deeper"]}
+    trials.forget_answers(path, lambda answer: answer["k"] == 0)
+    assert written() == {script: []}
