@@ -61,52 +61,41 @@ class Statistic(Protocol):
     @property
     def likelihood(self) -> Likelihood:
         """Of the data, with the noise that was fitted."""
-        ...
 
     @property
     def bank(self) -> TemplateBank:
         """Positions that are searched, and what a companion does there."""
-        ...
 
     @property
     def residual(self) -> FloatArray:
         """Data less the fit (n_data,) of the data that it was made from."""
-        ...
 
     @property
     def observed(self) -> FloatArray:
         """The same whitened, (n_independent,)."""
-        ...
 
     @property
     def label(self) -> str:
         """What its values are called."""
-        ...
 
     @property
     def exposures(self) -> ExposureNoise | None:
         """What exposures share of the noise; None where they are independent."""
-        ...
 
     def hits(self, white: FloatArray) -> Hits:
         """Search data sets, whitened residuals (n_data, n) of the fit without a companion."""
-        ...
 
     def evaluate(self, white: FloatArray) -> FloatArray:
         """Statistic of whitened residuals (n_data, n), (n,)."""
-        ...
 
     def field(self, white: FloatArray) -> FloatArray:
         """Statistic of one data set (n_data,) at every position, (n_grid,)."""
-        ...
 
     def signal_of(self, companions: FloatArray) -> FloatArray:
         """Whitened change of the data (n_data, n) by companions (n, 3)."""
-        ...
 
     def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
         """Draw n data sets with the noise of the data, and a signal in them, and search them."""
-        ...
 
     def draw_null(
         self,
@@ -118,47 +107,37 @@ class Statistic(Protocol):
         journal: Journal | None = None,
     ) -> FloatArray:
         """Statistic of n data sets of noise alone, (n,)."""
-        ...
 
     def noise(self, normals: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Noise of data sets (n_data, n) out of unit normals; ``rng`` for what else is drawn."""
-        ...
 
     def hits_in(self, noise: FloatArray, signal: FloatArray) -> Hits:
         """Search data sets of noise and a signal each, (n_data, n)."""
-        ...
 
     def scatter_posterior(
         self, n: int, rng: np.random.Generator, *, stated_probable: bool
     ) -> FloatArray:
         """Draw what scatter the noise may really have: (n_data, n) or (1, n) factors."""
-        ...
 
     def gain_at(self, statistic: FloatArray) -> FloatArray:
         """Gain in χ², in units of the noise, that reaches values of the statistic, any shape."""
-        ...
 
     def contrast_error(self, places: FloatArray) -> FloatArray:
         """Error of a faint companion's contrast at places (n, 2), mas, (n,)."""
-        ...
 
     def local_survival(self, statistic: FloatArray) -> FloatArray:
         """Probability that noise alone reaches a statistic at one given position, any shape."""
-        ...
 
     def with_noise_of(self, residuals: FloatArray) -> Self:
         """Make the same with the noise of other whitened residuals (n_data,)."""
-        ...
 
     @property
     def null_rests_on_residuals(self) -> bool:
         """Whether `with_noise_of` other residuals changes the distribution of null draws."""
-        ...
 
     @property
     def linear_noise(self) -> bool:
         """Whether `noise` is linear in the unit normals that it is made of."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

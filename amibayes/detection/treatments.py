@@ -9,7 +9,7 @@ data (kinds and files) scatter by its own amount; `StudentScores` bounds every r
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, Self
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 from scipy import special, stats
@@ -43,13 +43,14 @@ class Searched:
 class ErrorTreatment(Protocol):
     """How data sets are searched, and how null sets are made."""
 
+    linear_noise: ClassVar[bool] = True
+    """Whether noise is linear in the unit normals that it is made of."""
+
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets (n_data, n), whitened by the bank's own covariance."""
-        ...
 
     def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain in χ² of one data set (n_data,) at every position, and its χ²."""
-        ...
 
     def search_simulated(
         self, bank: TemplateBank, noise: FloatArray, signal: FloatArray | None = None
@@ -105,18 +106,12 @@ class ErrorTreatment(Protocol):
         return False
 
     @property
-    def linear_noise(self) -> bool:
-        """Whether noise is linear in the unit normals that it is made of."""
-        return True
-
-    @property
     def of_nulls(self) -> Self:
         """The same for null sets, with numbers rounded that hardly matter."""
         return self
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of a faint companion's contrast at places (n, 2), mas, under its noise, (n,)."""
-        ...
 
 
 @dataclass(frozen=True)
