@@ -96,6 +96,24 @@ def test_least_squares_finds_the_truth() -> None:
     np.testing.assert_allclose(found.theta, TRUTHS["crescent"], rtol=1e-3)
 
 
+@pytest.mark.parametrize("least", [1e-3, 5e-3])
+def test_a_prior_without_faint_companions_finds_the_bright_one(least: float) -> None:
+    """Its least contrast is that of the linear templates, or above it."""
+    base = base_of("companion", TRUTHS["companion"])
+    model = cube_of("companion", base)
+    model = replace(model, prior=replace(model.prior, contrast_min=least))
+    found = fit_model(
+        model,
+        [fit_model(cube_of("star", base), (), np.random.default_rng(0))],
+        np.random.default_rng(0),
+    )
+    (bank,) = found.banks
+    assert np.isfinite(bank.faint).all()
+    seeds = model.theta(bank.seeds(base.observables.data[:, None])[0])
+    assert np.hypot(*(seeds[:, :2] - TRUTHS["companion"][:2]).T).min() < 40.0
+    np.testing.assert_allclose(found.theta[:2], TRUTHS["companion"][:2], atol=6.0)
+
+
 def test_evidence_of_a_disc_against_a_grid() -> None:
     """ln Z of a face-on disc of two parameters, summed over a fine grid of its prior."""
     base = base_of("disc", [0.01, 150.0, 1.0, 0.0])
