@@ -85,6 +85,16 @@ def of_channels() -> Observables:
     return with_draw(sheet, noise.draw(1, np.random.default_rng(4))[:, 0])
 
 
+def of_gains() -> Observables:
+    """Ten exposures whose gains and closure phases are off by more than their floors."""
+    sheet, rng, off = pionier(10), np.random.default_rng(5), []
+    for table, size in ((sheet.vis2, 0.1), (sheet.closure_phase, 0.06)):
+        key = np.stack([table.setup, table.row], axis=1)
+        row = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+        off.append(size * rng.standard_normal(row.max() + 1)[row])
+    return with_draw(sheet, np.concatenate(off) + sheet.covariance.draw(rng, 1)[:, 0])
+
+
 def estimated(data: Observables) -> Observables:
     return replace(data, freedom=Freedom(30.0, 28.0))
 
@@ -123,6 +133,8 @@ def test_likelihoods_and_their_slopes(num_regression) -> None:
         ("star", data, STAR, np.append(THETA, [0.5, 0.1])),
         ("estimated", estimated(data), STAR, np.append(THETA, [40.0, 0.1])),
         ("vis2", data.only(["vis2"]), BinaryModel(), THETA),
+        ("turned", data.with_data(data.data * 3.0 + 2.0), BinaryModel(), THETA),
+        ("small", data, BinaryModel(diameter_mas="free"), np.append(THETA, 0.0)),
         ("dense", niriss(covariance="diagonal"), BinaryModel(), THETA),
     ):
         likelihood = Likelihood(observables, model)
@@ -179,11 +191,13 @@ def test_fitted_noise(num_regression) -> None:
     channels = Likelihood(of_channels())
     star = np.array([10.0, 5.0, 0.0])
     prior = NoisePrior(floors=FLOORS)
+    wide = NoisePrior(0.3, 0.3, floors=(Systematics("", 0.05, 0.03),))
     fits = {
         "together": (two, THETA, {}),
         "per_file": (two, THETA, {"per_file": True}),
         "narrow": (two, THETA, {"prior": NoisePrior(0.004, 0.002)}),
         "channels": (channels, star, {}),
+        "gains": (Likelihood(of_gains()).expecting(star), star, {"prior": wide}),
         "floors": (channels.expecting(star), star, {"prior": prior}),
         "estimated": (Likelihood(estimated(of_two_files())), THETA, {}),
     }
@@ -335,6 +349,18 @@ def test_laws_of_chi2_and_quadrature(num_regression) -> None:
         ],
         freedom=add_noise(small, ExtraNoise(0.01)).freedom,
     )
+    rng = np.random.default_rng(6)
+    whole = estimated(data)
+    scatter = data.covariance.sparse * 0.7
+    for name, one in (("plain", whole), ("measured", replace(whole, scatter=scatter))):
+        noise = Likelihood(one).noise
+        null = rotation_null(noise, np.ones(noise.n_independent))
+        assert null is not None
+        drawn = null.draw(np.cos(np.outer(np.arange(noise.n_independent), [1.0, 2.0])), rng)
+        found = (null.degrees, null.rows, (null.factor**2).sum(), (drawn**2).sum(axis=0))
+        numbers |= numbers_of(**{f"turned {name}": found})
+    turned = data.with_data(np.where(np.arange(len(data.data)) > 50, 3.3, 1.0) * (1.0 + data.data))
+    numbers |= numbers_of(wrapped=Likelihood(turned).difference(THETA))
     joined = joint_likelihood(Likelihood(pionier(3)), motion=True)
     numbers |= numbers_of(fastest=joined.model.fastest_mas_yr, mjd=joined.model.reference_mjd)
     num_regression.check(numbers, default_tolerance=TOLERANCE)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers import niriss
 from recorded_numbers import numbers_of
+from test_off_axis import with_lattice
 
 from amibayes.data.observables import Observables, join
 from amibayes.likelihood.likelihood import Likelihood
@@ -165,3 +166,31 @@ def test_discs_and_projections(num_regression) -> None:
         along_slopes=plane.along_slopes(np.array([50.0])),
     )
     num_regression.check(numbers, default_tolerance=TOLERANCE)
+
+
+def test_responses_off_the_axis(num_regression) -> None:
+    """Two exposures through responses of their own, light around the star beside a companion."""
+    parts = [with_lattice(np.random.default_rng(k), 60000.0 + k) for k in (1, 2)]
+    data, numbers = join(parts), {}
+    around = replace(RING, slope=0.0)
+    for name, options, theta in (
+        ("companion", {}, (30.0, -20.0, 0.3)),
+        ("star", {"diameter_mas": "free", "background": "free"}, (30.0, -20.0, 0.3, 40.0, 0.1)),
+        ("moving", {"fastest_mas_yr": 9.0, "reference_mjd": 59000.0}, (30.0, -20.0, 0.3, 2.0, -3)),
+        ("ring", {"surroundings": (around,)}, (30, -20, 0.3, 0.4, 60, 0.6, 35, 0.3, 0.7, 80)),
+    ):
+        likelihood = Likelihood(data, BinaryModel(**options))
+        samples, sets = likelihood.samples, np.array([theta, 0.9 * np.array(theta)])
+        value, slopes = likelihood.model.gradient(samples, sets)
+        seen = {"seen": likelihood.model.visibility(samples, sets), "value": value}
+        numbers |= numbers_of(**{name: seen | {"slopes": slopes}})
+    off_axis, waves = samples.off_axis, samples.response_waves
+    assert off_axis is not None
+    numbers |= numbers_of(
+        waves=waves,
+        start=off_axis.start,
+        through=off_axis.with_slopes((np.array([5.0, -30.0]), np.array([20.0, 8.0]))),
+        centre=off_axis.centre(value),
+        moves=off_axis.centre_slopes(value, slopes),
+    )
+    num_regression.check(numbers, default_tolerance={"rtol": 1e-5, "atol": 1e-12})
