@@ -29,7 +29,6 @@ from amibayes.data.observables import Observables, join
 from amibayes.detection.alternatives import (
     _chromatic_star,
     _elongated_star,
-    _extended_light,
     symmetric_chi2,
 )
 from amibayes.detection.calibrator_consistency import compare_calibrators
@@ -270,7 +269,6 @@ def test_alternatives_and_outlying_rows(monkeypatch: pytest.MonkeyPatch, num_reg
             chromatic_star = _chromatic_star(likelihood, found)
             assert chromatic_star is not None
             others.append(chromatic_star.chi2)
-            others.append(_extended_light(likelihood).chi2)
         else:
             others.append(_elongated_star(likelihood, found).chi2)
         numbers |= numbers_of(**{name: others})

@@ -71,7 +71,7 @@ def test_grids(result: SearchResult, resolved: SearchResult, num_regression) -> 
         ("uniform", result, ("contrast=uniform", "position=separation")),
         ("star", resolved, ()),
     ):
-        prior = default_prior(found.likelihood, found.grid.inner_mas, found.grid.outer_mas)
+        prior = default_prior(found.likelihood, 162.0, 178.0)
         names = [p.name for p in found.likelihood.parameters][3:]
         prior = edit_prior(prior, map(parse_setting, forms), names)
         grid = grid_posterior(found.likelihood, prior)
