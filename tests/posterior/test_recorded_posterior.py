@@ -71,10 +71,10 @@ def test_grids(result: SearchResult, resolved: SearchResult, num_regression) -> 
         ("uniform", result, ("contrast=uniform", "position=separation")),
         ("star", resolved, ()),
     ):
-        prior = default_prior(found.likelihood, 162.0, 178.0)
+        prior = default_prior(found.likelihood, 164.0, 176.0)
         names = [p.name for p in found.likelihood.parameters][3:]
         prior = edit_prior(prior, map(parse_setting, forms), names)
-        grid = grid_posterior(found.likelihood, prior)
+        grid = grid_posterior(found.likelihood, prior, step=4.0)
         wanted = ("east_mas", "separation_mas", "position_angle_deg", "contrast", "delta_mag")
         proposal = IndependenceProposal(grid)
         places, density = proposal.draw(40, np.random.RandomState(3))
