@@ -159,10 +159,15 @@ class SeedBank:
         shapes = columns[columns != flux]
         cube = np.tile(reference, (n, 1))
         cube[:, shapes] = qmc.Sobol(len(shapes), rng=np.random.default_rng(seed)).random(n)
-        dark, faint, bright = (_with_flux(model, cube, flux, f) for f in (0.0, FAINT, BRIGHT))
+        dark = _with_flux(model, cube, flux, 0.0)
+        # A prior may leave out what is fainter than some contrast.
+        least = float(model.theta(dark[:1])[0, flux])
+        faint, bright = (
+            _with_flux(model, cube, flux, f) for f in (max(FAINT, 2.0 * least), BRIGHT)
+        )
         without = model.predict(dark[:1])[:, 0]
         change = model.likelihood.wrapped(model.predict(faint) - without[:, None])
-        amount = model.theta(faint[:1])[0, flux] - model.theta(dark[:1])[0, flux]
+        amount = model.theta(faint[:1])[0, flux] - least
         linear = model.likelihood.noise.whiten(change) / amount
         return cls(model, reference, columns, flux, cube, without, linear, model.predict(bright))
 

@@ -9,14 +9,17 @@ import pytest
 from helpers import niriss, simulated
 from scipy import stats
 
-from amibayes.companion_search.grid import make_grid
+from amibayes.companion_search.exact_map import LADDER, ExactMap, exact_map
+from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.scan import GroupWeights, ScaleGroups
+from amibayes.companion_search.seeds import bright_seeds
 from amibayes.companion_search.template_bank import MANY_ROWS, TemplateBank
 from amibayes.data.covariance import dense_covariance
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.parameters import Box
 
 MODELS = [
     BinaryModel(),
@@ -178,3 +181,37 @@ def test_a_template_that_the_star_makes_whole_gains_nothing(rng) -> None:
     contrast, sigma = bank.scan_at(rng.standard_normal(bank.n_data), np.array([99.0]), np.zeros(1))
     assert np.isfinite(contrast).all()
     assert abs(contrast[0] / sigma[0]) < 1e-3
+
+
+@pytest.mark.parametrize("kinds", [("vis2", "cp"), ("vis2",)])
+def test_exact_map_is_chi2_of_the_model_and_its_best_the_least(kinds, rng) -> None:
+    """Every position and contrast by the model itself."""
+    likelihood = Likelihood(simulated(niriss(), [150.0, -80.0, 0.2], rng).only(list(kinds)))
+    grid, contrasts = make_grid(100.0, 180.0, 30.0), (0.1, 0.2, 0.6)
+    found = exact_map(likelihood, grid, np.empty(0), contrasts)
+    expected = [
+        likelihood.chi2(np.column_stack([grid.east_mas, grid.north_mas, np.full(len(grid), c)]))
+        for c in contrasts
+    ]
+    np.testing.assert_allclose(found.chi2, expected, rtol=1e-9)
+    least = [min(zip(column, contrasts, strict=True))[1] for column in np.transpose(expected)]
+    np.testing.assert_array_equal(found.best, least)
+    assert len(set(least)) > 1
+
+
+def test_bright_seeds_cost_no_more_than_they_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Positions, samples and contrasts of a field whose steps are neither finest nor coarsest."""
+    made = []
+
+    def kept(likelihood: Likelihood, grid: Grid, nuisance: np.ndarray) -> ExactMap:
+        made.append(len(grid) * len(likelihood.samples) * len(LADDER))
+        return exact_map(likelihood, grid, nuisance)
+
+    monkeypatch.setattr("amibayes.companion_search.seeds.exact_map", kept)
+    # What 6 steps per fringe cost.
+    likelihood, box = Likelihood(niriss()), Box(50.0, 300.0, 150.0)
+    area = np.pi * (box.outer_mas**2 - box.inner_mas**2) / box.fringe_mas**2
+    work = 36.0 * area * len(likelihood.samples) * len(LADDER)
+    monkeypatch.setattr("amibayes.companion_search.seeds.EXACT_WORK", work)
+    bright_seeds(likelihood, np.empty(0), box)
+    assert made[0] == pytest.approx(work, rel=0.05)

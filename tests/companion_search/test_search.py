@@ -8,7 +8,16 @@ from helpers import niriss, simulated
 from scipy import stats
 
 from amibayes.companion_search import search as search_module
-from amibayes.companion_search.field import default_separation, resolution_mas, resolves_stars
+from amibayes.companion_search.field import (
+    COARSE_STEPS_PER_FRINGE,
+    MAX_WORK,
+    WORK_PER_POSITION,
+    _affordable,
+    _holds,
+    default_separation,
+    resolution_mas,
+    resolves_stars,
+)
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.search import search
@@ -190,3 +199,23 @@ def test_bright_companions_are_those_of_a_large_contrast_or_a_large_gain(
     each = np.array([contrast, 1e-4])
     survey = ScanResult(each, each, np.array([gain, 0.0]), each[:, None])
     assert may_be_bright(survey, np.array([0])) == bright
+
+
+@pytest.mark.parametrize("contrast", [0.0, 0.02])
+def test_a_place_outside_holds_where_a_companion_is_there(contrast: float, rng) -> None:
+    """Noise alone gains less than the limit of modes, however large χ² is."""
+    place = np.array([430.0, 60.0])
+    likelihood = Likelihood(simulated(niriss(channels=3), [*place, contrast], rng))
+    within = make_grid(60.0, 250.0, 20.0)
+    box = Box(60.0, 500.0, resolution_mas(likelihood))
+    assert _holds(likelihood, within, np.empty(0), place, box, None) == (contrast > 0.0)
+
+
+def test_the_reach_of_a_look_outside_is_what_its_work_affords() -> None:
+    """As many positions, counted on their grid, times the work of one."""
+    likelihood = Likelihood(niriss())
+    box = Box(50.0, 1e6, resolution_mas(likelihood))
+    _, reach = _affordable(likelihood, box)
+    positions = len(make_grid(0.0, reach, box.fringe_mas / COARSE_STEPS_PER_FRINGE))
+    work = positions * (len(likelihood.samples) + WORK_PER_POSITION)
+    assert work == pytest.approx(MAX_WORK, rel=0.01)

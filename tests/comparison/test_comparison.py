@@ -16,6 +16,7 @@ from amibayes.comparison.fit_models import embedded, fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import Hypothesis, hypotheses, prior_of
 from amibayes.comparison.integral import Effort, integrate, log_z_laplace
+from amibayes.comparison.summary import _interval
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.comparison.verdict import Confusion, choose
 from amibayes.data.systematics import Systematics
@@ -94,6 +95,24 @@ def test_least_squares_finds_the_truth() -> None:
     base = base_of("crescent", TRUTHS["crescent"], None)
     found = fitted("crescent", base)
     np.testing.assert_allclose(found.theta, TRUTHS["crescent"], rtol=1e-3)
+
+
+@pytest.mark.parametrize("least", [1e-3, 5e-3])
+def test_a_prior_without_faint_companions_finds_the_bright_one(least: float) -> None:
+    """Its least contrast is that of the linear templates, or above it."""
+    base = base_of("companion", TRUTHS["companion"])
+    model = cube_of("companion", base)
+    model = replace(model, prior=replace(model.prior, contrast_min=least))
+    found = fit_model(
+        model,
+        [fit_model(cube_of("star", base), (), np.random.default_rng(0))],
+        np.random.default_rng(0),
+    )
+    (bank,) = found.banks
+    assert np.isfinite(bank.faint).all()
+    seeds = model.theta(bank.seeds(base.observables.data[:, None])[0])
+    assert np.hypot(*(seeds[:, :2] - TRUTHS["companion"][:2]).T).min() < 40.0
+    np.testing.assert_allclose(found.theta[:2], TRUTHS["companion"][:2], atol=6.0)
 
 
 def test_evidence_of_a_disc_against_a_grid() -> None:
@@ -293,3 +312,16 @@ def test_the_averaged_noise_has_the_errors_that_data_are_simulated_with() -> Non
     for term in noise.terms:
         size = ((term.whitening @ drawn) ** 2).sum(axis=0).mean() / term.n_independent
         assert 0.5 < size < 2.0
+
+
+@pytest.mark.parametrize(("turn", "middle"), [(360.0, 2.0), (180.0, 175.0), (0.0, -3.0)])
+def test_intervals_of_angles_do_not_care_where_the_turn_begins(turn: float, middle: float) -> None:
+    """Quantiles of a normal distribution, weighted unevenly, that goes across the turn's end."""
+    x = np.linspace(-60.0, 60.0, 4001)
+    weights = np.exp(-0.5 * (x / 8.0) ** 2)
+    values = (middle + x) % turn if turn else middle + x
+    found = _interval(middle, values, weights / weights.sum(), turn)
+    one = 8.0 * 0.99446
+    assert (found.median, found.lower, found.upper) == pytest.approx(
+        (middle, middle - one, middle + one), abs=0.05
+    )

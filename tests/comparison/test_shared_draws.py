@@ -9,6 +9,7 @@ import pytest
 from scipy.special import logsumexp
 from test_comparison import STAR, TRUTHS, base_of, cube_of, fitted
 
+from amibayes.comparison import confusion
 from amibayes.comparison.fit_models import fit_model
 from amibayes.comparison.fitting import least_squares
 from amibayes.comparison.hypotheses import prior_of
@@ -156,3 +157,20 @@ def test_evidence_is_that_of_nested_sampling(truth: str, name: str) -> None:
     for value, its_error in pairs:
         both = np.hypot(its_error, nested["log_z_error"])
         assert value == pytest.approx(nested["log_z"], abs=4.5 * both)
+
+
+def test_draws_that_miss_the_posterior_give_way_to_laplace(monkeypatch) -> None:
+    """Only where they are too small: ln Z is that of a careful integral then."""
+    base = base_of("companion", TRUTHS["companion"])
+    fit = fitted("companion", base)
+    data = np.repeat(base.observables.data[:, None], 2, axis=1)
+    missed = np.array([-1e3, 1e3]), np.ones(2)
+    monkeypatch.setattr(confusion, "pooled_evidences", lambda *_: missed)
+    prior = PriorDraws.of(fit.model, 16, np.random.default_rng(1))
+    tried = np.repeat(fit.cube[None], 2, axis=0), np.repeat(fit.chi2[None], 2, axis=0)
+    best = np.full(2, -np.inf)
+    found = confusion._evidence(fit, data, tried, np.random.default_rng(2), prior, best)
+    rng = np.random.default_rng(3)
+    careful = integrate(fit.model, data[:, 0], fit.cube, fit.chi2, rng).diagnostics["log_z"]
+    assert found[0] == pytest.approx(careful, abs=0.3)
+    assert found[1] == 1e3

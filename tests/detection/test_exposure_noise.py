@@ -229,3 +229,10 @@ def test_errors_of_a_companion_allow_for_drifts(rng) -> None:
     # Mean squares of 240 pulls, known to 0.15: 1.3, the share being known to a third, and 2.7.
     assert (pulls(80, rng, channels=True) ** 2).mean() < 1.8
     assert (pulls(80, rng, channels=False) ** 2).mean() > 1.8
+
+
+def test_times_of_a_series_are_hours() -> None:
+    """Exposures of ten minutes."""
+    sheet = four_telescopes(4, channels=3)
+    for one in series_of(sheet, channel_layout(sheet)):
+        np.testing.assert_allclose(np.diff(one.hours), 1.0 / 6.0, rtol=1e-4)

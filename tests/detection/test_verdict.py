@@ -24,6 +24,7 @@ from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import (
     SHAPE,
     SMALL,
+    WITHIN,
     Verdict,
     change_by_companion,
     fit_probability,
@@ -244,3 +245,15 @@ def test_confusion_of_forty_of_each_kind() -> None:
     for kind in ("triple", "ring", "spotted disc"):
         assert table[kind].get("companion", 0) <= 4
         assert kind == "spotted disc" or table[kind].get("no companion", 0) <= 4
+
+
+@pytest.mark.parametrize(("p", "said"), [(0.004, True), (0.006, False)])
+def test_structure_within_the_calibration_errors_is_told(p: float, said: bool, rng) -> None:
+    """At a rate of 1 % of two tests: of the fit, and of what it leaves."""
+    result = search(Likelihood(simulated(niriss(), [150.0, -80.0, 0.02], rng)), (120.0, 200.0))
+    tested = Significance(30.0, np.arange(2000.0), 5e-4, (0.0, 2e-3), None, 0.01)
+    left = Significance(12.0, np.arange(2000.0), p, (0.5 * p, 2.0 * p), None, 0.01)
+    found = verdict(result, tested, left, (), structured=False)
+    assert found.statement == "companion"
+    assert (WITHIN in found.because) == said
+    assert WITHIN not in verdict(result, tested, replace(left, probability=0.5), ()).because

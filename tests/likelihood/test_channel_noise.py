@@ -24,7 +24,7 @@ from amibayes.likelihood.channel_noise import (
 from amibayes.likelihood.channel_rows import OFFSET, SLOPE, channel_layout, smooth_basis
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import _Kind, fit_noise
 from amibayes.models.binary import BinaryModel
 
 
@@ -298,3 +298,28 @@ def test_amplitudes_are_what_a_coherent_error_does() -> None:
     layout = channel_layout(data)
     np.testing.assert_allclose(layout.amplitude[layout.vis2], 1.6 / 0.01)
     assert not layout.amplitude[~layout.vis2].any()
+
+
+def test_growth_of_a_floor_is_that_of_the_squares() -> None:
+    """Rows alike: their variance is the mean of their squares, where the prior is wide."""
+    data = pionier(2)
+    one = _Kind(data, data.data, np.empty((len(data.data), 0)), 1.0, "vis2", ())
+    alike = np.ones(40)
+    found = one._growth(10.0 * alike, 3.0 * alike, 2.0 * alike, 1e-3)
+    assert found == pytest.approx(1.0 + (10.0 - 3.0) / 2.0, rel=1e-2)
+    assert one._growth(2.0 * alike, 3.0 * alike, 2.0 * alike, 1e-3) == 1.0
+
+
+def test_larger_gains_are_told_from_the_errors_beside_them(rng) -> None:
+    """Gains whose mean square is that of the floor, all of it common to the channels."""
+    sheet = pionier(10).only(["vis2"])
+    key = np.stack([sheet.vis2.setup, sheet.vis2.row], axis=1)
+    row = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    gain = rng.standard_normal(row.max() + 1)
+    gain *= 0.1 / np.sqrt((gain**2).mean())
+    data = with_draw(sheet, gain[row] + sheet.covariance.draw(rng, 1)[:, 0])
+    prior = NoisePrior(vis2=0.3, floors=(Systematics("", 0.1, 0.0),))
+    point = np.array([10.0, 5.0, 0.0])
+    found = fit_noise(Likelihood(data).expecting(point), point, prior=prior)
+    # Half of a floor's variance is common to the channels, the rest changes across them.
+    assert found.channels[0].vis2.offset == pytest.approx(2.0, rel=0.1)

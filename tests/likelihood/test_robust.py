@@ -254,3 +254,25 @@ def test_errors_of_normal_residuals_are_those_of_the_efficiency() -> None:
     efficiency = slope**2 / mean(lambda x: ((nu + 1.0) * x / (nu + x * x)) ** 2)
     # Weights scatter by 0.3: 5 sigma of the mean is 6 %.
     assert np.mean(stretch**-2.0) == pytest.approx(efficiency, rel=0.06)
+
+
+def test_t_likelihood_is_normal_at_its_peak_and_shifts_with_its_scale(rng) -> None:
+    """Residuals in proportion to the scale differ by its part of the norm alone."""
+    data = niriss(covariance="diagonal")
+    (term, _) = student_terms(data)
+    white = rng.standard_normal((term.n_independent, 3))
+    at_peak = term.log_likelihoods_of_white(0.0 * white, np.zeros(1))[0]
+    sigma = np.sqrt(data.covariance.variance[: data.n_vis2])
+    np.testing.assert_allclose(at_peak, stats.norm.logpdf(0.0, scale=sigma).sum(), rtol=1e-9)
+    nodes = np.array([0.0, 0.4, 1.5])
+    scaled = [term.log_likelihoods_of_white(np.exp(u) * white, np.array([u]))[0] for u in nodes]
+    shift = normal_moments().efficiency * term.n_independent * nodes
+    np.testing.assert_allclose(scaled + shift[:, None], scaled[0] + np.zeros((3, 1)), rtol=1e-9)
+
+
+def test_power_of_the_t_likelihood_obeys_bartletts_identity() -> None:
+    """Of normal residuals the score's variance is the mean curvature: weights are fair."""
+    z = np.linspace(-12.0, 12.0, 200_001)
+    mass = stats.norm.pdf(z) * (z[1] - z[0])
+    score = np.gradient(normal_moments().power * stats.t.logpdf(z, DEGREES), z)
+    assert mass @ score**2 == pytest.approx(-(mass @ np.gradient(score, z)), rel=1e-4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from amibayes.limits.critical import CriticalContrasts
 from amibayes.limits.pooled import Pooled, quantiles
 
 SHARES = np.array([0.3, 0.5, 0.8])
@@ -42,3 +43,15 @@ def test_a_share_that_is_not_reached_has_no_contrast() -> None:
     contrast, _ = pooled.contrast(np.array([0.5, 0.9]))
     assert contrast[0, 0] == pytest.approx(np.exp(-5.0))
     assert np.isnan(contrast[0, 1])
+
+
+def test_contrasts_are_those_of_the_injections_where_places_are_alike() -> None:
+    """Whatever the contrast error that all places have."""
+    sigma = np.full((2, 30), 3e-4)
+    located = np.geomspace(1e-3, 4e-3, 300).reshape(1, 30, 10) * np.ones((2, 1, 1))
+    still = np.zeros_like(located)
+    critical = CriticalContrasts(
+        located, located, sigma, still, still, np.zeros(2), np.zeros(2, dtype=bool)
+    )
+    found = Pooled.of(critical).contrast(SHARES)[0]
+    np.testing.assert_allclose(found[0], np.quantile(located[0], SHARES), rtol=5e-3)

@@ -12,9 +12,11 @@ from helpers import niriss, simulated
 from amibayes.companion_search.search import search
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.posterior.chain import EnsembleSampler
 from amibayes.posterior.ensemble import sample
 from amibayes.posterior.grid import GridPosterior, grid_posterior
-from amibayes.posterior.independence import IndependenceProposal
+from amibayes.posterior.independence import IndependenceProposal, Unnoticed
+from amibayes.posterior.nuisance import star_alone
 from amibayes.posterior.priors import default_prior
 from amibayes.support.ensemble_moves import along_others
 
@@ -108,3 +110,22 @@ def test_wrong_proposals_make_no_wrong_posterior(
         n = posterior.convergence()[posterior.names[k]]["n_effective"]
         distance = np.abs(grid.marginal(name).cdf(values) - ranks).max()
         assert distance < 0.02 + 2.7 / np.sqrt(n), name
+
+
+def test_half_of_the_steps_are_independent() -> None:
+    """The other half is shared as without them."""
+    (*along, (_, independent)) = EnsembleSampler(proposal=lambda *_: None)._moves()
+    assert independent == pytest.approx(sum(share for _, share in along)) == 0.5
+    alone = EnsembleSampler()._moves()
+    np.testing.assert_allclose(2.0 * np.array([s for _, s in along]), [s for _, s in alone])
+
+
+def test_a_density_does_not_depend_on_its_neighbours(likelihood: Likelihood) -> None:
+    """Companions outside the prior beside some that are inside."""
+    prior = default_prior(likelihood, *FIELD)
+    unnoticed = Unnoticed(likelihood, prior, star_alone(likelihood, prior))
+    x = unnoticed.draw(np.random.default_rng(3), 6)
+    x[1, :2] *= 10.0
+    each = [unnoticed.log_density(one[None])[0] for one in x]
+    np.testing.assert_allclose(unnoticed.log_density(x), each)
+    assert np.isinf(each[1])

@@ -134,3 +134,14 @@ def test_the_completeness_of_a_box_is_that_of_drawn_companions() -> None:
 def test_a_survey_that_could_see_nothing_tells_nothing() -> None:
     with pytest.raises(UsageError, match="no target could have shown"):
         frequency_posterior(np.zeros(3, bool), np.zeros(3))
+
+
+def test_the_stack_reaches_to_the_outermost_ring_of_any_target() -> None:
+    rings = tuple(Crossings(-6.0, 5.0) for _ in range(2))
+    outcomes = [
+        Outcome(str(k), "done", detection=DetectionProbability(np.array([60.0, outer]), rings))
+        for k, outer in enumerate((200.0, 500.0, 300.0))
+    ]
+    found = statistics(outcomes)[1]["completeness"]
+    assert (found["separation_mas"][0], found["separation_mas"][-1]) == pytest.approx((60.0, 500.0))
+    assert (found["n_covering"][0], found["n_covering"][-2]) == (3, 1)
