@@ -59,33 +59,42 @@ def checker(num_regression: Any, tolerance: float = 1e-6) -> Callable[..., None]
 def _add(out: dict[str, Any], name: str, thing: Any, skipped: set[str], properties: bool) -> None:
     if thing is None or isinstance(thing, str | bytes | Path | date) or callable(thing):
         return
-    if isinstance(thing, BlockCovariance):
-        there = np.cos(1.0 + np.arange(thing.size))
-        thing = {
-            "variance": thing.variance,
-            "times": thing.dense() @ there,
-            "rank": thing.rank,
-            "logdet": thing.logdet(),
-            "chi2": float(np.sum(thing.whiten(there) ** 2)),
-        }
-    if issparse(thing):
-        thing = thing.toarray()
-    if is_dataclass(thing):
-        names = [f.name for f in fields(thing) if not f.name.startswith("_")]
-        names += _properties(type(thing)) if properties else []
-        thing = {n: getattr(thing, n) for n in names if n not in skipped}
-    if isinstance(thing, Mapping):
-        for key, value in thing.items():
+    parts = _parts(thing, skipped, properties)
+    if parts is not None:
+        for key, value in parts.items():
             if str(key) not in skipped:
                 _add(out, f"{name}.{key}", value, skipped, False)
         return
-    if isinstance(thing, list | tuple) and not all(np.isscalar(x) for x in thing):
-        for k, value in enumerate(thing):
-            _add(out, f"{name}.{k}", value, skipped, False)
-        return
-    array = np.asarray(thing)
+    array = np.asarray(thing.toarray() if issparse(thing) else thing)
     if array.dtype.kind in "biufc":
         out[name] = condensed(array)
+
+
+def _parts(thing: Any, skipped: set[str], properties: bool) -> Mapping[Any, Any] | None:
+    """What a container holds, by name; None of an array or a number."""
+    if isinstance(thing, BlockCovariance):
+        return _of_covariance(thing)
+    if is_dataclass(thing):
+        names = [f.name for f in fields(thing) if not f.name.startswith("_")]
+        names += _properties(type(thing)) if properties else []
+        return {n: getattr(thing, n) for n in names if n not in skipped}
+    if isinstance(thing, Mapping):
+        return thing
+    if isinstance(thing, list | tuple) and not all(np.isscalar(x) for x in thing):
+        return dict(enumerate(thing))
+    return None
+
+
+def _of_covariance(covariance: BlockCovariance) -> dict[str, Any]:
+    """The sign of its eigenvectors, and the order of its blocks, are not looked at."""
+    there = np.cos(1.0 + np.arange(covariance.size))
+    return {
+        "variance": covariance.variance,
+        "times": covariance.dense() @ there,
+        "rank": covariance.rank,
+        "logdet": covariance.logdet(),
+        "chi2": float(np.sum(covariance.whiten(there) ** 2)),
+    }
 
 
 def _properties(kind: type) -> list[str]:

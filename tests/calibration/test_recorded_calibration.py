@@ -211,9 +211,7 @@ def test_reduced_data_are_those_recorded(num_regression) -> None:
             rng, n_stations=4, n_channels=4, n_exposures=3, kind="assumed", name=name
         )
         parts.append(replace(star, setups=(replace(star.setups[0], source=name),)))
-    same = replace(
-        parts[0].setups[0], insname="I_P2", source="I_P2"
-    )
+    same = replace(parts[0].setups[0], insname="I_P2", source="I_P2")
     parts[1] = replace(parts[1], setups=(same,))
     for k, m in enumerate(("vis2", "closure_phase")):
         own = getattr(parts[0], m)

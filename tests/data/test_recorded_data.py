@@ -64,7 +64,9 @@ def test_block_covariances_are_those_recorded(num_regression) -> None:
     for k in range(2):
         closure = random_observables(rng, n_stations=5, kind="diagonal").closure_phase
         variance = rng.uniform(1.0, 2.0, len(closure.value))
-        parts.append(covariance_of_errors(np.full(2 + k, 0.1), closure, np.sqrt(variance), "assumed"))
+        parts.append(
+            covariance_of_errors(np.full(2 + k, 0.1), closure, np.sqrt(variance), "assumed")
+        )
     root = rng.normal(size=(4, 9))
     plain = dense_covariance(root @ root.T)
     whole = stack_covariances([*parts, plain])

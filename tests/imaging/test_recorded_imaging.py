@@ -72,7 +72,11 @@ def test_grids_and_choices_are_those_recorded(data: Observables, num_regression)
     samples = uv_points_of(data)
     scores = np.array([5.0, 3.0, 2.4, 2.2, 2.5, 4.0])
     checker(num_regression)(
-        grids=[choose_grid(samples), choose_grid(samples, 900.0), choose_grid(samples, 700.0, 31.0)],
+        grids=[
+            choose_grid(samples),
+            choose_grid(samples, 900.0),
+            choose_grid(samples, 700.0, 31.0),
+        ],
         field=(default_field(samples), repetition_mas(samples)),
         axes=(PixelGrid(5, 20.0).east_mas, PixelGrid(5, 20.0).north_mas),
         folds=folds_of(data, np.random.default_rng(7)),

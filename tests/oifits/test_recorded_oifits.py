@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
-from helpers import niriss, simulated
 from jwst_products import as_oifits, binary, integrations, write_product
 from oi_builders import HandMade, MaskFile, random_observables
 from recorded_numbers import checker
@@ -20,7 +19,6 @@ from scipy.sparse import diags_array
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.oifits.audit import audit, repair
 from amibayes.oifits.audit.geometry import four_triangles
 from amibayes.oifits.audit.packages import amplitude_ratio
 from amibayes.oifits.dates import first_date, mjd_of_date
@@ -28,20 +26,23 @@ from amibayes.oifits.export import export, triple_amplitudes
 from amibayes.oifits.products import open_products, pointing_of, product_of, read_product
 from amibayes.oifits.products.integrations import averaged, series_of
 from amibayes.oifits.products.mask_map import map_of
-from amibayes.oifits.products.repairs import band_width, relative_amplitude_error, repaired, vis2_error
-from amibayes.oifits.tables import OIFits, open_oifits
-from amibayes.oifits.uv_stations import stations_from_uv
+from amibayes.oifits.products.repairs import (
+    band_width,
+    relative_amplitude_error,
+    repaired,
+    vis2_error,
+)
 
 KINDS = ("ami-oi", "amimulti-oi", "aminorm-oi")
 
 
 def numbers_in(hdus: fits.HDUList) -> dict[str, dict[str, np.ndarray]]:
-    """Columns of all tables that hold numbers."""
+    """Columns of all tables that hold numbers, but not what rounding leaves of them."""
     return {
         f"{k}.{hdu.name}": {
             name: np.asarray(hdu.data[name])
             for name in hdu.columns.names
-            if hdu.data[name].dtype.kind in "biufc"
+            if hdu.data[name].dtype.kind in "biufc" and not name.endswith("_REST")
         }
         for k, hdu in enumerate(hdus)
         if isinstance(hdu, fits.BinTableHDU)
@@ -53,9 +54,7 @@ def visibilities(seed: int, contrast: float = 0.1, n: int = 12) -> np.ndarray:
 
 
 @pytest.mark.parametrize("covariance", ["assumed", "diagonal"])
-def test_a_plain_file_is_read_as_recorded(
-    covariance: str, tmp_path: Path, num_regression
-) -> None:
+def test_a_plain_file_is_read_as_recorded(covariance: str, tmp_path: Path, num_regression) -> None:
     """Flags, errors that are none, correlations, and closure phases with those assumed."""
     made = HandMade(np.random.default_rng(1))
     made.vis2_error[2, 1] = 0.0
@@ -77,7 +76,7 @@ def test_turning_masks_are_read_as_recorded(tmp_path: Path, num_regression) -> N
     path = made.write(tmp_path / "a.oifits")
     file = read_oifits(path)
     for name in ("OI_VIS2", "OI_T3"):
-        form, values, unit = made.tables[name]["STA_INDEX"]
+        _, values, _ = made.tables[name]["STA_INDEX"]
         made.put(name, "STA_INDEX", np.zeros_like(values))
     without = read_oifits(made.write(tmp_path / "b.oifits"))
     found = four_triangles(file)
@@ -96,7 +95,9 @@ def test_what_is_written_is_that_recorded(kind: str, tmp_path: Path, num_regress
     data = random_observables(np.random.default_rng(3), n_stations=5, kind=kind)
     variance = data.covariance.variance
     if kind in ("estimated", "assumed"):
-        changes = np.sqrt(variance)[:, None] * np.random.default_rng(4).normal(size=(len(variance), 2))
+        changes = np.sqrt(variance)[:, None] * np.random.default_rng(4).normal(
+            size=(len(variance), 2)
+        )
         data = replace(
             data, freedom=Freedom(31.0, 17.0), scatter=diags_array(0.4 * variance).tocsr()
         ).with_shared_errors(SharedErrors(("charge x", "charge y"), changes))
@@ -119,10 +120,12 @@ def test_exports_are_those_recorded(program: str, num_regression) -> None:
         random_observables(rng, n_stations=4, n_channels=2, n_exposures=2, kind="assumed", name=n)
         for n in ("A", "B")
     ]
+    vis2, closure = parts[1].vis2, parts[1].closure_phase
     parts[1] = replace(
-        parts[1], closure_phase=replace(parts[1].closure_phase, mjd=parts[1].closure_phase.mjd + 3.0),
-        vis2=replace(parts[1].vis2, mjd=parts[1].vis2.mjd + 3.0),
-    )  # fmt: skip
+        parts[1],
+        vis2=replace(vis2, mjd=vis2.mjd + 3.0),
+        closure_phase=replace(closure, mjd=closure.mjd + 3.0),
+    )
     made = export(parts, program)
     checker(num_regression)(
         hdus=numbers_in(made.hdus),
@@ -143,7 +146,7 @@ def test_products_are_read_as_recorded(kind: str, tmp_path: Path, num_regression
     assert product is not None
     fixed, repairs = repaired(product)
     found = map_of(product)
-    checker(num_regression)(
+    checker(num_regression, 1e-4)(
         read=read_product(oifits),
         columns={t.label: t.columns for t in fixed.tables},
         band=band_width(product),
@@ -169,7 +172,7 @@ def test_integrations_of_products_are_averaged_as_recorded(tmp_path: Path, num_r
         for k in range(2)
     ]  # fmt: skip
     products = open_products(paths)
-    checker(num_regression)(
+    checker(num_regression, 1e-4)(
         found=averaged(products), first=[series_of(p).mean for p in products],
         noise=[series_of(p).noise for p in products], mjd=len(first_date(np.array([6e4]))),
     )  # fmt: skip

@@ -10,7 +10,15 @@ import pytest
 from recorded_numbers import checker
 
 from amibayes.instrument import Channels, Mask, load_instrument
-from amibayes.optics import PupilMap, Wavefront, fringe_basis, fringe_field, fringe_image, psf, scene_image
+from amibayes.optics import (
+    PupilMap,
+    Wavefront,
+    fringe_basis,
+    fringe_field,
+    fringe_image,
+    psf,
+    scene_image,
+)
 from amibayes.optics.holes import coverage, hole_transform
 from amibayes.optics.psf import amplitude, axis_nodes, intensity, pixel_rule
 from amibayes.optics.sampling import (

@@ -64,9 +64,13 @@ def test_spectra_and_orientations_are_those_recorded(num_regression) -> None:
     vectors = np.array([[1.0, 2.0], [-0.5, 3.0]])
     both = (turned, Orientation(200.0 * DEGREE))
     checker(num_regression)(
-        densities=[s.photon_density(WAVELENGTH_M) for s in (Flat(), Blackbody(3500.0), table, g2v())],
+        densities=[
+            s.photon_density(WAVELENGTH_M) for s in (Flat(), Blackbody(3500.0), table, g2v())
+        ],
         matrices=[(o.matrix, o.inverse) for o in both],
-        vectors=[(o.to_sky(vectors), o.to_image(vectors), o.baselines_to_sky(vectors)) for o in both],
+        vectors=[
+            (o.to_sky(vectors), o.to_image(vectors), o.baselines_to_sky(vectors)) for o in both
+        ],
         again=[orientation_of_matrix(o.matrix) for o in both],
         alike=[turned.is_like(o) for o in (turned, both[1], Orientation(35.01 * DEGREE, -1))],
     )

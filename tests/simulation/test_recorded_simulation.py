@@ -52,9 +52,7 @@ F480M = load_instrument("niriss", "F480M")
 
 
 def numbers_in(header) -> dict[str, float]:
-    return {
-        str(k): float(v) for k, v in dict(header).items() if isinstance(v, int | float)
-    }
+    return {str(k): float(v) for k, v in dict(header).items() if isinstance(v, int | float)}
 
 
 @pytest.mark.parametrize("preset", ["paper", "realistic", "ramps", "drifting"])
