@@ -1,75 +1,130 @@
-"""Results as columns of numbers, few for each array, to be recorded and compared."""
+"""Numbers that a result holds, each array as a few of them, to be recorded and compared.
+
+An array is kept as the logarithm of its norm, its mean and that of its scatter, and a few
+projections, all of order one: one absolute tolerance then means the same of all of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass
+from datetime import date
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.sparse import issparse
 
-from amibayes.units import FloatArray
+from amibayes.data.blocks import BlockCovariance
 
-MOST = 16
-"""Longer arrays are recorded by their size, their root mean square and some projections."""
+PASSED_OVER = frozenset({"basis", "blocks", "factors", "header", "journal", "path", "source"})
+"""Fields whose signs are arbitrary, that tell of the machine, or that other fields repeat."""
 
-PROJECTIONS = 5
-NEGLIGIBLE = 1e-9
-"""Parts of an array's largest number below which a number is rounding, and recorded as zero."""
+RAW, PROJECTIONS, TINY = 6, 4, 1e-7
+"""Arrays up to this size are kept whole; scatter below this share of the norm is rounding."""
 
 
-def columns_of(array: Any) -> FloatArray:
-    """The numbers of one array that are recorded, (n,).
+def numbers_of(
+    *, passed_over: Collection[str] = (), properties: bool = True, **things: Any
+) -> dict[str, np.ndarray]:
+    """All numbers of results, by name, ready for ``num_regression``.
 
-    Infinite and undefined numbers of a long array are counted, and projected as zeros.
+    Parameters
+    ----------
+    passed_over : collection of str
+        Fields that are not looked at.
+    properties : bool
+        Take the properties of the results too, not of what they hold.
+    **things
+        Containers, arrays, numbers, or tuples and mappings of them.
     """
-    values = np.asarray(array)
-    if np.iscomplexobj(values):
-        values = np.stack([values.real, values.imag])
-    values = values.astype(float).ravel()
+    out: dict[str, np.ndarray] = {}
+    skipped = PASSED_OVER | set(passed_over)
+    for name, thing in things.items():
+        _add(out, name, thing, skipped, properties)
+    return out
+
+
+def checker(num_regression: Any, tolerance: float = 1e-6) -> Callable[..., None]:
+    """A function that compares numbers of results with those recorded."""
+
+    def check(**things: Any) -> None:
+        numbers = numbers_of(**things)
+        num_regression.check(numbers, default_tolerance={"atol": tolerance, "rtol": 0.0})
+
+    return check
+
+
+def _add(out: dict[str, Any], name: str, thing: Any, skipped: set[str], properties: bool) -> None:
+    if thing is None or isinstance(thing, str | bytes | Path | date) or callable(thing):
+        return
+    parts = _parts(thing, skipped, properties)
+    if parts is not None:
+        for key, value in parts.items():
+            if str(key) not in skipped:
+                _add(out, f"{name}.{key}", value, skipped, False)
+        return
+    array = np.asarray(thing.toarray() if issparse(thing) else thing)
+    if array.dtype.kind in "biufc":
+        out[name] = condensed(array)
+
+
+def _parts(thing: Any, skipped: set[str], properties: bool) -> Mapping[Any, Any] | None:
+    """What a container holds, by name; None of an array or a number."""
+    if isinstance(thing, BlockCovariance):
+        return _of_covariance(thing)
+    if is_dataclass(thing):
+        names = [f.name for f in fields(thing) if not f.name.startswith("_")]
+        names += _properties(type(thing)) if properties else []
+        return {n: getattr(thing, n) for n in names if n not in skipped}
+    if isinstance(thing, Mapping):
+        return thing
+    if isinstance(thing, list | tuple) and not all(np.isscalar(x) for x in thing):
+        return dict(enumerate(thing))
+    return None
+
+
+def _of_covariance(covariance: BlockCovariance) -> dict[str, Any]:
+    """The sign of its eigenvectors, and the order of its blocks, are not looked at."""
+    there = np.cos(1.0 + np.arange(covariance.size))
+    return {
+        "variance": covariance.variance,
+        "times": covariance.dense() @ there,
+        "rank": covariance.rank,
+        "logdet": covariance.logdet(),
+        "chi2": float(np.sum(covariance.whiten(there) ** 2)),
+    }
+
+
+def _properties(kind: type) -> list[str]:
+    return sorted(
+        name
+        for name in dir(kind)
+        if not name.startswith("_")
+        and isinstance(getattr(kind, name, None), property | cached_property)
+    )
+
+
+def condensed(array: np.ndarray) -> np.ndarray:
+    """A few numbers of order one that change where any number of an array does."""
+    if np.iscomplexobj(array):
+        array = np.stack([array.real, array.imag])
+    values = np.asarray(array, dtype=float).ravel()
     finite = np.isfinite(values)
-    if len(values) > MOST:
-        n, kept = len(values), np.where(finite, values, 0.0)
-        waves = np.cos(np.outer(np.sqrt(2.0 + np.arange(PROJECTIONS)), 1.0 + np.arange(n)))
-        square = np.sqrt((kept**2).mean())
-        counts = [float(n), float(finite.sum())]
-        return np.array([*counts, square, kept.mean(), *(waves @ kept / np.sqrt(n))])
-    # Infinities cannot be compared with a tolerance.
-    values = np.where(np.isinf(values), np.sign(values) * 1e99, values)
-    largest = np.abs(values[finite]).max(initial=0.0)
-    return np.where(np.abs(values) < NEGLIGIBLE * largest, 0.0, values)
-
-
-def numbers_of(**results: Any) -> dict[str, FloatArray]:
-    """Numbers of arrays, of containers of arrays by their fields, and of mappings, by name.
-
-    Texts, functions and what else is no number are left out.
-    """
-    found: dict[str, FloatArray] = {}
-    for name, value in results.items():
-        _add(found, name, value)
-    return found
-
-
-def _add(found: dict[str, FloatArray], name: str, value: Any) -> None:
-    if issparse(value):
-        value = value.toarray()
-    if isinstance(value, Mapping):
-        for key, part in value.items():
-            _add(found, f"{name}.{key}", part)
-    elif is_dataclass(value):
-        for field in fields(value):
-            _add(found, f"{name}.{field.name}", getattr(value, field.name))
-    elif isinstance(value, tuple | list) and not _is_array(value):
-        for k, part in enumerate(value):
-            _add(found, f"{name}.{k}", part)
-    elif _is_array(value) and np.size(value):
-        found[name] = columns_of(value)
-
-
-def _is_array(value: Any) -> bool:
-    try:
-        return np.asarray(value).dtype.kind in "biufc"
-    except ValueError:  # of unequal lengths
-        return False
+    missing = float(np.cos(np.arange(len(values)))[~finite].sum()) + float((~finite).sum())
+    values = np.where(finite, values, 0.0)
+    norm = float(np.linalg.norm(values))
+    if norm < 1e-30:
+        return np.array([-99.0, len(values), missing])
+    scaled = values / norm
+    if len(values) <= RAW:
+        return np.array([np.log10(norm), missing, *scaled])
+    rest = scaled - scaled.mean()
+    scatter = float(np.linalg.norm(rest))
+    numbers = [np.log10(norm), missing, scaled.mean() * np.sqrt(len(values))]
+    if scatter < TINY:
+        return np.array([*numbers, len(values)])
+    place = np.arange(1, PROJECTIONS + 1)[:, None] + np.sqrt(2.0) * np.arange(len(values))
+    frequency = np.array([0.31, 0.77, 1.3, 2.1])[:, None]
+    return np.array([*numbers, np.log10(scatter), *(np.cos(frequency * place) @ rest / scatter)])

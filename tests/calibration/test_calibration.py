@@ -23,6 +23,7 @@ from amibayes.calibration.weighted import clipped, weighted_response
 from amibayes.data.closure import canonical, closure_matrix, kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance
 from amibayes.data.observables import Observables, join
+from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import read_oifits, write_oifits
@@ -766,3 +767,62 @@ def test_reader_is_told_of_a_calibrator_that_calibrates_nothing() -> None:
     (said,) = unused_calibrators(found, ["F430M"])
     assert said.startswith("calibrator F430M is not used: no baseline at the same wavelength")
     assert unused_calibrators(found, []) == unused_calibrators(None, ["F430M"]) == []
+
+
+def test_filters_of_one_instrument_are_told_apart() -> None:
+    """Two exposures with the same stations and name, in bands that differ by a tenth."""
+    first = niriss()
+    wavelength = 1.1 * first.setups[0].wavelength_m
+    other = replace(
+        first,
+        vis2=replace(first.vis2, wavelength_m=1.1 * first.vis2.wavelength_m),
+        closure_phase=replace(
+            first.closure_phase, wavelength_m=1.1 * first.closure_phase.wavelength_m
+        ),
+        setups=(replace(first.setups[0], wavelength_m=wavelength, source="other"),),
+    )
+    keys = keys_of(join([first, other]))
+    assert len(keys) == 2 * len(first.data)
+    assert match(other, keys).key.min() >= 0
+    np.testing.assert_array_equal(
+        np.sort(match(join([first, other]), keys).key), np.arange(len(keys))
+    )
+
+
+def test_stations_are_matched_by_place_where_some_are_missing() -> None:
+    """Other names, another order, and two holes less: their places have another mean."""
+    target = niriss()
+    order = np.random.default_rng(4).permutation(7)
+    new = np.argsort(order)
+    setup = replace(
+        target.setups[0],
+        stations=tuple("ABCDEFG"),
+        station_xyz_m=None,
+        station_diameter_m=None,
+    )
+    moved = replace(
+        target,
+        vis2=replace(target.vis2, stations=new[target.vis2.stations]),
+        closure_phase=replace(target.closure_phase, stations=new[target.closure_phase.stations]),
+        setups=(setup,),
+    )
+    keep = [~np.isin(m.stations, (1, 4)).any(axis=1) for m in (moved.vis2, moved.closure_phase)]
+    part = moved.select(*keep)
+    keys = keys_of(target)
+    found = match(part, keys)
+    np.testing.assert_array_equal(found.key, np.flatnonzero(np.concatenate(keep)))
+
+
+def test_methods_of_extraction_are_named_in_order() -> None:
+    """Names come from a set, whose own order changes from run to run."""
+    names = ("unique", "square", "gauss", "fft", "matched", "fringes", "other", "another")
+    lattice = np.zeros((7, 7, 11, 11), dtype=np.complex64)
+
+    def extracted(method: str, k: int) -> Observables:
+        response = OffAxisResponse(lattice, np.eye(2), np.zeros(2), True, method)
+        sheet = simulated(niriss(), [100.0, 50.0, 0.01], np.random.default_rng(k))
+        return replace(sheet, setups=(replace(sheet.setups[0], response=response, source=f"{k}"),))
+
+    calibrator = join([extracted(name, k) for k, name in enumerate(names)])
+    with pytest.raises(DataError, match=f"extracted by {', '.join(sorted(names))}, the target"):
+        calibrate(extracted("fringes", 99), [calibrator])

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import niriss
+from scipy.sparse import csr_array
 
 from amibayes.calibration import calibrate
+from amibayes.calibration.narrowing import narrowed
+from amibayes.calibration.transfer import Transfer
 from amibayes.data.observables import Observables
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.units import FloatArray
@@ -98,3 +101,30 @@ def test_nothing_is_told_by_one_calibrator() -> None:
     change = template(4.0)
     found = calibrate([star(change, 0, 0.0)], [star(0.5 * change, 1, 0.0)], method="weighted")
     assert found.told is None
+
+
+@pytest.mark.parametrize("n_stars", [2, 3])
+def test_errors_of_constants_grow_as_the_calibrators_scatter(n_stars: int) -> None:
+    """Against least squares of all data at once, with the response of every datum free."""
+    rng = np.random.default_rng(n_stars)
+    n, n_constants = 4, 2
+    sigma = rng.uniform(0.5, 1.5, (n_stars, n))
+    changes = rng.normal(size=(n_stars, n, n_constants)) * 6.0
+    values = rng.normal(size=(n_stars, n)) * 5.0
+    names = ("one", "other")
+    stars = [
+        Transfer(v, csr_array(np.diag(s**2)), np.ones(n, bool), shared=SharedErrors(names, c))
+        for v, s, c in zip(values, sigma, changes, strict=True)
+    ]
+    found = narrowed(stars)
+    assert found is not None
+    columns = np.concatenate([np.tile(np.eye(n), (n_stars, 1)), np.concatenate(changes)], axis=1)
+    white = columns / sigma.ravel()[:, None]
+    best = np.linalg.lstsq(white, values.ravel() / sigma.ravel(), rcond=None)[0]
+    left = np.sum((values.ravel() / sigma.ravel() - white @ best) ** 2)
+    scale = left / (n * n_stars - n - n_constants)
+    assert scale > 2.0
+    free = np.linalg.inv(white.T @ white)[n:, n:] * scale
+    expected = np.linalg.inv(np.linalg.inv(free) + np.eye(n_constants))
+    np.testing.assert_allclose(found.root @ found.root.T, expected, rtol=1e-9)
+    np.testing.assert_allclose(found.mean, expected @ np.linalg.solve(free, best[n:]), rtol=1e-9)

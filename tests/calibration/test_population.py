@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drifting_visits import Drift, visits
+from scipy.sparse import csr_array
 
 from amibayes.calibration import calibrate
-from amibayes.calibration.population import components, inflation, predict
+from amibayes.calibration.matching import keys_of
+from amibayes.calibration.population import components, inflation, population_response, predict
+from amibayes.calibration.transfer import Transfer
+from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 
 Q = 20
@@ -124,3 +128,26 @@ def test_likelihoods_beyond_the_range_of_numbers_predict_as_well() -> None:
     made = predict(components(data, noise), data, noise, days, 1.5)
     assert np.isfinite(made.mean).all()
     assert made.mean @ mode == pytest.approx(5.0 * np.cos(0.5), abs=1e-2)
+
+
+def test_medians_of_covariances_that_are_none_are_mended() -> None:
+    """Each of three kinds of calibrators is sound; the median of their entries is not."""
+    rng = np.random.default_rng(3)
+    keys = keys_of(
+        point_source(
+            [(0.0, 0.0), (3.0, 1.0), (-1.0, 4.0)], [4e-6], [1e-7], vis2_error=0.1,
+            closure_error_rad=0.1,
+        ).only(["vis2"])
+    )  # fmt: skip
+    kinds = []
+    for one, two, three in ((0.9, 0.9, 0.8), (0.9, 0.0, 0.0), (0.0, 0.9, 0.0)):
+        kinds.append(np.array([[1.0, one, two], [one, 1.0, three], [two, three, 1.0]]))
+    assert all(np.linalg.eigvalsh(k)[0] > 0.0 for k in kinds)
+    assert np.linalg.eigvalsh(np.median(kinds, axis=0))[0] < -0.1
+    transfers = [
+        Transfer(0.8 + 0.01 * rng.normal(size=3), csr_array(1e-4 * kinds[k % 3]), np.ones(3, bool))
+        for k in range(9)
+    ]
+    found = population_response(transfers, keys, np.arange(9.0), 4.2)
+    assert np.linalg.eigvalsh(found.covariance.toarray())[0] > 0.0
+    assert found.value == pytest.approx(0.8, abs=0.05)

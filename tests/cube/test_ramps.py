@@ -160,3 +160,17 @@ def test_read_noise_is_true_of_few_integrations_too(n: int, tmp_path: Path) -> N
             found.append(file.noise[1])
     # 128 faint pixels in each of twelve files: to 0.6 % for n = 2, photons included.
     assert np.sqrt(np.mean(found)) == pytest.approx(READ_DN, rel=0.025)
+
+
+def test_read_variance_is_known_as_well_as_stated(tmp_path: Path) -> None:
+    """Estimates of sixty files scatter as a variance of the stated degrees of freedom does."""
+    found = []
+    for k in range(60):
+        path = ramp_file(tmp_path / f"{k}_ramp.fits", np.random.default_rng([8, k]))
+        with open_cube(path) as file:
+            assert isinstance(file, RampFile)
+            found.append(file.noise[1])
+            degrees = file.noise_degrees
+    # 60 draws know their own variance to 18 %.
+    scatter = np.var(found, ddof=1) / np.mean(found) ** 2
+    assert 1.0 / 2.2 < 2.0 / scatter / degrees < 2.2

@@ -63,7 +63,7 @@ from amibayes.models.binary import BinaryModel
 
 FIELD = (110.0, 220.0)
 TRUTH = (150.0, -80.0, 0.02)
-TOLERANCE = {"rtol": 1e-4, "atol": 1e-10}
+TOLERANCE = {"rtol": 0.0, "atol": 1e-4}
 DISC = BinaryModel(diameter_mas="free")
 
 

@@ -211,3 +211,15 @@ def test_an_image_of_vis2_alone_has_no_misfit_of_phases() -> None:
     image = ab.reconstruct_image(alone, weight=30.0)
     assert np.isfinite(image.chi2_vis2)
     assert np.isnan(image.chi2_phase)
+
+
+@pytest.mark.parametrize("flux", [None, 0.3])
+def test_entropy_is_least_and_zero_at_its_default_image(flux: float | None) -> None:
+    grid = PixelGrid(7, 40.0)
+    prior, light = default_image(grid), 0.3 if flux is None else flux
+    value = REGULARISERS["entropy"](grid, flux)
+    found, gradient = value(light * prior)
+    assert found == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-12)
+    rng = np.random.default_rng(1)
+    assert all(value(light * prior * rng.uniform(0.5, 1.5, 49))[0] > 0.0 for _ in range(5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -349,3 +350,15 @@ def test_scatter_is_carried_for_every_channel(tmp_path: Path) -> None:
     assert two.scatter.shape[0] == 2 * one.scatter.shape[0]
     first = two.scatter.toarray()[: one.scatter.shape[0], : one.scatter.shape[0]]
     np.testing.assert_allclose(first, one.scatter.toarray(), rtol=1e-6, atol=1e-12)
+
+
+def test_date_is_the_mean_of_those_that_are_known(tmp_path: Path) -> None:
+    data = kernel_observables(kernel_file(tmp_path / "a.fits", frames=4))
+    mjd = np.where(np.arange(len(data.closure_phase)) % 2, np.nan, 60321.25)
+    write_kpfits(
+        tmp_path / "b.fits", replace(data, closure_phase=replace(data.closure_phase, mjd=mjd))
+    )
+    assert fits.getval(tmp_path / "b.fits", "MJD-AVG") == pytest.approx(60321.25)
+    nothing = replace(data.closure_phase, mjd=np.full(len(mjd), np.nan))
+    write_kpfits(tmp_path / "c.fits", replace(data, closure_phase=nothing))
+    assert "MJD-AVG" not in fits.getheader(tmp_path / "c.fits")

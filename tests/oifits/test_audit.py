@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
-from oi_builders import HandMade, diagonal, table
+from oi_builders import HandMade, MaskFile, diagonal, table
 
 from amibayes.data.closure import closure_matrix
 from amibayes.data.observables import Observables, join
@@ -616,3 +616,15 @@ def test_arrays_without_positions_or_sizes_are_read(
     found, whole = read_oifits(path), read_oifits(tmp_path / "a.fits")
     np.testing.assert_array_equal(found.vis2.u_m, whole.vis2.u_m)
     assert len(found.vis2) == 21
+
+
+def test_errors_are_told_before_warnings(rng: np.random.Generator, tmp_path: Path) -> None:
+    made = MaskFile(rng)
+    made.change("OI_T3", lambda x: 1e-3 * x, "T3PHIERR")
+    made.tables["OI_ARRAY"].pop("DIAMETER")
+    made.put("OI_VIS2", "VIS2DATA", made.tables["OI_VIS2"]["VIS2DATA"][1] * 5.0)
+    severities = [f.severity for f in audit(made.write(tmp_path / "a.fits")).findings]
+    assert len(set(severities)) > 1
+    n = severities.count("error")
+    assert n > 0
+    assert severities[:n] == ["error"] * n

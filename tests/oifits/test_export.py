@@ -174,3 +174,12 @@ def test_public_files(data: Path, tmp_path: Path) -> None:
             back = read_oifits(path)
             assert back.n_vis2 == observables.n_vis2
             assert back.n_closure_phases == observables.n_closure_phases
+
+
+def test_days_between_amplitudes_and_phases_are_the_most(rng: np.random.Generator) -> None:
+    """One V² of the first baseline was taken a quarter of a day later than all the rest."""
+    star = epoch(rng)
+    mjd = star.vis2.mjd.copy()
+    mjd[:2] += 0.25
+    later = replace(star, vis2=replace(star.vis2, mjd=mjd))
+    assert triple_amplitudes(later)[2] == pytest.approx(0.25)

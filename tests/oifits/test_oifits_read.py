@@ -6,6 +6,7 @@ import gzip
 import tracemalloc
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from oi_builders import HandMade, table
 
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
-from amibayes.oifits.scales import ANGLE, LENGTH, TIME
+from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME
+from amibayes.oifits.stated import _integrations
 
 DEGREE = np.pi / 180
 
@@ -612,3 +614,25 @@ def test_units_are_worth_what_astropy_says(known: dict[str, float], si: str) -> 
         if isinstance(unit, units.UnrecognizedUnit):
             unit = units.Unit(spelled.removesuffix("s"))
         assert factor == pytest.approx(unit.to(si), rel=1e-14), name
+
+
+@pytest.mark.parametrize("name", ["mas", "arcsec"])
+def test_frequencies_are_the_inverse_of_angles(name: str) -> None:
+    for form in ("{}-1", "{}^-1", "1/{}", "cycles/{}"):
+        assert FREQUENCY[form.format(name)] * ANGLE[name] == pytest.approx(1.0, rel=1e-12)
+    assert ANGLE["arcsec"] == pytest.approx(units.arcsec.to(units.rad), rel=1e-12)
+
+
+def test_correlations_that_are_no_square_matrices_are_refused(
+    made: HandMade, tmp_path: Path
+) -> None:
+    """Of which as many rows as data are there, (exposures, data, fewer)."""
+    made.more.append(fits.ImageHDU(np.zeros((1, 18, 5)), name="V2COV"))
+    with pytest.raises(DataError, match="no stack of matrices"):
+        read_oifits(made.write(tmp_path / "a.fits"))
+
+
+def test_integrations_of_several_tables_are_the_fewest() -> None:
+    """A covariance of fewer integrations is known less well."""
+    headers = [{"AMIBAYES NINT": n} for n in (40, 12, 70)] + [{}]
+    assert _integrations([SimpleNamespace(header=h) for h in headers]) == 12  # type: ignore[misc]

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.stats import sigma_clipped_stats
-from jwst_products import binary, integrations, write_product
+from jwst_products import MASK, binary, integrations, product, write_product
 
 from amibayes.instrument import load_instrument
 from amibayes.oifits import read_oifits
-from amibayes.oifits.products.fringe_fit import fit_covariance
+from amibayes.oifits.products import product_of
+from amibayes.oifits.products.fringe_fit import correlated, fit_covariance
 from amibayes.oifits.products.pointing import place_of
 from amibayes.oifits.products.repairs import CLIPPED
+from amibayes.oifits.tables import open_oifits
 from amibayes.optics import scene_image
 from amibayes.scene.sources import Scene
 from amibayes.units import MAS
@@ -95,3 +98,40 @@ def test_the_place_of_light_is_that_of_its_phases(
     # 0.02 rad of 21 baselines of 4 m and less: 0.2 mas.
     np.testing.assert_allclose(place_of(fringe, uv) / MAS, place_mas, atol=1.2)
     assert (place_of(fringe[:0], uv[:0]) == 0.0).all()
+
+
+def test_baselines_counted_from_nought_have_no_place_in_the_fit(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Holes are counted from 1; where one is not among them nothing is changed."""
+    drawn = integrations(binary(0.1, 120.0, -80.0), 0.02, 20, rng)
+    path = write_product(tmp_path / "a.fits", "ami-oi", drawn)
+    of_file = product_of(open_oifits(path))
+    assert of_file is not None
+    plain = read_oifits(path, closure_covariance="diagonal")
+    setup = plain.setups[0]
+    assert correlated(plain, of_file) is not plain
+    for first in (0, 2):
+        index = np.arange(first, first + 7)
+        moved = replace(plain, setups=(replace(setup, station_index=index),))
+        assert correlated(moved, of_file) is moved
+
+
+def test_clipping_is_part_of_the_errors_of_closure_phases(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """Without the errors of phases of baselines it is not known, and left out."""
+    drawn = integrations(binary(0.1, 120.0, -80.0), 0.02, 20, rng)
+    hdus = product("ami-oi", drawn)
+    hdus.writeto(tmp_path / "a.fits")
+    hdus["OI_VIS"].columns.del_col("VISPHIERR")
+    hdus.writeto(tmp_path / "b.fits")
+    more, less = (
+        np.sum(read_oifits(tmp_path / name).errors[1] ** 2) for name in ("a.fits", "b.fits")
+    )
+    n = len(drawn)
+    # Errors of phases of baselines, 0.02 by amplitudes near 1 and √n, on three sides of each.
+    amplitude = np.abs(binary(0.1, 120.0, -80.0))
+    each = (0.02 / amplitude) ** 2 / n
+    added = np.interp(1.0 / n, *CLIPPED) * each[MASK.triangle_baselines].sum()
+    assert more - less == pytest.approx(added, rel=0.25)

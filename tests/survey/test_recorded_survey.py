@@ -18,7 +18,7 @@ from amibayes.survey.frequency import Box, frequency_posterior
 from amibayes.survey.rows import Outcome, detection_of, row_of
 from amibayes.survey.together import suggested_box, survey_json
 
-TOLERANCE = {"rtol": 1e-6, "atol": 1e-12}
+TOLERANCE = {"rtol": 0.0, "atol": 1e-6}
 
 
 def outcomes(facts: dict[str, object] | None = None) -> list[Outcome]:
