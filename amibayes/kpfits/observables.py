@@ -7,7 +7,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import block_diag, coo_array, csr_array
 
 from amibayes.data.closure import kernel_basis
 from amibayes.data.covariance import Block, BlockCovariance, diagonal_covariance
@@ -123,7 +123,7 @@ def _averaged(file: KernelFile, frames: IntArray, independent: bool) -> Observab
     matrices = [f.matrix / len(frames) for f in found]
     estimated = all(f.carried is not None for f in found)
     freedom = stacked_freedom((basis.shape[1], f.carried) for f in found) if estimated else None
-    scatter = csr_array(block_diag([f.scatter / len(frames) for f in found]))
+    scatter = csr_array(block_diag([coo_array(f.scatter / len(frames)) for f in found]))
     stated: CovarianceKind = "given" if file.has_covariance else "diagonal"
     kind: CovarianceKind = "estimated" if estimated else stated
     if independent:
