@@ -123,11 +123,13 @@ def test_joined_observables_are_those_recorded(num_regression) -> None:
     whole = join(parts)
     rng = np.random.default_rng(5)
     masks = [rng.uniform(size=len(m.value)) < 0.7 for m in (whole.vis2, whole.closure_phase)]
+    tables = [whole.to_table("vis2"), whole.to_table("closure_phase")]
     flagged = whole.flagged(~masks[0], ~masks[1])
     checker(num_regression)(
         whole=whole,
         order=[p.source == "" for p in in_order(parts[::-1])],
         flagged=flagged,
+        tables=[{n: np.asarray(t[n]) for n in t.colnames} for t in tables],
         unflagged=flagged.unflagged().data,
         selected=whole.select(*masks),
         only=[whole.only(["vis2"]).covariance, whole.only(["cp"]).covariance],

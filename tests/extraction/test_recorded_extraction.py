@@ -119,3 +119,24 @@ def test_single_images_and_several_files_are_extracted_as_recorded(
         one=(one.observables.data, one.observables.covariance),
         both=[(e.observables.data, e.observables.covariance, e.frames.flux) for e in both],
     )
+
+
+def test_faint_and_migrating_images_are_extracted_as_recorded(cube: Cube, num_regression) -> None:
+    """Where noise is of second order, and where charge between pixels is taken out."""
+    rng = np.random.default_rng(2)
+    light = np.maximum(1e-3 * cube.images, 0.0)
+    noisy = rng.poisson(light) + rng.normal(0.0, 0.5, light.shape)
+    faint = replace(cube, images=noisy, error=np.sqrt(light + 0.25))
+    sampling = extract_all(cube, ExtractOptions(method="gauss"))[0].operators[0].sampling
+    flux = 3.0
+    samples = np.full(sampling.n_samples, 0.7 * flux, dtype=complex)
+    timed = replace(cube, header={"NGROUPS": 6, "TGROUP": 0.07544, "TFRAME": 0.07544})
+    weak = extract_all(faint, ExtractOptions(method="gauss", keep_all=True, clip=9.0))[0]
+    moved = extract_all(timed, ExtractOptions(charge_migration=4e-7))[0]
+    checker(num_regression, 1e-4)(
+        weak=(weak.observables.data, weak.observables.covariance, weak.physical),
+        moved=(moved.observables.data, moved.observables.covariance),
+        squares=sampling.squares(flux, samples, np.linspace(1.0, 2.0, len(sampling.linear))),
+        shared=moved.observables.shared,
+        charge=moved.charge.migration,
+    )

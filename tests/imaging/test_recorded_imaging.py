@@ -17,7 +17,7 @@ from scenes import disc, observed
 import amibayes as ab
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
-from amibayes.imaging.choice import as_good, p_fit
+from amibayes.imaging.choice import as_good, cross_validated, largest_that_fits, p_fit
 from amibayes.imaging.data_term import DataTerm
 from amibayes.imaging.field import choose_grid, default_field, repetition_mas
 from amibayes.imaging.folds import folds_of
@@ -101,3 +101,16 @@ def test_images_are_those_recorded(data: Observables, num_regression) -> None:
         counts=(found.n_vis2, found.n_phases, found.n_independent, len(warnings_of(found))),
         beside=found.beside_star,
     )
+
+
+def test_weights_are_chosen_as_recorded(
+    data: Observables, monkeypatch: pytest.MonkeyPatch, num_regression
+) -> None:
+    """Two strong weights, whose images are well defined."""
+    monkeypatch.setattr("amibayes.imaging.choice.WEIGHTS", (3000.0, 300.0))
+    samples, grid = uv_points_of(data), PixelGrid(5, 70.0)
+    problem = Problem(pixel_response(samples, grid), grid, REGULARISERS["tv"](grid), True)
+    term = DataTerm.of(data, samples)
+    table = cross_validated(problem, data, samples, np.random.default_rng(8), None)
+    weight, _ = largest_that_fits(problem, term, table)
+    checker(num_regression, 2e-3)(table=table, weight=weight)

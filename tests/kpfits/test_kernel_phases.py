@@ -21,6 +21,7 @@ from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
 from amibayes.kpfits.audit import audit_kpfits
+from amibayes.kpfits.file import open_kpfits
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.rings import make_rings
 
@@ -362,3 +363,13 @@ def test_date_is_the_mean_of_those_that_are_known(tmp_path: Path) -> None:
     nothing = replace(data.closure_phase, mjd=np.full(len(mjd), np.nan))
     write_kpfits(tmp_path / "c.fits", replace(data, closure_phase=nothing))
     assert "MJD-AVG" not in fits.getheader(tmp_path / "c.fits")
+
+
+def test_instrument_is_named_by_the_first_keyword_that_does(tmp_path: Path) -> None:
+    path = kernel_file(tmp_path / "a.fits")
+    names = []
+    for changes in ({}, {"INSTRUME": "", "CURRINST": "NIRC2"}, {"CURRINST": ""}):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].header.update(changes)
+        names.append(open_kpfits(path).instrument)
+    assert names == ["NIRISS_F480M", "NIRC2_F480M", "KPFITS_F480M"]

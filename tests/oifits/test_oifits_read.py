@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import tracemalloc
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,8 +17,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oi_builders import HandMade, table
 
+from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
+from amibayes.oifits.correlations import shared_baseline_sign
 from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME
 from amibayes.oifits.stated import _integrations
 
@@ -636,3 +639,15 @@ def test_integrations_of_several_tables_are_the_fewest() -> None:
     """A covariance of fewer integrations is known less well."""
     headers = [{"AMIBAYES NINT": n} for n in (40, 12, 70)] + [{}]
     assert _integrations([SimpleNamespace(header=h) for h in headers]) == 12  # type: ignore[misc]
+
+
+def test_sign_of_a_shared_baseline_is_that_of_its_direction() -> None:
+    stations = [(0, 1, 2), (0, 1, 3), (1, 0, 4), (3, 4, 5), (2, 6, 0)]
+    phases = point_source(
+        np.random.default_rng(1).normal(size=(7, 2)), [2e-6], [1e-8], vis2_error=0.1,
+        closure_error_rad=0.1,
+    ).closure_phase.select(np.arange(5))  # fmt: skip
+    phases = replace(phases, stations=np.array(stations))
+    found = shared_baseline_sign(phases, np.array([0, 0, 0, 0]), np.array([1, 2, 3, 4]))
+    # 2 → 0 closes the first triangle; the last one goes from 0 to 2.
+    np.testing.assert_array_equal(found, [1.0, -1.0, 0.0, -1.0])

@@ -120,7 +120,7 @@ def test_sampling_is_that_recorded(num_regression) -> None:
         side=[fine_size(20, 3, 0.6), fine_size(21, 4, 1.0)],
         operator=[pixel_operator(8, 48, 3, s, r) for s, r in ((0.0, 0.0), (0.3, 0.05))],
         shifted=shifted_images(fine, 3, (8, 8), shifts),
-        lattice=lattice_images(fine, 3, (8, 8), (0.2, -0.3), 1, 1),
+        lattice=list(lattice_images(fine, 3, (8, 8), (0.2, -0.3), 1, 1)),
         transform=[pixel_transform(np.linspace(0.0, 0.6, 9), r) for r in (0.0, 0.04)],
         weights=[pixel_weights(r) for r in (0.0, 0.04)],
         weighted=interpolator(np.array([-1.0, 0.2, 0.9])),

@@ -93,6 +93,15 @@ delta_mag = 3.0
 [[disc]]
 diameter_mas = 90.0
 contrast = 0.1
+[[gaussian]]
+fwhm_mas = 70.0
+contrast = 0.07
+east_mas = 12.0
+[[image]]
+file = "a.fits"
+scale_mas = 14.0
+position_angle_deg = 20.0
+contrast = 0.03
 [[ring]]
 diameter_mas = 200.0
 width_mas = 30.0
