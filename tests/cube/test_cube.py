@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from amibayes.cube import (
     read_cube,
     write_cube,
 )
+from amibayes.cube.read import holds_light
 from amibayes.errors import DataError, RunError, UsageError
 from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS
@@ -410,3 +412,14 @@ def test_flags_have_the_names_and_bits_of_jwst(tmp_path: Path) -> None:
     assert hot.tolist() == [True, False, True, False, False]
     with pytest.raises(UsageError, match="did you mean JUMP_DET"):
         _ = read_cube(path, bad_flags=("JUMP_DETT",)).bad
+
+
+def test_a_single_usable_pixel_that_differs_is_light() -> None:
+    cube = make_cube(np.random.default_rng(1), 2)
+    even = replace(cube, images=np.full_like(cube.images, 7.0), dq=None, error=None)
+    images = even.images.copy()
+    images[1, 2, 3] = 8.0
+    assert holds_light(replace(even, images=images))
+    assert not holds_light(even)
+    one = np.where(np.arange(images.size).reshape(images.shape) == 0, 7.0, np.nan)
+    assert not holds_light(replace(even, images=one))

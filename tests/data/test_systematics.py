@@ -115,3 +115,10 @@ def test_result_has_how_much_larger_than_their_floor_errors_were_found() -> None
     first, second = systematics_json(ExtraNoise(channels=shares, floors=floors))
     assert (first["vis2_offset_times"], first["vis2_slope_times"]) == (2.0, 1.5)
     assert first["closure_phase_offset_times"] == second["vis2_offset_times"] == 1.0
+
+
+def test_floors_of_the_table_are_in_radians() -> None:
+    """One degree of MIRC-X, which its publication states, is 0.0175."""
+    (mircx,) = (one for one in table() if one.instrument == "MIRCX")
+    assert mircx.closure_phase_rad == pytest.approx(np.pi / 180.0)
+    assert (mircx.vis2, mircx.visibility) == (0.02, 0.005)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+from astropy.io import fits
 from conftest import script
 
 from amibayes.extraction import ExtractOptions
+from amibayes.extraction.reading import residual_share
 from amibayes.instrument import load_instrument
 
 # Calibrated V² and closure phase (degrees), rms: about twice what the table says. Photon
@@ -48,3 +52,17 @@ def test_geometry_as_stated_does_harm_that_the_fit_takes_back(table: ModuleType)
     fitted = table.biases(instrument, both, ExtractOptions())
     stated = table.biases(instrument, both, ExtractOptions(geometry="stated"))
     assert (stated > 10.0 * fitted).all()
+
+
+def test_share_that_fits_leave_of_an_image(tmp_path: Path) -> None:
+    """Residuals of a tenth of the image everywhere; images that are all zero say nothing more."""
+    image = np.arange(1.0, 10.0).reshape(3, 3)
+    path = tmp_path / "amilg.fits"
+    for ctrd, resid, said in (
+        (image, 0.1 * image, ", whose fits leave 10.0 % of the image"),
+        (image, None, ""),
+    ):
+        hdus = [fits.PrimaryHDU(), fits.ImageHDU(ctrd, name="CTRD")]
+        hdus += [] if resid is None else [fits.ImageHDU(resid, name="RESID")]
+        fits.HDUList(hdus).writeto(path, overwrite=True)
+        assert residual_share(str(path)) == said

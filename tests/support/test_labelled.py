@@ -22,6 +22,9 @@ def test_a_search_is_a_map_with_its_best_position() -> None:
     data = FOUND.to_xarray()
     best = data.delta_chi2_map.where(data.delta_chi2_map == data.delta_chi2_map.max(), drop=True)
     assert best.item() == pytest.approx(FOUND.bank_delta_chi2.max())
+    grid = FOUND.grid
+    for axis, at in (("east_mas", grid.east_mas), ("north_mas", grid.north_mas)):
+        assert np.abs(data[axis]).max() == pytest.approx(np.abs(at).max())
     near = data.sel(east_mas=90.0, north_mas=0.0, method="nearest")
     assert near.delta_chi2_map.item() > 0.8 * best.item()
     assert near.contrast_map.item() == pytest.approx(0.03, rel=0.2)
