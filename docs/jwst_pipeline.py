@@ -297,12 +297,14 @@ def main() -> int:
                 arguments.most,
                 arguments.again,
             )
-    for name, table in TABLES.items():
-        put_table(PAGE, table(), f"{name}: {SCRIPT}", known_answers(FILE))
+    tables = {name: table() for name, table in TABLES.items()}
     if arguments.data:
-        put_table(PAGE, public_table(arguments.data), f"public: {SCRIPT}")
+        tables["public"] = public_table(arguments.data)
     if arguments.draws:
-        put_table(PAGE, error_table(arguments.draws), f"errors: {SCRIPT}")
+        tables["errors"] = error_table(arguments.draws)
+    for name, lines in tables.items():
+        # What is recorded is of the script: all of its tables are as old as the answers.
+        put_table(PAGE, lines, f"{name}: {SCRIPT}", known_answers(FILE))
     return 0
 
 

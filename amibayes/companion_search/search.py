@@ -112,11 +112,16 @@ def search(
         joint_gain=survey.gain if bank.joint else None,
         **_solutions(likelihood, modes, aliases),
     )
-    return with_global_check(result) if check and checked is None else result
+    return with_global_check(result) if check else result
 
 
 def with_global_check(result: SearchResult) -> SearchResult:
-    """Look over the whole field with NLopt, beside the search, and take what is better."""
+    """Look over the whole field with NLopt, beside the search, and take what is better.
+
+    A result that has been checked is given back as it is.
+    """
+    if result.global_check is not None:
+        return result
     likelihood, grid, single = result.likelihood, result.grid, result.single_theta
     box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
     coarse = coarse_likelihood(likelihood, box)

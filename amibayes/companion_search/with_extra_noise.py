@@ -63,8 +63,6 @@ def search_with_noise(
     while len(tried) <= MAX_ROUNDS:
         fitted, noisy = _best_noise(likelihood, result, per_file=per_file, prior=prior)
         if _same(noise, fitted):
-            if result.global_check is not None:
-                return result, noise
             # The whole field once, with the noise that stands: what is better has its own noise.
             checked = with_global_check(result)
             if checked.modes[0].delta_chi2 <= result.modes[0].delta_chi2 + BETTER:
@@ -78,7 +76,7 @@ def search_with_noise(
     # the calibration errors that are there for certain.
     floors = noise.floors
     _, result, noise = min((t for t in tried if t[2].floors == floors), key=lambda t: t[0])
-    result = with_global_check(result) if result.global_check is None else result
+    result = with_global_check(result)
     return replace(result, warnings=(*result.warnings, NOT_CONVERGED)), noise
 
 

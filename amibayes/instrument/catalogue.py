@@ -231,6 +231,7 @@ def recognised(header: Mapping[str, Any], source: str) -> tuple[str, HeaderRules
     return stated, HeaderRules()
 
 
+@cache
 def _all_rules() -> dict[str, HeaderRules]:
     """Rules of the package's own instruments, by the names of their files."""
     return {name: _own_rules(name) for name in instrument_names()}

@@ -60,7 +60,7 @@ time."""
 
 NULL_DRAWS, FRESH_WORK = 20_000, 5e10
 """Null searches from which the threshold is known to 0.01 mag, and positions times data of those
-that are added to the ones of the search: some one second of one core."""
+that are added to the ones of the search: about a second of one core."""
 
 BOOTSTRAPS = 40
 """Resampled thresholds: their error is then known to a tenth."""
@@ -193,7 +193,8 @@ def _summarised(
     critical: CriticalContrasts,
 ) -> DetectionLimit:
     """Gather what was found on every ring."""
-    pooled = Pooled.of(critical)
+    in_errors = over_components(critical)
+    pooled = Pooled.of(critical, in_errors)
     goal = _root(test, threshold), _threshold_error(test, null)
     level = _levels(goal[0], critical.sigma)
     counts = [
@@ -211,7 +212,7 @@ def _summarised(
         contrast_50=every[:, at[1]],
         log_error=error[:, at[0]],
         log_error_50=error[:, at[1]],
-        spread=_spread(critical),
+        spread=_spread(critical.sigma, in_errors),
         by_detection=critical.by_detection,
         ambiguous=critical.ambiguous,
         threshold=threshold,
@@ -246,14 +247,13 @@ def _threshold_error(test: Statistic, null: Significance) -> float:
     return float(np.std([_root(test, pareto_quantile(x, null.alpha)) for x in resampled]))
 
 
-def _spread(critical: CriticalContrasts) -> FloatArray:
+def _spread(sigma: FloatArray, in_errors: FloatArray) -> FloatArray:
     """Quantiles over the position angle of the limit at one position angle, (n, 3).
 
     At one position recovery depends on the contrast in units of its error there, c/σ(angle):
     a quantile of that gives every direction its own limit.
     """
-    in_errors = over_components(critical)
     wanted = np.array([COMPLETENESS])
     at = np.array([quantiles(ring, wanted) for ring in in_errors])
-    out = np.quantile(critical.sigma, SPREAD, axis=1).T * at
+    out = np.quantile(sigma, SPREAD, axis=1).T * at
     return np.where(out <= 1.0, out, np.nan)

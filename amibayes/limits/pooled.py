@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.limits.components import over_components
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.units import BoolArray, FloatArray, IntArray
 
@@ -38,10 +37,10 @@ class Pooled:
     kind: BoolArray
 
     @classmethod
-    def of(cls, critical: CriticalContrasts) -> Pooled:
-        """Take logarithms."""
+    def of(cls, critical: CriticalContrasts, in_errors: FloatArray) -> Pooled:
+        """Take logarithms of what `amibayes.limits.components.over_components` gives."""
         typical = np.median(critical.sigma, axis=1)
-        values = over_components(critical) * (critical.sigma / typical[:, None])[..., None, None]
+        values = in_errors * (critical.sigma / typical[:, None])[..., None, None]
         merged = np.maximum(values, FAINTEST).reshape(len(values), -1, values.shape[3])
         return cls(np.log(merged), np.log(typical), critical.by_detection)
 

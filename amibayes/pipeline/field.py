@@ -246,7 +246,7 @@ def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult
         return search_robust(likelihood, field, free_scale=free, per_file=apart, prior=prior)
     if options.extra_noise or options.channel_noise or prior.floors:
         return search_with_noise(likelihood, field, per_file=apart, prior=prior, first=first)
-    return first if first.global_check is not None else with_global_check(first), ExtraNoise()
+    return with_global_check(first), ExtraNoise()
 
 
 def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:

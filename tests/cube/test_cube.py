@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
+from flagged_cube import make_cube
 
 from amibayes.cube import (
     DO_NOT_USE,
@@ -23,25 +24,7 @@ from amibayes.cube import (
 )
 from amibayes.cube.read import holds_light
 from amibayes.errors import DataError, RunError, UsageError
-from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS
-
-
-def make_cube(rng: np.random.Generator, n: int = 5, size: int = 8) -> Cube:
-    images = rng.normal(100.0, 3.0, (n, size, size + 2)).astype(np.float32)
-    dq = rng.integers(0, 2, images.shape).astype(np.uint32) * np.uint32(2**31 + 4)
-    return Cube(
-        images=images,
-        pixel_scale_rad=65.6 * MAS,
-        instrument="NIRISS",
-        filter="F430M",
-        orientation=Orientation(123.4 * DEGREE, -1),
-        error=np.abs(images) / 10.0,
-        dq=dq,
-        integration_time_s=1.05616,
-        mjd=60000.0 + np.arange(n) / 1e4,
-        header={"NGROUPS": 14, "PUPIL": "MASK_NRM", "V3I_YANG": 0.57, "TARGPROP": "AB-DOR"},
-    )
 
 
 def test_what_is_written_is_read(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -315,7 +298,7 @@ def test_unfit_headers_are_one_line(tmp_path: Path, keys: Any, message: str) -> 
 
 def test_damaged_files_are_one_line(tmp_path: Path, rng: np.random.Generator) -> None:
     whole = tmp_path / "whole.fits"
-    write_cube(whole, make_cube(rng, size=30))
+    write_cube(whole, make_cube(rng, size=(30, 32)))
     content = whole.read_bytes()
     cut = tmp_path / "cut.fits"
     for length in (0, 100, 2880, 9000, 20000, len(content) - 2880):

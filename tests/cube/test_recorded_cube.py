@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from flagged_cube import make_cube
 from recorded_numbers import checker
 
-from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, Cube, open_cube, read_cube, write_cube
+from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, open_cube, read_cube, write_cube
 from amibayes.cube.container import flag_bits
 from amibayes.cube.header import pixel_scale_of, wcs_matrix
 from amibayes.cube.ramps import SlopeWeights, median_of_variance
 from amibayes.cube.reference_files import Linearity, as_read
 from amibayes.cube.timing import GroupTiming, timing_of
 from amibayes.cube.write import int_times
-from amibayes.scene.orientation import Orientation
-from amibayes.units import DEGREE, MAS
 
 SHAPE = (6, 7, 9, 10)
 
@@ -94,26 +93,14 @@ def test_weights_and_times_are_those_recorded(num_regression) -> None:
 def test_files_of_cubes_are_those_recorded(tmp_path: Path, num_regression) -> None:
     """What is written, read and derived of a header: orientation, scale, times, flags."""
     rng = np.random.default_rng(2)
-    images = rng.normal(100.0, 3.0, (4, 6, 7)).astype(np.float32)
-    cube = Cube(
-        images=images,
-        pixel_scale_rad=65.6 * MAS,
-        instrument="NIRISS",
-        filter="F430M",
-        orientation=Orientation(123.4 * DEGREE, -1),
-        error=np.abs(images) / 10.0,
-        dq=rng.integers(0, 2, images.shape).astype(np.uint32) * np.uint32(2**31 + 4),
-        integration_time_s=1.05616,
-        mjd=60000.0 + np.arange(4) / 1e4,
-        header={"NGROUPS": 14, "TARGPROP": "AB-DOR"},
-    )
+    cube = replace(make_cube(rng, 4, (6, 7)), header={"NGROUPS": 14, "TARGPROP": "AB-DOR"})
     path = tmp_path / "a_calints.fits"
     write_cube(path, cube)
     back = read_cube(path)
     plain = tmp_path / "plain.fits"
     header = {"CD1_1": -1.8e-5, "CD1_2": 3e-6, "CD2_1": 2.9e-6, "CD2_2": 1.81e-5, "PIXELSCL": 0.065,
               "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}  # fmt: skip
-    hdu = fits.PrimaryHDU(images)
+    hdu = fits.PrimaryHDU(cube.images)
     hdu.header.update(header)
     hdu.writeto(plain)
     with fits.open(path) as hdus:

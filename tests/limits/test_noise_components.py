@@ -119,4 +119,4 @@ def test_components_of_a_ring_are_one_of_each_part_of_the_normal_law() -> None:
     np.testing.assert_array_equal(np.floor(level), np.arange(20)[:, None] * np.ones(6))
     assert found.width.mean() == pytest.approx(1.0, abs=0.1)
     assert 0.05 < found.width.std() < 0.25
-    assert isinstance(Pooled.of(found), Pooled)
+    assert isinstance(Pooled.of(found, over_components(found)), Pooled)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from amibayes.limits.components import over_components
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.limits.pooled import Pooled, quantiles
 
@@ -53,5 +54,5 @@ def test_contrasts_are_those_of_the_injections_where_places_are_alike() -> None:
     critical = CriticalContrasts(
         located, located, sigma, still, still, np.zeros(2), np.zeros(2, dtype=bool)
     )
-    found = Pooled.of(critical).contrast(SHARES)[0]
+    found = Pooled.of(critical, over_components(critical)).contrast(SHARES)[0]
     np.testing.assert_allclose(found[0], np.quantile(located[0], SHARES), rtol=5e-3)
