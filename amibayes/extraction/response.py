@@ -15,7 +15,7 @@ from scipy.ndimage import spline_filter1d
 
 from amibayes.data.off_axis_response import OffAxisResponse, bspline_weights
 from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
-from amibayes.extraction.fourier.sampling import Sampling
+from amibayes.extraction.fourier.sampling import Sampling, split
 from amibayes.extraction.image_plane import FringeModel, fringe_sampling, weighted_fit
 from amibayes.extraction.view import View
 from amibayes.instrument import Instrument
@@ -75,13 +75,12 @@ def off_axis_response(
     step = max(int(fringe / (NODES_PER_FRINGE * cell)), 1)
     half = int(FARTHEST * view.instrument.field_rad / (step * cell))
     axis = step * cell * np.arange(-half, half + 1)
-    parts = [sampling.apply(i.reshape(len(i), -1)) for i in star.on_lattice(step, half)]
-    flux, samples = (np.concatenate(each) for each in zip(*parts, strict=True))
-    x, y = (a.ravel() for a in np.meshgrid(axis, axis, indexing="ij"))
-    turns = view.uv_m @ np.stack([x, y]) / view.wavelength_m
-    ratio = np.vstack([flux, sampling.fringes(samples).T * np.exp(2j * np.pi * turns)])
-    ratio /= ratio[:, [len(x) // 2]]
-    spline = _interpolating(ratio.reshape(-1, len(axis), len(axis)))
+    seen = star.on_lattice(sampling.for_fringes, step, half)
+    flux, fringes = split(seen.reshape(len(seen), -1).T)
+    ratio = np.concatenate([flux[None], fringes.T]).reshape(-1, *seen.shape[1:])
+    x, y = np.exp(2j * np.pi / view.wavelength_m * np.multiply.outer(view.uv_m.T, axis))
+    ratio[1:] *= x[:, :, None] * y[:, None, :]
+    spline = _interpolating(ratio / ratio[:, half, half, None, None])
     n = view.instrument.mask.n_holes
     between = np.empty((n, n, *spline.shape[1:]), dtype=np.complex64)
     between[np.arange(n), np.arange(n)] = spline[0]
@@ -117,19 +116,12 @@ def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray)
     angle = 2.0 * np.pi * np.arange(NEAR_ANGLES) / NEAR_ANGLES
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     place = reach * np.concatenate([np.zeros((1, 2)), *(r * ring for r in NEAR_RADII)])
-    flux, samples = _measured(star, sampling, place)
+    images = star.moved(place).astype(float)
+    flux, fringes = split(images.reshape(len(images), -1) @ sampling.for_fringes)
     turn = np.exp(2j * np.pi * place @ star.view.frequency_px.T)
-    seen = sampling.fringes(samples) * turn / flux[:, None]
+    seen = fringes * turn / flux[:, None]
     found = np.linalg.lstsq(_monomials(place / reach), seen, rcond=None)[0]
     return np.asarray(_monomials(shift_px / reach) @ found)
-
-
-def _measured(
-    star: FineImage, sampling: Sampling, place_px: FloatArray
-) -> tuple[FloatArray, ComplexArray]:
-    """Flux and samples of the star at places (n, 2) from the centre."""
-    images = star.moved(place_px).astype(float)
-    return sampling.apply(images.reshape(len(images), -1))
 
 
 def _monomials(place: FloatArray) -> FloatArray:

@@ -10,11 +10,11 @@ another such matrix.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.fft import irfft, next_fast_len, rfft
 
 from amibayes.units import FloatArray, IntArray, SingleArray
 
@@ -26,9 +26,6 @@ MAX_FREQUENCY = 0.15
 
 _KAISER_BETA = 17.7
 """Errors below 1e-8 up to the largest frequency, for this width."""
-
-LATTICE_IMAGES = 64
-"""Of a lattice, about so many images are given at a time."""
 
 _NODES = 8
 """Gauss–Legendre nodes across a pixel; the mask's fringes turn by 1.5 rad at most."""
@@ -97,42 +94,56 @@ def shifted_images(
     return out
 
 
-def lattice_images(
+def lattice_products(
     fine: SingleArray,
     oversample: int,
-    shape: tuple[int, int],
+    operator: SingleArray,
     centre_px: tuple[float, float],
     step: int,
     half: int,
-) -> Iterator[SingleArray]:
-    """Yield images (n, n_y, n_x) of fine cells displaced to a square lattice of places.
+) -> SingleArray:
+    """Products of an operator and images of fine cells displaced to a square lattice of places.
 
-    The places are ``centre_px`` (x, y) and up to ``half`` times ``step`` cells to either side,
-    (2·half + 1)² in all, x outside and y within. Displacements by whole cells share one
-    interpolation, so that an image is a choice of pixels.
+    The places are ``centre_px`` (x, y) and up to ``half`` times ``step`` cells to either side.
+    Displacements by whole cells share one interpolation; those a whole number of pixels apart
+    are a correlation, along x by the Fourier transform.
+
+    Parameters
+    ----------
+    fine : (n, n) array
+    oversample : int
+        Cells per pixel and axis.
+    operator : (m, n_y, n_x) array
+        Images times this, summed over their pixels, are the products.
+    centre_px : (x, y)
+    step, half : int
+
+    Returns
+    -------
+    (m, 2·half + 1, 2·half + 1) array
+        The place along x, then along y.
     """
-    starts, kernels = zip(
-        *(
-            _kernels(n, size, oversample, np.array([c]))
-            for n, size, c in zip(shape, fine.shape, centre_px[::-1], strict=True)
-        ),
-        strict=True,
+    _, n_y, n_x = operator.shape
+    (first_y, up), (first_x, across) = (
+        _kernels(n, size, oversample, np.array([c]))
+        for n, size, c in zip((n_y, n_x), fine.shape, centre_px[::-1], strict=True)
     )
     pixels = fine
-    for kernel in kernels:
+    for kernel in (up, across):
         along_first = sliding_window_view(pixels, kernel.shape[1], axis=0) @ kernel[0]
         pixels = np.ascontiguousarray(along_first.T)
-    # Cells a whole number of pixels apart are laid side by side: rows of images are copied whole.
-    padded = np.pad(pixels, [(0, -n % oversample) for n in pixels.shape])
-    phases = padded.reshape(len(padded) // oversample, oversample, -1, oversample)
-    apart = np.ascontiguousarray(phases.transpose(1, 3, 0, 2))
-    windows = sliding_window_view(apart, shape, axis=(2, 3))
     to_side = step * np.arange(half, -half - 1, -1)
-    (y, own_y), (x, own_x) = (np.divmod(first + to_side, oversample) for first in starts)
-    at_once = max(LATTICE_IMAGES // len(to_side), 1)
-    for k in range(0, len(to_side), at_once):
-        part = slice(k, k + at_once), None
-        yield windows[own_y, own_x[part], y, x[part]].reshape(-1, *shape)
+    rows = first_y + to_side + oversample * np.arange(n_y)[:, None]
+    (place, phase), n = np.divmod(first_x + to_side, oversample), len(to_side)
+    size = next_fast_len(int(place.max()) + n_x, real=True)
+    waves = rfft(operator, size, axis=2).conj().transpose(2, 0, 1)
+    out = np.empty((len(operator), n, n), np.float32)
+    for own in np.unique(phase):
+        there = phase == own
+        light = rfft(pixels[:, own::oversample][:, :size], size, axis=1)
+        products = irfft(waves @ light.T[:, rows], size, axis=0)
+        out[:, there] = products[place[there]].transpose(1, 0, 2)
+    return out
 
 
 def _kernels(

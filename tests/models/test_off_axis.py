@@ -18,7 +18,7 @@ from amibayes.models.binary import BinaryModel
 from amibayes.models.companion import point_visibility
 from amibayes.models.off_axis import OffAxis
 from amibayes.oifits import read_oifits, write_oifits
-from amibayes.optics.sampling import lattice_images, shifted_images
+from amibayes.optics.sampling import lattice_products, shifted_images
 from amibayes.units import MAS
 
 STEP_MAS = 40.0
@@ -67,16 +67,18 @@ def test_no_places_have_no_response(rng: np.random.Generator) -> None:
     assert fringe.shape[1] == flux.shape[1] == 0
 
 
-def test_lattice_images_are_shifted_images(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_lattice_products_are_those_of_shifted_images(rng: np.random.Generator, step: int) -> None:
     """Of cells that hold no frequency beyond what the interpolation is made for."""
     grid = np.hypot(*np.meshgrid(np.arange(150) - 70.3, np.arange(156) - 80.1))
     cells = np.exp(-0.5 * (grid / 6.0) ** 2).astype(np.float32)
-    parts = list(lattice_images(cells, 3, (20, 18), (0.3, -0.2), 2, 4))
-    assert len(parts) > 1
-    side = (np.arange(9) - 4) * 2 / 3
+    operator = rng.normal(size=(5, 20, 18)).astype(np.float32)
+    found = lattice_products(cells, 3, operator, (0.3, -0.2), step, 4)
+    side = (np.arange(9) - 4) * step / 3
     places = np.array([(0.3 + x, -0.2 + y) for x in side for y in side])
-    expected = shifted_images(cells, 3, (20, 18), places)
-    np.testing.assert_allclose(np.concatenate(parts), expected, atol=2e-6 * expected.max())
+    images = shifted_images(cells, 3, (20, 18), places)
+    expected = np.einsum("pyx,nyx->pn", operator, images.astype(float)).reshape(5, 9, 9)
+    np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
 
 
 def test_centre_is_where_the_phases_have_no_slope(rng: np.random.Generator) -> None:

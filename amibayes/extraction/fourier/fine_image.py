@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from amibayes.extraction.view import View
 from amibayes.optics import fringe_image
-from amibayes.optics.sampling import fine_sampling, fine_size, lattice_images, shifted_images
+from amibayes.optics.sampling import fine_sampling, fine_size, lattice_products, shifted_images
 from amibayes.units import FloatArray, SingleArray
 
 COARSER = 0.75
@@ -32,10 +31,11 @@ class FineImage:
         places = by_px + np.array(self.view.centre_px)
         return shifted_images(self.cells, self.oversample, self.view.shape, places)
 
-    def on_lattice(self, step: int, half: int) -> Iterator[SingleArray]:
-        """Yield `lattice_images` of the view about its centre."""
+    def on_lattice(self, operator: FloatArray, step: int, half: int) -> SingleArray:
+        """`lattice_products` (m, 2·half + 1, 2·half + 1) of an operator (n_pixels, m)."""
         view = self.view
-        return lattice_images(self.cells, self.oversample, view.shape, view.centre_px, step, half)
+        rows = np.ascontiguousarray(operator.T, dtype=np.float32).reshape(-1, *view.shape)
+        return lattice_products(self.cells, self.oversample, rows, view.centre_px, step, half)
 
 
 def fine_image(view: View, coefficients: FloatArray, reach_px: float | None = None) -> FineImage:

@@ -52,6 +52,10 @@ class Sampling(Protocol):
     def fringes(self, samples: ComplexArray) -> ComplexArray:
         """One number per baseline, (n, n_baselines): V·flux, summed with the phases kept."""
 
+    @property
+    def for_fringes(self) -> FloatArray:
+        """(n_pixels, 1 + 2·n_baselines): images times this are flux and `fringes`, as `split`."""
+
     def centred(self, samples: ComplexArray, shift_px: FloatArray) -> ComplexArray:
         """Sum (n_samples,) over images, the star of each moved back by shifts (n, 2)."""
 
@@ -148,6 +152,11 @@ class OneEach:
     def fringes(self, samples: ComplexArray) -> ComplexArray:
         """The samples themselves."""
         return samples
+
+    @property
+    def for_fringes(self) -> FloatArray:
+        """The `matrix` itself."""
+        return self.matrix
 
     def centred(self, samples: ComplexArray, shift_px: FloatArray) -> ComplexArray:
         """Sum (n_samples,) over images, the star of each moved back by shifts (n, 2)."""

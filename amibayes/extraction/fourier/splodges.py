@@ -121,6 +121,14 @@ class Splodges:
         return np.asarray(np.einsum("nbk,bk->nb", self._split(samples), self._reference))
 
     @cached_property
+    def for_fringes(self) -> FloatArray:
+        """(n_pixels, 1 + 2·n_baselines): images times this are flux and `fringes`, as `split`."""
+        weight = self._reference.reshape(self._factor.shape)
+        # The imaginary part is the real one of −i times it.
+        rows = [self.linear.T[:1], self._pulled(weight), self._pulled(-1j * weight)]
+        return np.concatenate(rows).T
+
+    @cached_property
     def _points(self) -> ComplexArray:
         """Waves (k·k, m·m) from the cells of a patch to the points of its image.
 
