@@ -247,8 +247,7 @@ def global_check(
     many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
     ``coarse``, the same data or those with their channels averaged.
     """
-    residuals = bank.reduce(single_likelihood(coarse).residuals(single)[:, 0])
-    best_at = bank.matched_filter(residuals)
+    best_at = bank.matched_filter(single_likelihood(coarse).residuals(single)[:, 0])
 
     def inside(position: FloatArray) -> bool:
         return box.inner_mas <= math.hypot(*position) <= box.outer_mas

@@ -151,8 +151,8 @@ def _checked(
     """Global check by NLopt; of large data with their channels averaged."""
     if coarse is not likelihood:
         grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas)
+    # Combining the data for some hundred positions would take longer than it saves.
     bank = TemplateBank(coarse, grid, single)
-    bank = bank.reduced(np.zeros(bank.n_data, dtype=np.intp))
     return global_check(likelihood, coarse, bank, box, single, deviance_single)
 
 
