@@ -37,7 +37,8 @@ def frames(n: int, seed: int = 1) -> Frames:
     flux = 100.0 * (1.0 + 0.01 * rng.standard_normal(n))
     fringe = rng.normal(size=(2, n, triangles)) + 5.0
     return Frames(
-        flux, 0.05 * rng.standard_normal((n, 2)), flux[:, None] ** 2 * rng.uniform(0.8, 1, (n, pairs)),
+        flux, 0.05 * rng.standard_normal((n, 2)),
+        flux[:, None] ** 2 * rng.uniform(0.8, 1.0, (n, pairs)),
         flux**2 - 3.0, fringe[0] + 1j * fringe[1], 0.1 + 0.001 * rng.standard_normal(n),
         np.arange(n), 6e4 + np.arange(n), np.zeros(n, int), np.arange(n), np.full(n, "", "U60"),
     )  # fmt: skip

@@ -218,7 +218,7 @@ def images(n: int = 40) -> tuple[Cube, FloatArray]:
 
 @pytest.mark.parametrize("method", ["fringes", "gauss"])
 def test_changes_of_observables_are_those_of_changed_images(method: str) -> None:
-    """V² and closure phases of images with charge, waves and single pixels a little more or less."""
+    """V² and closure phases where charge, waves and single pixels do a little more or less."""
     cube, _ = images()
     rng = np.random.default_rng(5)
     pixels = own(shape=(40, 40))
