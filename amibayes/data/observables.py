@@ -161,8 +161,13 @@ class Observables:
         )
 
     def with_data(self, data: FloatArray) -> Observables:
-        """The same with other values (n_data,): V², then closure phases in radians."""
-        vis2, closure = np.split(np.asarray(data), [self.n_vis2])
+        """The same with other values (n_data,): V², then closure phases in radians.
+
+        Flagged entries keep theirs.
+        """
+        vis2, closure = self.vis2.value.copy(), self.closure_phase.value.copy()
+        parts = np.split(np.asarray(data), [self.n_vis2])
+        vis2[~self.vis2.flag], closure[~self.closure_phase.flag] = parts
         return replace(
             self,
             vis2=replace(self.vis2, value=vis2),

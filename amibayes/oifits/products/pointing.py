@@ -35,11 +35,11 @@ def pointing_of(product: Product) -> FloatArray:
         np.asarray(rows.columns[name], dtype=float).reshape(len(rows), -1)
         for name in ("VISAMP", "VISPHI")
     )
-    fringe = np.nanmean(amplitude * np.exp(1j * np.radians(phase)), axis=1)
+    fringe = amplitude * np.exp(1j * np.radians(phase))
     uv = np.stack([rows.columns["UCOORD"], rows.columns["VCOORD"]], axis=1).astype(float)
     uv = uv / float(np.ravel(waves[0].columns["EFF_WAVE"])[0])
-    good = np.isfinite(fringe) & np.isfinite(uv).all(axis=1)
-    return place_of(fringe[good], uv[good])
+    good = np.isfinite(fringe).any(axis=1) & np.isfinite(uv).all(axis=1)
+    return place_of(np.nanmean(fringe[good], axis=1), uv[good])
 
 
 def place_of(fringe: FloatArray, uv: FloatArray) -> FloatArray:
