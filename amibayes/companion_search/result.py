@@ -366,7 +366,7 @@ def _errors(values: Sequence[float], covariance: FloatArray) -> tuple[float, ...
     """Errors of a `Companion` in its order, from those of east, north, contrast (3, 3)."""
     east, north, _ = values
     matrix = covariance[:2, :2]
-    rho = max(float(np.hypot(east, north)), 1e-300)
+    rho = float(np.hypot(east, north)) or np.nan  # on the star neither has a slope
     outward = np.array([east, north]) / rho
     around = np.array([north, -east]) / rho**2
     sigma = np.sqrt(np.diag(covariance))

@@ -221,8 +221,24 @@ def test_flagging_rules(rng: np.random.Generator, rule: str, vis2, closure) -> N
 
 def test_rules_that_make_no_sense(rng: np.random.Generator) -> None:
     star = noisy(rng, [1.6e-6])
-    for rule in ("vis3>1", "vis2", "vis2>much", "station=Z9", "station>H1"):
-        with pytest.raises(UsageError):
+    for rule, said in (
+        ("vis3>1", "the rule 'vis3>1' is not understood"),
+        ("vis2", "the rule 'vis2' is not understood"),
+        ("vis2>much", "the rule 'vis2>much' has no number"),
+        ("station=Z9", "the rule 'station=Z9' names no station"),
+        ("station>H1", "the rule 'station>H1' names no station"),
+    ):
+        with pytest.raises(UsageError, match=said):
             flag_by_rule(star, [rule])
-    with pytest.raises(DataError, match="nothing is left"):
+    with pytest.raises(DataError, match="nothing is left by mjd>1"):
         flag_by_rule(star, ["mjd>1"])
+    # Phases by themselves are data, and so are V².
+    left = flag_by_rule(star, ["vis2>-9", "cp_deg<-1e9"])
+    assert left.vis2.flag.all()
+    assert not left.closure_phase.flag.any()
+    left = flag_by_rule(star, ["vis2>1e9", "cp_deg>-1e9"])
+    assert left.closure_phase.flag.all()
+    assert not left.vis2.flag.any()
+    first = float(np.degrees(np.sort(star.closure_phase.value)[0]))
+    some = flag_by_rule(star, ["vis2>-9", f"cp_deg>{first}"])
+    assert 0 < some.closure_phase.flag.sum() < len(some.closure_phase)

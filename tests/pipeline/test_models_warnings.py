@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from amibayes.comparison.agreement import agreement, model_words
 from amibayes.comparison.hypotheses import FAMILIES, hypotheses
 from amibayes.comparison.verdict import candidates
 from amibayes.pipeline.models import models_warnings
@@ -28,9 +27,6 @@ def compared(stated: str, p_fit: float = 0.5, **log_z: float) -> Any:
 
 def of(statement: str) -> Any:
     return SimpleNamespace(statement=statement)
-
-
-CRESCENT = {"star": 260.0, "companion": 429.4, "ring": 499.6, "crescent": 585.8}
 
 
 @pytest.mark.parametrize(
@@ -64,58 +60,9 @@ def test_a_model_that_does_not_fit_is_warned_of() -> None:
     assert len(models_warnings(compared("ring", 1e-5), of("model rejected"))) == 1
 
 
-@pytest.mark.parametrize(
-    ("stated", "log_z", "words"),
-    [
-        ("crescent", CRESCENT, "a crescent explains the data better than a companion: ln Z +156"),
-        ("two", {"companion": 3.0, "two": 7.25},
-         "two companions explain the data better than a companion: ln Z +4.2"),
-        ("companion", {"star": 3.0, "companion": 7.25, "two": 5.0},
-         "a companion explains the data better than the star alone: ln Z +4.2"),
-        ("extended light", {"companion": 1.0, "disc": 20.0, "ring": 21.0},
-         "extended light explains the data better than a companion: ln Z +20"),
-        ("ring+companion", {"companion": 1.0, "ring__companion": 21.0},
-         "a ring and a companion explain the data better than a companion: ln Z +20"),
-        ("one or two companions", {"star": 1.0, "companion": 21.0, "two": 20.0, "ring": 0.0},
-         "one or two companions explain the data better than the star alone: ln Z +20"),
-        ("star", {"star": 1.0, "companion": 0.0},
-         "the star alone is more probable than a companion: ln Z +1.0"),
-        ("undecided", {"star": 1.0}, "the comparison of models is undecided: the odds say so"),
-        ("ring", {"ring": 1.0, "disc": 0.0}, "the odds say so"),
-    ],
-)  # fmt: skip
-def test_the_comparison_in_a_sentence(stated: str, log_z: dict[str, float], words: str) -> None:
-    assert agreement(compared(stated, **log_z)).summary == words
-
-
-@pytest.mark.parametrize(
-    ("stated", "statement", "leads"),
-    [
-        ("crescent", "companion", True),
-        ("undecided", "companion", True),
-        ("companion", "companion", False),
-        ("one or two companions", "companion", False),
-        ("two", "model rejected", True),
-        ("ring", "no companion", True),
-        ("star", "no companion", False),
-        ("undecided", "no companion", False),
-        ("crescent", "inconsistent data", False),
-    ],
-)
-def test_what_heads_the_report(stated: str, statement: str, leads: bool) -> None:
-    log_z = {"star": 0.0, "companion": 1.0, "two": 2.0, "ring": 3.0, "crescent": 4.0}
-    assert agreement(compared(stated, **log_z), of(statement)).leads is leads
-
-
 def test_no_kind_of_models_has_the_name_of_a_model() -> None:
     """Shares of a family's column overwrote those of the model of the same name."""
     models = hypotheses([*SKY_MODELS, "ring+companion", "disc+companion"])
     names = [name for name, _ in candidates(models)]
     assert len(set(names)) == len(names)
     assert set(FAMILIES.values()) & {m.name for m in models} <= {"star"}
-
-
-def test_every_model_has_words() -> None:
-    assert model_words("disc") == "a Gaussian disc"
-    assert model_words("star+ring+companion") == "a ring and a companion"
-    assert all("," not in model_words(name) for name in SKY_MODELS)
