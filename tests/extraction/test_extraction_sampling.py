@@ -9,6 +9,7 @@ import pytest
 
 from amibayes.cube import Cube
 from amibayes.extraction import METHODS, ExtractOptions, extract_all
+from amibayes.extraction.fourier.sampling import split
 from amibayes.extraction.fourier.splodges import Splodges
 from amibayes.extraction.view import View
 from amibayes.instrument import load_instrument
@@ -84,6 +85,15 @@ def test_a_star_has_unit_power_and_real_fringes(splodges: Splodges) -> None:
     _, samples = splodges.apply(splodges.star[None])
     np.testing.assert_allclose(splodges.power(samples), 1.0, rtol=1e-12)
     np.testing.assert_allclose(splodges.fringes(samples), 1.0, rtol=1e-12)
+
+
+def test_flux_and_fringes_are_products_with_one_matrix(splodges: Splodges) -> None:
+    images = images_of(splodges)
+    flux, samples = splodges.apply(images)
+    own_flux, fringes = split(images @ splodges.for_fringes)
+    np.testing.assert_allclose(own_flux, flux, rtol=1e-12)
+    expected = splodges.fringes(samples)
+    np.testing.assert_allclose(fringes, expected, atol=1e-12 * np.abs(expected).max())
 
 
 def test_stars_that_are_moved_back_add_up(splodges: Splodges) -> None:

@@ -57,7 +57,8 @@ def stations_fault(oifits: OIFits, table: OITable) -> str:
     target = np.zeros(len(table)) if ids is None else ids[:, 0]
     parts = [np.flatnonzero(target == t) for t in np.unique(target)]
     try:
-        return next((f for rows in parts if (f := station_fault(oifits, table, rows))), "")
+        fault = next((f for rows in parts if (f := station_fault(oifits, table, rows))), "")
+        return fault.removeprefix(f"{table.label} ")  # a finding says where it is by itself
     except DataError:
         return ""  # a column of another shape is a finding of its own
 
