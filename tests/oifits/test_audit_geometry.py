@@ -76,7 +76,7 @@ def test_sound_observables_are_left_alone() -> None:
 def test_sides_off_their_baselines_are_counted() -> None:
     """Of 20 triangles (two sides each, one entry of every row) three are off on one side."""
     made = data()
-    moved = changed(made, "closure_phase", [1, 4, 9], u_m=lambda u: u + [[0.0, 0.4]])
+    moved = changed(made, "closure_phase", [1, 4, 9], u_m=lambda u: u + np.array([[0.0, 0.4]]))
     (said,) = uv_against_stations(HERE, [moved])
     assert said.code == "uv-stations"
     assert said.severity == "error"

@@ -123,9 +123,9 @@ class Splodges:
     @cached_property
     def for_fringes(self) -> FloatArray:
         """(n_pixels, 1 + 2·n_baselines): images times this are flux and `fringes`, as `split`."""
-        weight = self._reference.reshape(self._factor.shape)
+        weight = self._reference.reshape(self._factor.shape).astype(complex)
         # The imaginary part is the real one of −i times it.
-        rows = [self.linear.T[:1], self._pulled(weight), self._pulled(-1j * weight)]
+        rows = [self.linear.T[:1], self._pulled(weight), self._pulled(np.asarray(-1j * weight))]
         return np.concatenate(rows).T
 
     @cached_property
