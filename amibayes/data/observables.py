@@ -122,10 +122,16 @@ class Observables:
     @cached_property
     def errors(self) -> tuple[FloatArray, FloatArray]:
         """1σ errors of V² and closure phase (radians); NaN where flagged."""
-        sigma = np.sqrt(self.covariance.variance)
-        vis2, closure = np.full(len(self.vis2), np.nan), np.full(len(self.closure_phase), np.nan)
-        vis2[~self.vis2.flag] = sigma[: self.n_vis2]
-        closure[~self.closure_phase.flag] = sigma[self.n_vis2 :]
+        flagged = np.full(len(self.vis2), np.nan), np.full(len(self.closure_phase), np.nan)
+        return self._put_in(np.sqrt(self.covariance.variance), *flagged)
+
+    def _put_in(
+        self, data: FloatArray, vis2: FloatArray, closure: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Copies of columns of V² and closure phase, with (n_data,) numbers where not flagged."""
+        vis2, closure = vis2.copy(), closure.copy()
+        parts = np.split(np.asarray(data), [self.n_vis2])
+        vis2[~self.vis2.flag], closure[~self.closure_phase.flag] = parts
         return vis2, closure
 
     def unflagged(self) -> Observables:
@@ -165,9 +171,7 @@ class Observables:
 
         Flagged entries keep theirs.
         """
-        vis2, closure = self.vis2.value.copy(), self.closure_phase.value.copy()
-        parts = np.split(np.asarray(data), [self.n_vis2])
-        vis2[~self.vis2.flag], closure[~self.closure_phase.flag] = parts
+        vis2, closure = self._put_in(data, self.vis2.value, self.closure_phase.value)
         return replace(
             self,
             vis2=replace(self.vis2, value=vis2),

@@ -140,7 +140,7 @@ def lattice_products(
     out = np.empty((len(operator), n, n), np.float32)
     for own in np.unique(phase):
         there = phase == own
-        light = rfft(pixels[:, own::oversample][:, :size], size, axis=1)
+        light = rfft(pixels[:, own::oversample], size, axis=1)
         products = irfft(waves @ light.T[:, rows], size, axis=0)
         out[:, there] = products[place[there]].transpose(1, 0, 2)
     return out

@@ -44,7 +44,7 @@ def stations_not_given(oifits: OIFits) -> Findings:
                 "error",
                 "stations",
                 table.label,
-                fault.removeprefix(f"{table.label}: "),
+                fault.removeprefix(table.label).lstrip(": "),
                 "baselines and triangles can be told apart by their (u, v) alone",
                 "number the stations by (u, v), as is done here on reading",
                 certain=True,
@@ -57,8 +57,7 @@ def stations_fault(oifits: OIFits, table: OITable) -> str:
     target = np.zeros(len(table)) if ids is None else ids[:, 0]
     parts = [np.flatnonzero(target == t) for t in np.unique(target)]
     try:
-        fault = next((f for rows in parts if (f := station_fault(oifits, table, rows))), "")
-        return fault.removeprefix(f"{table.label} ")  # a finding says where it is by itself
+        return next((f for rows in parts if (f := station_fault(oifits, table, rows))), "")
     except DataError:
         return ""  # a column of another shape is a finding of its own
 
