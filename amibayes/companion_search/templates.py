@@ -270,26 +270,33 @@ class MirroredTemplates:
 
         Below zero where neither gains; and numbers (n, m) below zero where it is the mirror
         image. Where both have templates of equal length, that is the odd part's product, and
-        half of the scores are not needed.
+        half of the scores are not needed. Each is worked on in the memory of the one before.
         """
         squares = self.norm[None] if weights is None else self._squares(weights.groups)
         here, mirrored = np.split(squares, 2, axis=1)
         equal = bool((np.abs(here - mirrored) <= EQUAL * mirrored).all())
         length = np.sqrt(here) if weights is None and equal else 1.0
         even, odd = ((x / length).astype(data.every.dtype) for x in (self.even, self.odd))
-        at_once = max(SCORES_AT_ONCE // max(here.shape[1], 1), data.every.shape[1])
+        m = here.shape[1]
+        at_once = max(SCORES_AT_ONCE // max(m, 1), data.every.shape[1])
+        # One memory for all parts: the system clears new memory of this size first.
+        memory = np.empty((3, min(at_once, len(data.every)), m), dtype=data.every.dtype)
         for part in (slice(k, k + at_once) for k in range(0, len(data.every), at_once)):
             some = None if weights is None else weights.of(part)
-            score, turned = data.even[part] @ even, data.odd[part] @ odd
-            if not equal:
-                both = [score + turned, score - turned]
-                for x, square in zip(both, (here, mirrored), strict=True):
+            score, turned, other = memory[:, : len(data.even[part])]
+            np.matmul(data.even[part], even, out=score)
+            np.matmul(data.odd[part], odd, out=turned)
+            if equal:
+                score += np.abs(turned, out=other)
+                if some is not None:
+                    score /= np.sqrt(some.of_sums(here))
+            else:
+                np.subtract(score, turned, out=other)
+                score += turned
+                for x, square in ((score, here), (other, mirrored)):
                     x /= np.sqrt(square if some is None else some.of_sums(square)).astype(x.dtype)
-                yield np.maximum(*both), both[0] - both[1]
-                continue
-            score += np.abs(turned)
-            if some is not None:
-                score /= np.sqrt(some.of_sums(here))
+                np.subtract(score, other, out=turned)
+                np.maximum(score, other, out=score)
             yield score, turned
 
 
