@@ -226,7 +226,7 @@ class TemplateBank:
         for (index, _, templates), some in zip(
             self.pieces(), self._promising(rows, weights), strict=False
         ):
-            gain, top = templates.highest(rows.at(some), weights and weights.of(some))
+            gain, top = templates.highest(rows, weights, some)
             highest.update(gain, index[top], some)
         return np.asarray(highest.score, dtype=float), highest.position
 
@@ -303,7 +303,8 @@ class TemplateBank:
         """Data sets (n_data, n) as rows."""
         # Rows one after the other, since some of them are picked out.
         rows = np.ascontiguousarray(data.T)
-        return DataRows(rows, rows[:, self._even.rows], rows[:, self._odd.rows])
+        even, odd = (rows.take(part.rows, axis=1) for part in (self._even, self._odd))
+        return DataRows(rows, even, odd)
 
     def pieces(self) -> Iterator[tuple[IntArray, FloatArray, Templates]]:
         """Yield positions (2m,), rates (2m, 2) and their templates in all bands."""

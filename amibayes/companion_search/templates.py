@@ -39,10 +39,6 @@ class DataRows:
     even: NDArray[Any]
     odd: NDArray[Any]
 
-    def at(self, which: IntArray | slice) -> DataRows:
-        """Some of the data sets."""
-        return DataRows(self.every[which], self.even[which], self.odd[which])
-
 
 Highest = tuple[NDArray[Any], IntArray]
 """Largest gain of n data sets, (n,), and at which of m positions, (n,)."""
@@ -87,8 +83,13 @@ class Templates(Protocol):
         """
         ...
 
-    def highest(self, data: DataRows, weights: GroupWeights | None = None) -> Highest:
-        """Largest gain in χ², weighted or not, of every data set."""
+    def highest(
+        self,
+        data: DataRows,
+        weights: GroupWeights | None = None,
+        which: IntArray | slice = slice(None),
+    ) -> Highest:
+        """Largest gain in χ², weighted or not, of the data sets ``which``."""
         ...
 
 
@@ -133,12 +134,17 @@ class BandTemplates:
         """Contrasts that gain most, none below zero, by coordinate descent."""
         return best_positive(match, self._shared)
 
-    def highest(self, data: DataRows, weights: GroupWeights | None = None) -> Highest:
-        """Largest gain in χ² of every data set."""
-        match = list(self.match(data))
+    def highest(
+        self,
+        data: DataRows,
+        weights: GroupWeights | None = None,
+        which: IntArray | slice = slice(None),
+    ) -> Highest:
+        """Largest gain in χ² of the data sets ``which``."""
+        match = [product[which] for product in self.match(data)]
         if weights is None:
             return highest_of(best_positive(match, self._shared)[1])
-        return highest_of(weighted_gain(weights, self._unit, match))
+        return highest_of(weighted_gain(weights.of(which), self._unit, match))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,11 +251,17 @@ class MirroredTemplates:
         norm = np.concatenate([half[k][chosen] for k in (0, 1) for half, chosen in halves])
         return cls(even, odd, first.even_rows, first.odd_rows, norm, first.basis)
 
-    def highest(self, data: DataRows, weights: GroupWeights | None = None) -> Highest:
-        """Largest gain in χ² of every data set."""
+    def highest(
+        self,
+        data: DataRows,
+        weights: GroupWeights | None = None,
+        which: IntArray | slice = slice(None),
+    ) -> Highest:
+        """Largest gain in χ² of the data sets ``which``."""
         half = self.even.shape[1]
-        found = [(np.empty(0, dtype=data.every.dtype), np.empty(0, dtype=np.intp))]
-        for score, turned in self._roots(data, weights):
+        found = [(np.empty(0, dtype=data.even.dtype), np.empty(0, dtype=np.intp))]
+        some = weights and weights.of(which)
+        for score, turned in self._roots(data.even[which], data.odd[which], some):
             root, top = highest_of(score)
             mirror = turned[np.arange(len(top)), top] < 0.0
             found.append((np.maximum(root, 0.0) ** 2, top + half * mirror))
@@ -260,11 +272,11 @@ class MirroredTemplates:
         self, data: DataRows, weights: GroupWeights | None, first: IntArray
     ) -> NDArray[Any]:
         """Roots of the largest gains within runs of positions from ``first`` (k,) on, (n, k)."""
-        roots = self._roots(data, weights)
+        roots = self._roots(data.even, data.odd, weights)
         return np.concatenate([np.maximum.reduceat(score, first, axis=1) for score, _ in roots])
 
     def _roots(
-        self, data: DataRows, weights: GroupWeights | None
+        self, by_even: NDArray[Any], by_odd: NDArray[Any], weights: GroupWeights | None
     ) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
         """Yield roots of the gains at positions or mirror images, whichever gains more, (n, m).
 
@@ -276,16 +288,16 @@ class MirroredTemplates:
         here, mirrored = np.split(squares, 2, axis=1)
         equal = bool((np.abs(here - mirrored) <= EQUAL * mirrored).all())
         length = np.sqrt(here) if weights is None and equal else 1.0
-        even, odd = ((x / length).astype(data.every.dtype) for x in (self.even, self.odd))
-        m = here.shape[1]
-        at_once = max(SCORES_AT_ONCE // max(m, 1), data.every.shape[1])
+        even, odd = ((x / length).astype(by_even.dtype) for x in (self.even, self.odd))
+        n, m = len(by_even), here.shape[1]
+        at_once = max(SCORES_AT_ONCE // max(m, 1), len(self.basis))
         # One memory for all parts: the system clears new memory of this size first.
-        memory = np.empty((3, min(at_once, len(data.every)), m), dtype=data.every.dtype)
-        for part in (slice(k, k + at_once) for k in range(0, len(data.every), at_once)):
+        memory = np.empty((3, min(at_once, n), m), dtype=by_even.dtype)
+        for part in (slice(k, k + at_once) for k in range(0, n, at_once)):
             some = None if weights is None else weights.of(part)
-            score, turned, other = memory[:, : len(data.even[part])]
-            np.matmul(data.even[part], even, out=score)
-            np.matmul(data.odd[part], odd, out=turned)
+            score, turned, other = memory[:, : len(by_even[part])]
+            np.matmul(by_even[part], even, out=score)
+            np.matmul(by_odd[part], odd, out=turned)
             if equal:
                 score += np.abs(turned, out=other)
                 if some is not None:
