@@ -197,7 +197,7 @@ class _FlatInFrequency:
 
 def instrument_names() -> list[str]:
     """Names of the instruments that come with the package."""
-    return sorted(path.stem for path in _own_folder().glob("*.toml"))
+    return list(_own_files())
 
 
 def recognised(header: Mapping[str, Any], source: str) -> tuple[str, HeaderRules]:
@@ -276,7 +276,7 @@ def load_instrument(name: str | Path, filter: str | None = None) -> Instrument:
         Where the file is wrong: it names the key and the fault.
     """
     path = _path(name)
-    own = path.parent == _own_folder()
+    own = path in _own_files().values()
     return (_remembered if own else _loaded)(path, filter)
 
 
@@ -303,14 +303,17 @@ _remembered = lru_cache(maxsize=32)(_loaded)
 """The package's own files do not change; a cube asks for its instrument several times."""
 
 
-def _own_folder() -> Path:
-    return Path(str(resources.files("amibayes.instrument") / "data"))
+@cache
+def _own_files() -> dict[str, Path]:
+    """Files of the package's own instruments by name: each cube asks for them several times."""
+    folder = Path(str(resources.files("amibayes.instrument") / "data"))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def _path(name: str | Path) -> Path:
     text = str(name)
-    if text.lower() in instrument_names():
-        return _own_folder() / f"{text.lower()}.toml"
+    if text.lower() in _own_files():
+        return _own_files()[text.lower()]
     if Path(text).suffix != ".toml" and not Path(text).exists():
         known = ", ".join(instrument_names())
         raise UsageError(
