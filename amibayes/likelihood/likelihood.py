@@ -41,6 +41,13 @@ VALUES_AT_ONCE, LEAST_SETS = 25_000, 64
 """Model values (samples × parameter sets) that are worked on at once, whose arrays
 fit a processor's cache and need no new memory; not fewer sets than repay the calls."""
 
+MEMORY_KEPT = 32_000_000
+"""Bytes. The C library gives freed arrays back to the system, which clears memory before it gives
+it out again: more than half of the time of work on arrays that just fit a cache. That of Linux
+keeps those up to the largest that it has seen freed (mallopt(3), M_MMAP_THRESHOLD, at most 32 MB),
+so it is shown one, to which nothing is written."""
+np.empty(MEMORY_KEPT, dtype=np.uint8)
+
 FAINTEST = 0.005
 """Visibility below which that of a fit is not taken for the size of a fringe: calibration errors
 alone are as large."""
