@@ -110,7 +110,8 @@ class EnsembleSampler:
             if self.path:
                 save_chain(sampler, self.path, digest)
             if self.progress:
-                expected = int(ENOUGH * longest(times(sampler)))
+                # Walkers that have not moved have no times.
+                expected = int(min(ENOUGH * longest(times(sampler)), self.max_steps))
                 self.progress(sampler.iteration, max(expected, sampler.iteration))
         return sampler
 
@@ -165,9 +166,13 @@ def thinning(sampler: emcee.EnsembleSampler) -> int:
 
 
 def times(sampler: emcee.EnsembleSampler) -> FloatArray:
-    """Integrated autocorrelation times of the second two thirds of the chain, steps, (n_dim,)."""
+    """Integrated autocorrelation times of the second two thirds of the chain, steps, (n_dim,).
+
+    NaN where a walker did not move.
+    """
     chain = sampler.get_chain()[burn_in(sampler) :]
-    return np.asarray(emcee.autocorr.integrated_time(chain, tol=0))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(emcee.autocorr.integrated_time(chain, tol=0))
 
 
 def longest(times: FloatArray) -> float:
@@ -184,10 +189,15 @@ def long_enough(sampler: emcee.EnsembleSampler) -> bool:
 
 
 def split_rhat(sampler: emcee.EnsembleSampler) -> FloatArray:
-    """Split-R̂ of the parameters, every walker's second two thirds cut in two, (n_dim,)."""
+    """Split-R̂ of the parameters, every walker's second two thirds cut in two, (n_dim,).
+
+    Infinite where no walker moved.
+    """
     chain = sampler.get_chain()[burn_in(sampler) :]
     half = len(chain) // 2
     halves = np.concatenate([chain[:half], chain[half : 2 * half]], axis=1)
     within = halves.var(axis=0, ddof=1).mean(axis=0)
     between = halves.mean(axis=0).var(axis=0, ddof=1)
-    return np.asarray(np.sqrt(((half - 1) / half * within + between) / within))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = np.sqrt((half - 1) / half + between / within)
+    return np.where(within > 0.0, found, np.inf)

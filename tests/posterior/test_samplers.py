@@ -11,6 +11,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.chain import EnsembleSampler
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.independence import GridSampler
+from amibayes.posterior.laplace import physical, sampled
 from amibayes.posterior.nested import NestedSampler
 from amibayes.posterior.priors import Prior
 from amibayes.posterior.sampler import Draws, ModelPrior, Sampler, draw_posterior
@@ -87,3 +88,23 @@ def test_same_seed_same_draws(likelihood) -> None:
             for _ in range(2)
         ]
         np.testing.assert_array_equal(both[0].samples, both[1].samples)
+
+
+def test_walkers_that_cannot_move_give_a_chain_that_is_said_not_to_have_converged(
+    likelihood,
+) -> None:
+    """No place but their own is possible: autocorrelation times are those of a constant."""
+    prior, rng = ModelPrior(PRIOR, likelihood.parameters), np.random.default_rng(8)
+    start = sampled(prior.draw(64, rng), prior.parameters)
+    possible, told = physical(start, prior.parameters)[:, 0], []
+    sampler = EnsembleSampler(
+        start=start, max_steps=1000, progress=lambda *steps: told.append(steps)
+    )
+    found = sampler.sample(
+        lambda theta: np.where(np.isin(theta[:, 0], possible), 0.0, -np.inf), prior, rng
+    )
+    assert found.diagnostics["converged"] == 0.0
+    assert found.diagnostics["autocorrelation_time"] == np.inf
+    assert found.diagnostics["split_rhat"] > 1e6
+    assert np.isin(found.samples[:, 0], possible).all()
+    assert told == [(500, 1000), (1000, 1000)]
