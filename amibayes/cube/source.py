@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -54,11 +54,31 @@ class InMemoryCube:
         )
 
 
+MOST_OPEN = 64
+"""Files that are held open together: a quarter of what systems allow a process at least."""
+
+Images = Cube | str | Path | Source
+"""A cube, its file, or that opened."""
+
+
 @contextmanager
-def opened(cube: Cube | str | Path, **header: Any) -> Iterator[Source]:
+def opened(cube: Images, **header: Any) -> Iterator[Source]:
     """Open a path, with `open_cube`'s options in place of its header, or a cube."""
     if isinstance(cube, Cube):
         yield InMemoryCube(cube)
-        return
-    with open_cube(cube, **header) as file:
-        yield file
+    elif isinstance(cube, str | Path):
+        with open_cube(cube, **header) as file:
+            yield file
+    else:
+        yield cube
+
+
+@contextmanager
+def all_opened(cubes: Sequence[Images], **header: Any) -> Iterator[Sequence[Images]]:
+    """Open files that are needed more than once; too many are left for `opened`.
+
+    Reading its headers takes as long as extracting a hundred integrations.
+    """
+    with ExitStack() as stack:
+        few = len(cubes) <= MOST_OPEN
+        yield [stack.enter_context(opened(cube, **header)) for cube in cubes] if few else cubes

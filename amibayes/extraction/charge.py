@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from amibayes.cube import Cube
 from amibayes.cube.ramps import RampFile
 from amibayes.cube.reference_files import BIAS_KEYWORD, LINEARITY_KEYWORD
-from amibayes.cube.source import Source, opened
+from amibayes.cube.source import Images, Source, opened
 from amibayes.cube.write import SHIFT_KEYWORDS
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
@@ -139,13 +138,13 @@ class _Known:
 
 
 def visit_migration(
-    cubes: Sequence[Cube | str | Path], options: ExtractOptions, header: Mapping[str, Any]
+    cubes: Sequence[Images], options: ExtractOptions, header: Mapping[str, Any]
 ) -> list[CubeMigration]:
     """Find what charge migration is taken out of each cube, one fit for all of a detector.
 
     Parameters
     ----------
-    cubes : sequence of Cube or path
+    cubes : sequence of Cube, path or Source
         Of targets and calibrators.
     options : ExtractOptions
     header : mapping
@@ -163,7 +162,7 @@ def _detector(known: _Known) -> str:
     return known.template.instrument.upper()
 
 
-def _known(cube: Cube | str | Path, options: ExtractOptions, header: Mapping[str, Any]) -> _Known:
+def _known(cube: Images, options: ExtractOptions, header: Mapping[str, Any]) -> _Known:
     with opened(cube, **header) as file:
         is_ramp = isinstance(file, RampFile)
         wanted = options.charge_migration == "fit" and isinstance(file, RampFile)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.cube import Cube
-from amibayes.cube.source import opened
+from amibayes.cube.source import Images, all_opened, opened
 from amibayes.data.covariance import Block
 from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables, join
@@ -114,12 +114,13 @@ def extract_all(
         raise DataError("no cube to extract", remedy="give at least one file")
     chosen = options or ExtractOptions()
     chosen.refuse_unused()
-    charges = visit_migration(given, chosen, header) if charges is None else charges
-    maps = visit_maps(given, chosen, header, charges) if maps is None else maps
-    parts = [
-        _measured(cube, index, chosen, header, mask_map, charge)
-        for index, (cube, mask_map, charge) in enumerate(zip(given, maps, charges, strict=True))
-    ]
+    with all_opened(given, **header) as files:
+        charges = visit_migration(files, chosen, header) if charges is None else charges
+        maps = visit_maps(files, chosen, header, charges) if maps is None else maps
+        parts = [
+            _measured(file, index, chosen, header, mask_map, charge)
+            for index, (file, mask_map, charge) in enumerate(zip(files, maps, charges, strict=True))
+        ]
     refuse_twice([Contents(p.template.source, p.template.header, (), ()) for p in parts])
     groups = exposures(parts, lambda part: part.template, one_star=one_star)
     return [_finished(_numbered(group), chosen) for group in groups]
@@ -148,7 +149,7 @@ def _numbered(parts: list[_Part]) -> list[_Part]:
 
 
 def _measured(
-    cube: Cube | str | Path,
+    cube: Images,
     index: int,
     options: ExtractOptions,
     header: dict[str, Any],

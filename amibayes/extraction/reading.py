@@ -13,6 +13,7 @@ import numpy as np
 from astropy.io import fits
 
 from amibayes.cube.header import orientation_of
+from amibayes.cube.source import all_opened
 from amibayes.data.joining import SEPARATOR
 from amibayes.data.observables import Observables
 from amibayes.data.off_axis_response import OffAxisResponse
@@ -365,8 +366,9 @@ def of_one_visit(paths: Sequence[str | Path], images: ImageOptions | None = None
     """
     chosen = images or ImageOptions()
     cubes = [str(path) for path in paths if format_of(path).read is _extracted]
-    charges = visit_migration(cubes, chosen.extraction, chosen.header)
-    maps = visit_maps(cubes, chosen.extraction, chosen.header, charges)
+    with all_opened(cubes, **chosen.header) as files:
+        charges = visit_migration(files, chosen.extraction, chosen.header)
+        maps = visit_maps(files, chosen.extraction, chosen.header, charges)
     return replace(
         chosen,
         maps=dict(zip(cubes, maps, strict=True)),

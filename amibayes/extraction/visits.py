@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from amibayes.cube import Cube
-from amibayes.cube.source import opened
+from amibayes.cube.source import Images, opened
 from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.mask_map import MapEstimate, MaskMap, combined
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import map_estimate, maps_mask
 from amibayes.extraction.table import target_of
 from amibayes.instrument import Distortion
-
-Images = Cube | str | Path
 
 SAME_PIXEL = 1e-4
 """Pixel scales of one detector agree to this: a WCS is fitted anew for every exposure."""
@@ -73,7 +70,7 @@ def visit_maps(
 
     Parameters
     ----------
-    cubes : sequence of Cube or path
+    cubes : sequence of Cube, path or Source
         Of targets and calibrators: single stars tell the map best.
     options : ExtractOptions
     header : mapping

@@ -365,6 +365,20 @@ def test_files_of_one_exposure_are_one(niriss: Instrument) -> None:
     assert len(extract_all([stars[0], stars[0]])) == 1
 
 
+def test_files_too_many_to_be_held_open_give_the_same(
+    niriss: Instrument, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = []
+    for seed, noisy in enumerate(np.split(binary_images(niriss, jittered(8), (0.0, 0.0), 0.0), 2)):
+        paths.append(tmp_path / f"{seed}.fits")
+        write_cube(paths[-1], cube_of(with_photons(noisy, seed), niriss))
+    together = extract(paths)
+    monkeypatch.setattr("amibayes.cube.source.MOST_OPEN", 1)
+    one_by_one = extract(paths)
+    np.testing.assert_array_equal(together.data, one_by_one.data)
+    assert together.n_integrations == one_by_one.n_integrations
+
+
 def test_oifits_keeps_everything(niriss: Instrument, tmp_path: Path) -> None:
     images = with_photons(binary_images(niriss, jittered(10), (90.0, 0.0), 0.05), 13)
     before = extract(cube_of(images, niriss, integration_time_s=2.0, mjd=59000.0 + np.arange(10)))
