@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from jwst_products import (
     MASK,
     as_oifits,
@@ -59,6 +60,17 @@ def test_other_files_are_no_products(tmp_path: Path, rng: np.random.Generator) -
     write_oifits(tmp_path / "b.oifits", data)
     assert read_product(as_oifits(tmp_path / "c.fits", "ami-oi", draws(rng))) is not None
     assert product_of(open_oifits(tmp_path / "b.oifits")) is None
+
+
+@pytest.mark.parametrize("name", ["OI_VIS2", "OI_T3"])
+def test_products_whose_tables_have_no_rows_are_refused(
+    name: str, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    path = made("ami-oi", tmp_path / "a.fits", rng)
+    with fits.open(path, mode="update") as hdus:
+        hdus[name].data = hdus[name].data[:0]
+    with pytest.raises(DataError, match="without one OI_VIS2 and one OI_T3 with rows"):
+        read_oifits(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)

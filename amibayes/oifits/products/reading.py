@@ -138,7 +138,7 @@ def open_products(paths: Sequence[str | Path]) -> list[Product]:
         product = product_of(open_oifits(path))
         if product is None:
             raise DataError(
-                "is a product of the jwst package without one OI_VIS2 and one OI_T3",
+                "is a product of the jwst package without one OI_VIS2 and one OI_T3 with rows",
                 source=path,
                 remedy="give the file as the pipeline wrote it",
             )

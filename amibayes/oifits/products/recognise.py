@@ -85,7 +85,7 @@ def product_of(oifits: OIFits) -> Product | None:
     by_pipeline = is_product_header(oifits.header, tuple(t.name for t in oifits.tables))
     if not by_pipeline and not any(IMPLANEIA in t.columns for t in oifits.named("OI_ARRAY")):
         return None
-    if len(oifits.named("OI_VIS2")) != 1 or len(oifits.named("OI_T3")) != 1:
+    if any([len(t) > 0 for t in oifits.named(name)] != [True] for name in ("OI_VIS2", "OI_T3")):
         return None
     if not by_pipeline:
         return Product(oifits, "amimulti-oi", 0) if _has_integrations(oifits) else None
