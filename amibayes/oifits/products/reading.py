@@ -14,7 +14,12 @@ from amibayes.errors import DataError
 from amibayes.oifits.products.fringe_fit import correlated
 from amibayes.oifits.products.integrations import averaged
 from amibayes.oifits.products.mask_map import map_of
-from amibayes.oifits.products.recognise import DATA_MODEL, Product, product_of
+from amibayes.oifits.products.recognise import (
+    DATA_MODEL,
+    Product,
+    is_product_header,
+    product_of,
+)
 from amibayes.oifits.products.repairs import Repair, repaired
 from amibayes.oifits.reader import observables_of
 from amibayes.oifits.tables import OIFits, open_oifits, plain
@@ -101,9 +106,25 @@ def read_products(products: Sequence[Product], **options: Any) -> list[Observabl
 
 
 def read_product(oifits: OIFits, **options: Any) -> Observables | None:
-    """Read a file if it is a product; None for any other."""
+    """Read a file if it is a product; None for any other.
+
+    Raises
+    ------
+    DataError
+        Where it cannot be read, or lacks V² or closure phases.
+    """
     product = product_of(oifits)
+    if product is None and is_product_header(oifits.header, tuple(t.name for t in oifits.tables)):
+        raise _incomplete(oifits.path)
     return None if product is None else read_products([product], **options)[0]
+
+
+def _incomplete(path: str | Path) -> DataError:
+    return DataError(
+        "is a product of the jwst package without one OI_VIS2 and one OI_T3 with rows",
+        source=path,
+        remedy="give the file as the pipeline wrote it",
+    )
 
 
 KEPT = ("ORIGIN", "TELESCOP", "INSTRUME", "FILTER", "OBJECT", "OBSERVER", "DATE-OBS", "INSMODE")
@@ -137,11 +158,7 @@ def open_products(paths: Sequence[str | Path]) -> list[Product]:
     for path in paths:
         product = product_of(open_oifits(path))
         if product is None:
-            raise DataError(
-                "is a product of the jwst package without one OI_VIS2 and one OI_T3 with rows",
-                source=path,
-                remedy="give the file as the pipeline wrote it",
-            )
+            raise _incomplete(path)
         found.append(product)
     return found
 
