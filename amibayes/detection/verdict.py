@@ -96,7 +96,7 @@ def verdict(
     compared : bool
         Whether models of the sky are compared too.
     alone : (Likelihood, (n_nuisance,) float array), optional
-        The star alone as `star_alone` gives it: without a companion it has to fit.
+        As `star_alone` gives it: without a companion it has to fit.
 
     Notes
     -----
@@ -121,17 +121,21 @@ def verdict(
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
-        note, data = note_of(result, compared=compared), result.likelihood.observables
-        if not note and within_calibration(data, change_by_companion(result)):
-            note = SMALL
-        left += f"; but {note}" if note else ""
-        return Verdict("companion", _found(tested) + left, p_model, note)
-    star = [] if alone is None else _parts_alone(*alone, shape)
-    if alone is not None and _smallest(star) < alpha:
-        worst = _worst(star, alone[0].degrees)
-        because = f"a star alone does not fit: {_misfit(star, worst)}; and {_nothing(tested)}"
-        return Verdict("model rejected", because, p_model)
+        return _companion(result, tested, left, p_model, compared=compared)
+    if alone is not None and (misfit := _misfit_alone(*alone, shape, alpha)):
+        return Verdict("model rejected", f"{misfit}; and {_nothing(tested)}", p_model)
     return Verdict("no companion", _nothing(tested) + left, p_model)
+
+
+def _companion(
+    result: SearchResult, tested: Significance, left: str, p_model: float, *, compared: bool
+) -> Verdict:
+    """The verdict where a companion is detected, with what else may look like it."""
+    note, data = note_of(result, compared=compared), result.likelihood.observables
+    if not note and within_calibration(data, change_by_companion(result)):
+        note = SMALL
+    left += f"; but {note}" if note else ""
+    return Verdict("companion", _found(tested) + left, p_model, note)
 
 
 def star_alone(
@@ -235,9 +239,12 @@ def _parts(likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float) -
     return found
 
 
-def _parts_alone(likelihood: Likelihood, theta: FloatArray, shape: float) -> list[_Part]:
-    """Kinds of observables of files, as the star alone leaves them."""
-    return _parts(likelihood, theta, likelihood.n_independent - len(theta), shape)
+def _misfit_alone(likelihood: Likelihood, theta: FloatArray, shape: float, alpha: float) -> str:
+    """Say how a star alone does not fit; empty where it does."""
+    parts = _parts(likelihood, theta, likelihood.n_independent - len(theta), shape)
+    if _smallest(parts) >= alpha:
+        return ""
+    return f"a star alone does not fit: {_misfit(parts, _worst(parts, likelihood.degrees))}"
 
 
 def within_calibration(observables: Observables, change: FloatArray) -> bool:
