@@ -226,11 +226,19 @@ def choose_field(
         return (inner, outer), None
     near = make_grid(NEARER * inner, inner, NEARER * step)
     gains = _gains(still, near, single)
-    if gains.max(initial=0.0) > gain - MODE_LIMIT:
+    separation = float(np.hypot(*place))
+    if gains.max(initial=0.0) > min(gain - MODE_LIMIT, (1.0 - NOTABLY_BETTER) * gain):
         # What is nearer to the star than two baselines can tell has aliases far out.
         best = int(gains.argmax())
-        return (NEARER * inner, outer), float(np.hypot(near.east_mas[best], near.north_mas[best]))
-    separation = float(np.hypot(*place))
+        nearer = np.array([near.east_mas[best], near.north_mas[best]])
+        if gains[best] > gain - MODE_LIMIT:
+            return (NEARER * inner, outer), float(np.hypot(*nearer))
+        # Gains of faint companions do not tell bright ones apart, however large they are.
+        bank, box = TemplateBank(still, near, single), Box(NEARER * inner, farthest, fringe)
+        fits = [_fit_from(at, bank, still, single, box, 0.0) for at in (nearer, place)]
+        if fits[0].delta_chi2 > fits[1].delta_chi2 - MODE_LIMIT:
+            separation = fits[0].companion.separation_mas
+            return (NEARER * inner, MARGIN * float(np.hypot(*place))), separation
     return (inner, MARGIN * separation), separation
 
 
@@ -241,18 +249,26 @@ def wider_fields(result: SearchResult) -> list[tuple[float, float]]:
 
     The looks outside are made with the templates of a faint companion. One half as bright as the
     star changes V² otherwise: it is found by searches alone, and a fit inside that is far off
-    asks for these. None where the fit is no worse than errors that are somewhat too small make it,
-    or where the data are too many to search again.
+    asks for these. A fit on the inner edge asks for the first one, however good it is. None where
+    the fit is no worse than errors that are somewhat too small make it, or where the data are too
+    many to search again.
     """
     likelihood, grid = result.likelihood, result.grid
     n, alone = likelihood.n_independent, result.chi2_single
+    nearer = NEARER * grid.inner_mas, grid.outer_mas
     if n > MAX_COARSE_DATA or min(result.chi2_binary, 0.2 * alone) < FAR_OFF * n:
-        return []
+        return [nearer] if on_inner_edge(result) else []
     fringe = resolution_mas(likelihood)
     farthest = _affordable(likelihood, Box(grid.inner_mas, outermost(likelihood), fringe))[1]
     edges = (min(times * grid.outer_mas, farthest) for times in WIDER)
     wider = [(grid.inner_mas, edge) for edge in dict.fromkeys(edges) if edge > grid.outer_mas]
-    return [(NEARER * grid.inner_mas, grid.outer_mas), *wider]
+    return [nearer, *wider]
+
+
+def on_inner_edge(result: SearchResult) -> bool:
+    """Whether what noise alone does not give lies on the inner edge of the field."""
+    edge = result.grid.inner_mas + 0.25 * result.grid.step_mas
+    return result.delta_chi2 > SURELY_NOT_NOISE and result.companion.separation_mas < edge
 
 
 NEARER = 0.3
@@ -260,7 +276,7 @@ NEARER = 0.3
 contrast and separation of any companion are one number."""
 
 
-FAR_OFF = 3.0
+FAR_OFF = 2.0
 """χ² per datum of the best companion inside, and a fifth of that of the star alone, from which on
 fields beyond are searched."""
 

@@ -181,13 +181,18 @@ def with_large_discs(likelihood: Likelihood, theta: FloatArray, box: Box) -> Flo
     return large
 
 
-def with_disc(likelihood: Likelihood, point: FloatArray, box: Box) -> FloatArray:
-    """Parameter vector of a model whose companion has a free disc, from that of a point."""
+def with_disc(
+    likelihood: Likelihood, point: FloatArray, box: Box, size: float = SHAPE_START
+) -> FloatArray:
+    """Parameter vector of a model whose companion has a free disc, from that of a point.
+
+    The disc has a ``size`` in fringes.
+    """
     parameters = likelihood.parameters
     theta = np.zeros(len(parameters))
     discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
     theta[np.setdiff1d(np.arange(len(theta)), discs)] = point
-    theta[discs] = SHAPE_START * box.fringe_mas
+    theta[discs] = size * box.fringe_mas
     return theta
 
 

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import calibration_errors
@@ -16,7 +17,9 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import SEE, note_of
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
-from amibayes.likelihood.likelihood import single_likelihood
+from amibayes.likelihood.extra_noise import MAX_ROUNDS, NoisePrior, with_noise
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.residuals import files_of
 from amibayes.units import FloatArray
 
@@ -71,6 +74,7 @@ def verdict(
     structured: bool = True,
     shape: float = 0.0,
     compared: bool = False,
+    alone: tuple[Likelihood, FloatArray] | None = None,
 ) -> Verdict:
     """Give the verdict of a search whose null draws can tell a detection.
 
@@ -91,6 +95,8 @@ def verdict(
         Of `fit_probability`: `SHAPE` where noise was fitted.
     compared : bool
         Whether models of the sky are compared too.
+    alone : (Likelihood, (n_nuisance,) float array), optional
+        As `star_alone` gives it: without a companion it has to fit.
 
     Notes
     -----
@@ -99,7 +105,7 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    parts = _parts(result, shape)
+    parts = _parts(result.likelihood, result.theta, result.ndof, shape)
     fit = _smallest(parts)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
@@ -115,12 +121,56 @@ def verdict(
     small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
-        note, data = note_of(result, compared=compared), result.likelihood.observables
-        if not note and within_calibration(data, change_by_companion(result)):
-            note = SMALL
-        left += f"; but {note}" if note else ""
-        return Verdict("companion", _found(tested) + left, p_model, note)
+        return _companion(result, tested, left, p_model, compared=compared)
+    if alone is not None and (misfit := _misfit_alone(*alone, shape, alpha)):
+        return Verdict("model rejected", f"{misfit}; and {_nothing(tested)}", p_model)
     return Verdict("no companion", _nothing(tested) + left, p_model)
+
+
+def _companion(
+    result: SearchResult, tested: Significance, left: str, p_model: float, *, compared: bool
+) -> Verdict:
+    """The verdict where a companion is detected, with what else may look like it."""
+    note, data = note_of(result, compared=compared), result.likelihood.observables
+    if not note and within_calibration(data, change_by_companion(result)):
+        note = SMALL
+    left += f"; but {note}" if note else ""
+    return Verdict("companion", _found(tested) + left, p_model, note)
+
+
+def star_alone(
+    result: SearchResult, stated: Observables, prior: NoisePrior, *, per_file: bool
+) -> tuple[Likelihood, FloatArray] | None:
+    """The star alone that fits best, with the noise that is most likely beside it.
+
+    The noise of a result is that of its best companion, which a star alone need not fit.
+
+    Parameters
+    ----------
+    result : SearchResult
+    stated : Observables
+        The data that were searched, with the stated errors.
+    prior : NoisePrior
+    per_file : bool
+        Every file has noise of its own.
+
+    Returns
+    -------
+    (Likelihood, (n_nuisance,) float array) or None
+        None of a robust search, where any misfit counts as outliers.
+    """
+    if result.robustness is not None:
+        return None
+    likelihood = Likelihood(stated, single_likelihood(result.likelihood).model)
+    theta = fit_single(likelihood)[0]
+    for _ in range(MAX_ROUNDS):
+        expecting = likelihood.expecting(theta)
+        noise = fit_noise(expecting, theta, per_file=per_file, prior=prior)
+        noisy, before = with_noise(expecting, noise), theta
+        theta = fit_single(noisy)[0]
+        if np.allclose(theta, before, rtol=1e-2, atol=0.0):
+            break
+    return noisy, theta
 
 
 def without_companion(
@@ -152,7 +202,7 @@ def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
     probabilities count, the smallest times their number. That of all data together would refuse
     a model for misfits that noise within its prior explains, but that no part asks for.
     """
-    return _smallest(_parts(result, shape))
+    return _smallest(_parts(result.likelihood, result.theta, result.ndof, shape))
 
 
 @dataclass(frozen=True)
@@ -171,11 +221,10 @@ def _smallest(parts: Sequence[_Part]) -> float:
     return min(1.0, len(parts) * min(part.p for part in parts))
 
 
-def _parts(result: SearchResult, shape: float) -> list[_Part]:
-    """Kinds of observables of files, as the best fit leaves them."""
-    likelihood = result.likelihood
-    difference = likelihood.difference(np.atleast_2d(result.theta))[:, 0]
-    covariance, share = likelihood.noise.covariance, result.ndof / likelihood.n_independent
+def _parts(likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float) -> list[_Part]:
+    """Kinds of observables of files, as a best fit leaves them."""
+    difference = likelihood.difference(np.atleast_2d(theta))[:, 0]
+    covariance, share = likelihood.noise.covariance, ndof / likelihood.n_independent
     nodes, weights = np.polynomial.hermite_e.hermegauss(41)
     factors, weights = np.exp(shape * nodes), weights / weights.sum()
     found = []
@@ -188,6 +237,14 @@ def _parts(result: SearchResult, shape: float) -> list[_Part]:
             each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
             found.append(_Part(kind, file.source, chi2, share * rank, float(weights @ each)))
     return found
+
+
+def _misfit_alone(likelihood: Likelihood, theta: FloatArray, shape: float, alpha: float) -> str:
+    """Say how a star alone does not fit; empty where it does."""
+    parts = _parts(likelihood, theta, likelihood.n_independent - len(theta), shape)
+    if _smallest(parts) >= alpha:
+        return ""
+    return f"a star alone does not fit: {_misfit(parts, _worst(parts, likelihood.degrees))}"
 
 
 def within_calibration(observables: Observables, change: FloatArray) -> bool:
@@ -235,20 +292,28 @@ def _apart(split: Consistency) -> str:
 
 def _rejected(parts: Sequence[_Part], degrees: float, fit: float, structure: Significance) -> str:
     if fit <= structure.probability:
-
-        def chance(part: _Part) -> tuple[float, float]:
-            """By χ² as it is; probabilities may be 0."""
-            return chi2_survival(part.chi2, part.dof, degrees), -part.chi2 / part.dof
-
-        worst = min(parts, key=chance)
-        where = f" in {worst.source}" if len({part.source for part in parts}) > 1 else ""
-        return (
-            f"χ² of {NAMES[worst.kind]}{where} is {worst.chi2:.4g} for {worst.dof:.0f} degrees of "
-            "freedom with the best companion and as much noise as its prior allows"
-        )
+        return _misfit(parts, _worst(parts, degrees), "the best companion and ")
     return (
         "what the best fit leaves still holds structure: one more component would gain more than "
         f"in all but {_share(structure.probability)} of data without it"
+    )
+
+
+def _worst(parts: Sequence[_Part], degrees: float) -> _Part:
+    """The part that fits worst."""
+
+    def chance(part: _Part) -> tuple[float, float]:
+        """By χ² as it is; probabilities may be 0."""
+        return chi2_survival(part.chi2, part.dof, degrees), -part.chi2 / part.dof
+
+    return min(parts, key=chance)
+
+
+def _misfit(parts: Sequence[_Part], worst: _Part, beside: str = "") -> str:
+    where = f" in {worst.source}" if len({part.source for part in parts}) > 1 else ""
+    return (
+        f"χ² of {NAMES[worst.kind]}{where} is {worst.chi2:.4g} for {worst.dof:.0f} degrees of "
+        f"freedom with {beside}as much noise as its prior allows"
     )
 
 

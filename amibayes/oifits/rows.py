@@ -23,7 +23,8 @@ DAY_S = 86400.0
 class Kind:
     """Which columns hold one kind of data, and what is impossible and not used.
 
-    No calibration error makes a visibility of 100: a V² past ``largest_value`` is a fault. A
+    No calibration error makes a visibility of 100: a V² past ``largest_value`` is a fault, and so
+    is one below ``least_value``, such as -9999: only noise is negative, and it is smaller. A
     phase past it stands for "no value" (1e20, 9.97e36, …), and any other has its turns.
     """
 
@@ -35,6 +36,7 @@ class Kind:
     is_angle: bool
     largest_error: float
     largest_value: float
+    least_value: float
 
     @property
     def index(self) -> str:
@@ -42,7 +44,7 @@ class Kind:
         return f"CORRINDX_{self.value}"
 
 
-VIS2 = Kind("OI_VIS2", "VIS2DATA", "VIS2ERR", ("UCOORD",), ("VCOORD",), False, 100.0, 1e4)
+VIS2 = Kind("OI_VIS2", "VIS2DATA", "VIS2ERR", ("UCOORD",), ("VCOORD",), False, 100.0, 1e4, -10.0)
 T3 = Kind(
     "OI_T3",
     "T3PHI",
@@ -52,6 +54,7 @@ T3 = Kind(
     True,
     np.pi,
     1e10,
+    -1e10,
 )
 KINDS = {kind.table: kind for kind in (VIS2, T3)}
 
@@ -211,7 +214,7 @@ def unusable(kind: Kind, value: FloatArray, variance: FloatArray) -> BoolArray:
     """Where a value or its error cannot be meant: not finite, not positive, or a fill value."""
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(variance)
-        usable = np.isfinite(value) & (np.abs(value) < kind.largest_value)
+        usable = np.isfinite(value) & (value < kind.largest_value) & (value > kind.least_value)
         usable &= (sigma >= MIN_ERROR) & (sigma <= kind.largest_error)
     return np.asarray(~usable)
 

@@ -19,6 +19,7 @@ from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.detection.verdict import (
     SHAPE,
     Verdict,
+    star_alone,
     verdict,
     within_calibration,
     without_companion,
@@ -168,9 +169,18 @@ def verdict_of(
     structured = rest.probability > options.alpha or not within
     shape = SHAPE if options.extra_noise else 0.0
     compared = options.models is not None
+    alone = None
+    if not tested.detected:
+        alone = star_alone(
+            result,
+            stated.only(options.observables),
+            noise_prior(stated, options),
+            per_file=options.file_noise is not False,
+        )
     said = verdict(
-        result, tested, rest, splits, structured=structured, shape=shape, compared=compared
-    )
+        result, tested, rest, splits,
+        structured=structured, shape=shape, compared=compared, alone=alone,
+    )  # fmt: skip
     if said.statement == "companion" and (other := alternative(result)) is not None:
         said = without_companion(said, other, result, compared=compared)
     return said, splits

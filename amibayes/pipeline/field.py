@@ -14,14 +14,16 @@ from amibayes.companion_search.field import (
     look_inside,
     look_outside,
     notices_disc,
+    on_inner_edge,
     refuse_no_length,
     resolution_mas,
     wider_fields,
 )
-from amibayes.companion_search.optimise import fit_single, refine, with_disc
+from amibayes.companion_search.optimise import SHAPE_START, fit_single, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
 from amibayes.companion_search.search import search, with_global_check
+from amibayes.companion_search.seeds import MAX_COARSE_DATA
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import systematics_of
@@ -31,9 +33,10 @@ from amibayes.detection.outlying_rows import (
     outlying_rows,
     without_rows,
 )
-from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.models.bands import reference_wavelength
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
@@ -147,24 +150,69 @@ def _with_its_disc(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> SearchResult:
     """The search with a free disc of the companion, where V² show one and none was asked for."""
-    if options.companion_diameter is None and shows_disc(likelihood, first):
-        return _search_for_disc(likelihood, first)
-    return first
+    if options.companion_diameter is not None:
+        return first
+    if shows_disc(likelihood, first):
+        first = _search_for_disc(likelihood, first)
+    return _with_disc_elsewhere(likelihood, first)
+
+
+def _with_disc_elsewhere(likelihood: Likelihood, near: SearchResult) -> SearchResult:
+    """The search with a free disc of the companion, where one fits that is not near the best point.
+
+    A companion as large as λ/B leaves so little of the fringes of a point that the best point
+    may be anywhere: discs of a few sizes are searched for where what was found does not fit.
+    """
+    n, grid = likelihood.n_independent, near.grid
+    if not likelihood.observables.n_vis2 or likelihood.model.companion_diameter_mas != 0.0:
+        return near
+    if n > MAX_COARSE_DATA or near.chi2_binary < NO_POINT * n:
+        return near
+    found = []
+    for size in TRIAL_DISCS:
+        diameter = size * resolution_mas(likelihood)
+        fixed = likelihood.with_model(replace(likelihood.model, companion_diameter_mas=diameter))
+        trial = search(fixed, (grid.inner_mas, grid.outer_mas), check=False)
+        found.append(_search_for_disc(likelihood, trial, size))
+    disc = min(found, key=lambda result: result.chi2_binary)
+    gain = n * np.log(near.chi2_binary / disc.chi2_binary)
+    sure = gain > SURELY_A_DISC and disc.companion.contrast > DISC_CONTRAST
+    return disc if sure else near
+
+
+NO_POINT = 2.0
+"""χ² per datum of the best fit, with the stated errors, from which discs are searched for: one
+that errors too small by 1.4 give is no reason to."""
+
+TRIAL_DISCS = (0.7, 1.0, 1.5)
+"""Their diameters in units of λ/B_max: smaller ones are found from where the best point is."""
 
 
 def _in_wider_field(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
+    prior = noise_prior(likelihood.observables, options)
     for field in wider_fields(first):
-        found = search(likelihood, field, check=False)
-        if found.chi2_binary < EXPLAINED * first.chi2_binary:
+        # With its disc, as the first one has: a point in its place may fit worse than that.
+        found = _with_its_disc(likelihood, search(likelihood, field, check=False), options)
+        if found.chi2_binary < EXPLAINED * first.chi2_binary or (
+            found.chi2_binary < first.chi2_binary
+            and _score(first, prior) - _score(found, prior) > SURELY_NOT_NOISE
+        ):
             place = found.companion.separation_mas
-            return _with_its_disc(likelihood, found, options), [
+            return found, [
                 f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: none in the default "
                 f"one fits, and a companion at {place:.1f} mas does far better"
             ]
     return first, []
+
+
+def _score(result: SearchResult, prior: NoisePrior) -> float:
+    """−2 ln L of a search with stated errors, with the noise that its best fit leaves."""
+    likelihood = result.likelihood.expecting(result.theta)
+    noisy = with_noise(likelihood, fit_noise(likelihood, result.theta, prior=prior))
+    return float(-2.0 * noisy.log_prob(result.theta)[0])
 
 
 def _rival_outside(result: SearchResult) -> list[str]:
@@ -224,12 +272,17 @@ def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
     return bool(min(chi2[0] - chi2[1], scaled) > SURELY_A_DISC)
 
 
-def _search_for_disc(likelihood: Likelihood, point: SearchResult) -> SearchResult:
-    """Search again with a free disc of the companion, from what was found for a point."""
+def _search_for_disc(
+    likelihood: Likelihood, point: SearchResult, size: float = SHAPE_START
+) -> SearchResult:
+    """Search again with a free disc of the companion, from what was found for a point.
+
+    Or for a disc of a given ``size``, in units of λ/B_max.
+    """
     free = replace(likelihood.model, companion_diameter_mas="free")
     disc, grid = likelihood.with_model(free), point.grid
     box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
-    known = np.array([with_disc(disc, np.array(m.theta), box) for m in point.modes])
+    known = np.array([with_disc(disc, np.array(m.theta), box, size) for m in point.modes])
     return search(disc, (grid.inner_mas, grid.outer_mas), known=known, check=False)
 
 
@@ -265,9 +318,8 @@ def _beyond(result: SearchResult) -> list[str]:
             "star, a companion fits as well or better, and this may be an alias of it"
         )
     rho = result.companion.separation_mas
-    if result.delta_chi2 > SURELY_NOT_NOISE and (
-        rho < grid.inner_mas + 0.25 * grid.step_mas or rho > grid.outer_mas - 0.25 * grid.step_mas
-    ):
+    on_outer_edge = rho > grid.outer_mas - 0.25 * grid.step_mas
+    if on_inner_edge(result) or (on_outer_edge and result.delta_chi2 > SURELY_NOT_NOISE):
         found.append(
             f"the best fit lies at {rho:.4g} mas, on the edge of the field that was asked for: "
             "the companion may be outside it"

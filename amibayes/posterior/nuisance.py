@@ -91,9 +91,10 @@ def nuisance_nodes(
         turn, sigma = _given_before(errors, k)
         if not 0.0 < sigma < bounds[1] - bounds[0]:
             sigma, turn = bounds[1] - bounds[0], 0.0 * turn
-        finest = _given_before(narrow, k)[1] or sigma
+        finest = _given_before(narrow, k)[1]
+        finest = min(finest, sigma) if finest > 0.0 else sigma  # NaN where data say nothing
         middle = centres[:, k] + (value[:, None] - centres[:, :k]) @ turn
-        x, w, a, b = _axis(middle, reach * sigma, min(finest, sigma), bounds)
+        x, w, a, b = _axis(middle, reach * sigma, finest, bounds)
         n = x.shape[1]
         shape.append(n)
         value, low, high = (

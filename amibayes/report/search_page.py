@@ -22,8 +22,25 @@ from amibayes.report.page import (
 )
 from amibayes.report.sections import fit as fit_sections
 from amibayes.report.sections.noise import noise
-from amibayes.report.statement import by_comparison, false_alarm, field, sky_of, statement_of
-from amibayes.report.words import chance, count, fixed, measured, plain, sentence
+from amibayes.report.statement import (
+    by_comparison,
+    companion_stated,
+    false_alarm,
+    field,
+    refused,
+    sky_of,
+    statement_of,
+)
+from amibayes.report.words import (
+    LARGEST_ANGLE_DEG,
+    LARGEST_MAG,
+    chance,
+    count,
+    fixed,
+    known,
+    plain,
+    sentence,
+)
 
 Json = dict[str, Any]
 
@@ -116,18 +133,18 @@ def _tiles(content: Json) -> tuple[Fact, ...]:
     fit, errors = content["fit"], content["fit"]["errors"]
     chance_text = false_alarm(content["significance"])
     alarm = Fact("False-alarm probability", chance_text, "by noise, anywhere in the field")
-    if content["significance"]["detected"] is False:
+    if companion_stated(content) is False:
         return (alarm, *_excluded(content))
-    if fit["contrast"] <= 0.0:
+    if fit["contrast"] <= 0.0 or refused(content):
         return (alarm,)
     label = "" if content["significance"]["detected"] else " (best fit)"
     label = " (of one companion)" if by_comparison(content) else label
     place = (
-        Fact(f"{name}{label}", measured(fit[key], errors[key], unit))
-        for name, key, unit in (
-            ("Separation", "separation_mas", " mas"),
-            ("Position angle", "position_angle_deg", "°"),
-            ("Magnitude difference", "delta_mag", ""),
+        Fact(f"{name}{label}", known(fit[key], errors[key], unit, largest))
+        for name, key, unit, largest in (
+            ("Separation", "separation_mas", " mas", fit["separation_mas"]),
+            ("Position angle", "position_angle_deg", "°", LARGEST_ANGLE_DEG),
+            ("Magnitude difference", "delta_mag", "", LARGEST_MAG),
         )
     )
     return (*place, alarm)

@@ -7,7 +7,17 @@ from typing import Any
 from amibayes.comparison.agreement import model_words
 from amibayes.comparison.verdict import UNDECIDED
 from amibayes.report.page import Kind, Mark, Sky, Statement
-from amibayes.report.words import capital, chance, count, fixed, measured, plain, sentence
+from amibayes.report.words import (
+    LARGEST_ANGLE_DEG,
+    LARGEST_MAG,
+    capital,
+    chance,
+    count,
+    fixed,
+    known,
+    plain,
+    sentence,
+)
 from amibayes.units import offset
 
 Json = dict[str, Any]
@@ -42,7 +52,7 @@ def statement_of(content: Json) -> Statement:
     refused = _refused(content)
     if refused is not None:
         return refused
-    detected = content["significance"]["detected"]
+    detected = companion_stated(content)
     kind = {True: "found", False: "none", None: "open"}[detected]
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
     sentences = [
@@ -54,6 +64,24 @@ def statement_of(content: Json) -> Statement:
         _upper_limit(content),
     ]
     return Statement(kind, LABELS[detected], headline, tuple(s for s in sentences if s))  # type: ignore[arg-type]
+
+
+def companion_stated(content: Json) -> bool | None:
+    """Whether a companion is stated; None where that is not known.
+
+    Noise alone may not explain one, and a star without a companion may: the verdict says so.
+    """
+    detected: bool | None = content["significance"]["detected"]
+    verdict = content.get("verdict")
+    another = verdict is not None and verdict["statement"] == "no companion"
+    return False if detected and another else detected
+
+
+def refused(content: Json) -> bool:
+    """Whether the verdict states no best fit, and nothing else does."""
+    verdict = content.get("verdict")
+    stated = verdict is not None and verdict["statement"] in REFUSED
+    return stated and not by_comparison(content)
 
 
 def _refused(content: Json) -> Statement | None:
@@ -107,9 +135,10 @@ def _note(content: Json) -> str:
 def place(content: Json) -> str:
     """Where the best fit is, and how bright, with errors."""
     fit, errors = content["fit"], content["fit"]["errors"]
-    separation = measured(fit["separation_mas"], errors["separation_mas"], "\u00a0mas")
-    angle = measured(fit["position_angle_deg"], errors["position_angle_deg"], "°")
-    magnitude = measured(fit["delta_mag"], errors["delta_mag"], "\u00a0mag")
+    rho = fit["separation_mas"]
+    separation = known(rho, errors["separation_mas"], "\u00a0mas", largest=rho)
+    angle = known(fit["position_angle_deg"], errors["position_angle_deg"], "°", LARGEST_ANGLE_DEG)
+    magnitude = known(fit["delta_mag"], errors["delta_mag"], "\u00a0mag", LARGEST_MAG)
     text = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
     return text.replace(" ±", "\u00a0±")
 
@@ -125,6 +154,9 @@ def _found(content: Json) -> str:
 
 
 def _nothing(content: Json) -> str:
+    verdict = content.get("verdict")
+    if content["significance"]["detected"] and verdict is not None:
+        return f"No companion is stated: {verdict['because']}."
     return f"No companion is detected at {field(content)} from the star."
 
 
@@ -183,7 +215,7 @@ def false_alarm(significance: Json) -> str:
 def _others(content: Json) -> str:
     """Whether the position is the only one."""
     modes = content["modes"]
-    if len(modes) < 2 or content["significance"]["detected"] is False:
+    if len(modes) < 2 or companion_stated(content) is False:
         return ""
     # An alias lies where the field of one answer has ended: a warning says so.
     rivals = [m for m in modes[1:] if not m["alias"]]
@@ -241,7 +273,7 @@ def sky_of(content: Json) -> Sky:
     """Sketch the field, the best fit and the other modes."""
     inner, outer = content["data"]["separation_mas"]
     fit = content["fit"]
-    detected = content["significance"]["detected"] and not by_comparison(content)
+    detected = companion_stated(content) and not by_comparison(content)
     marks = []
     for mode in content["modes"][1:]:
         east, north = offset(mode["separation_mas"], mode["position_angle_deg"])

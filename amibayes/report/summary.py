@@ -17,7 +17,14 @@ from amibayes.posterior.evidence import Evidence
 from amibayes.report.joint import joint_lines
 from amibayes.report.models import models_lines
 from amibayes.report.result import upper_limit
-from amibayes.report.words import FARTHEST_TOLD, capital, percent, places_of
+from amibayes.report.words import (
+    FARTHEST_TOLD,
+    LARGEST_ANGLE_DEG,
+    LARGEST_MAG,
+    capital,
+    percent,
+    places_of,
+)
 from amibayes.support.terminal import row, with_warnings
 
 EVEN = 0.5
@@ -98,7 +105,8 @@ def _best_fit(report: SearchReport) -> list[str]:
         f"PA {angle} (E {c.east_mas:.{places}f}, N {c.north_mas:.{places}f} mas)"
     )
     if found is not None and found.statement == "no companion":
-        place = f"{place}: no more than noise gives"
+        noise = tested is None or not tested.detected
+        place += ": no more than noise gives" if noise else ": needless, see the verdict"
     if apart:
         place = f"with one companion and nothing else: {place}"
     return [row("best fit", place), contrast]
@@ -141,9 +149,6 @@ OPEN_SHARE = 1.0
 
 OPEN_ANGLE_DEG = 180.0
 """A 68 % interval of position angles wider than this leaves every direction open."""
-
-LARGEST_MAG, LARGEST_ANGLE_DEG = 1.5, 60.0
-"""Errors of a magnitude and of an angle beyond which either may have any value."""
 
 
 def _verdict(report: SearchReport) -> str:
@@ -226,10 +231,17 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
         if name == "diameter_mas" and value < UNRESOLVED * error:
             bound = value + UNRESOLVED * error
             shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
+            if not bound < result.grid.outer_mas:
+                shown = "undetermined"
         else:
-            shown = with_error(value, error, unit) + (" (star alone)" if alone else "")
+            largest = np.inf if unit else LARGEST_SHAPE
+            shown = with_error(value, error, unit, largest) + (" (star alone)" if alone else "")
         lines.append(row(label, shown))
     return lines
+
+
+LARGEST_SHAPE = 2.0
+"""An error of limb darkening or background as wide as its whole range."""
 
 
 def _noise_lines(report: SearchReport) -> list[str]:

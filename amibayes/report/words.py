@@ -33,6 +33,10 @@ def fixed(value: float | None, places: int) -> str:
     return f"{value:.{places}f}".replace("-", "−")
 
 
+LARGEST_MAG, LARGEST_ANGLE_DEG = 1.5, 60.0
+"""Errors of a magnitude and of an angle beyond which either may have any value."""
+
+
 def measured(value: float | None, error: float | None, unit: str = "") -> str:
     """Write a number and its error, both to the error's second digit."""
     if value is None or not math.isfinite(value):
@@ -47,6 +51,13 @@ def measured(value: float | None, error: float | None, unit: str = "") -> str:
         return f"{scaled}{TIMES}10{str(power).translate(SUPERSCRIPT)}{unit}".replace("-", "−")
     both = f"{value:.{max(places, 0)}f}{PLUS_MINUS}{error:.{max(places, 0)}f}"
     return f"{both}{unit}".replace("-", "−")
+
+
+def known(value: float, error: float | None, unit: str, largest: float) -> str:
+    """Write a number with its error, or where that is larger than all there is the number alone."""
+    if error is None or error <= largest:
+        return measured(value, error, unit)
+    return f"{plain(value, 2)}{unit} (undetermined)"
 
 
 def places_of(error: float) -> int:

@@ -39,9 +39,10 @@ def pair(metres: float, wavelength_m: float, error: float = 0.01) -> Observables
 
 def found_in(grid: Any, gain: float, **options: Any) -> Any:
     """A result of which the looks around need but few numbers."""
-    known = {"delta_chi2": 100.0, "single_theta": np.empty(0), "chi2_single": 150.0}
+    known: dict[str, Any] = {"delta_chi2": 100.0, "single_theta": np.empty(0), "chi2_single": 150.0}
     bank_gain = np.array([0.2 * gain, gain, 0.0])
     likelihood = Likelihood(niriss())
+    known["companion"] = Companion(0.0, 90.0, 0.01)
     return SimpleNamespace(
         grid=grid, bank_gain=bank_gain, likelihood=likelihood, **(known | options)
     )
@@ -302,10 +303,10 @@ def test_few_data_have_the_default_field() -> None:
 
 @pytest.mark.parametrize(
     ("binary", "alone", "n_fields"),
-    [(3.01, 15.1, 3), (2.99, 15.1, 0), (3.01, 14.9, 0), (2.99, 14.9, 0), (50.0, 60.0, 3)],
+    [(2.01, 10.1, 3), (1.99, 10.1, 0), (2.01, 9.9, 0), (1.99, 9.9, 0), (50.0, 60.0, 3)],
 )
 def test_wider_fields_where_nothing_fits(binary: float, alone: float, n_fields: int) -> None:
-    """Of three times the data's number, and a fifth of what a star alone leaves."""
+    """Of twice the data's number, and a fifth of what a star alone leaves."""
     n = Likelihood(niriss()).n_independent
     result = found_in(make_grid(80.0, 100.0, 12.0), 1.0)
     result.chi2_binary, result.chi2_single = binary * n, alone * n
@@ -316,11 +317,25 @@ def test_wider_fields_where_nothing_fits(binary: float, alone: float, n_fields: 
     ]
     # As far as the channels see, and each field once.
     farthest = FRINGE * 4.817 / 0.302
-    result.grid = SimpleNamespace(inner_mas=80.0, outer_mas=0.45 * farthest)
+    result.grid = SimpleNamespace(inner_mas=80.0, outer_mas=0.45 * farthest, step_mas=12.0)
     expected = [(24.0, 0.45 * farthest), (80.0, farthest)]
     assert field.wider_fields(result) == [pytest.approx(e) for e in expected[: min(n_fields, 2)]]
     result.grid.outer_mas = farthest + 1.0
     assert len(field.wider_fields(result)) == min(n_fields, 1)
+
+
+@pytest.mark.parametrize(
+    ("separation", "delta_chi2", "n_fields"),
+    [(82.9, 30.1, 1), (83.1, 30.1, 0), (82.9, 29.9, 0)],
+)
+def test_a_fit_on_the_inner_edge_asks_for_a_nearer_field(
+    separation: float, delta_chi2: float, n_fields: int
+) -> None:
+    grid = make_grid(80.0, 100.0, 12.0)
+    found = found_in(grid, 1.0, delta_chi2=delta_chi2, chi2_binary=1.0)
+    found.companion = Companion(separation, 0.0, 0.01)
+    assert field.on_inner_edge(found) is bool(n_fields)
+    assert field.wider_fields(found) == [(pytest.approx(24.0), 100.0)][:n_fields]
 
 
 def test_many_data_are_not_searched_again() -> None:

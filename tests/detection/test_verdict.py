@@ -28,13 +28,14 @@ from amibayes.detection.verdict import (
     Verdict,
     change_by_companion,
     fit_probability,
+    star_alone,
     verdict,
     within_calibration,
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
-from amibayes.pipeline.field import search_field
+from amibayes.pipeline.field import noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.units import MAS, offset
 
@@ -156,6 +157,28 @@ def test_what_else_may_look_like_the_companion_is_stated(
     assert stated.statement == "companion"
     assert stated.note == warned
     assert stated.because.endswith(warned)
+
+
+@pytest.mark.parametrize(("contrast", "expected"), [(0.0, "no companion"), (0.9, "model rejected")])
+def test_no_star_alone_is_stated_that_does_not_fit(
+    contrast: float, expected: str, rng: np.random.Generator
+) -> None:
+    """That noise of any size may look like a bright companion says nothing for the star alone.
+
+    Whatever the null draws say: beside a star of equal brightness it needs far more noise than is
+    plausible.
+    """
+    sheet = four_telescopes(2, 6, vis2_error=0.005, closure_error_deg=0.5)
+    data = observed(sheet, points((3.0, 4.0, contrast)), rng)
+    options = replace(OPTIONS, separation_mas=(1.5, 8.0))
+    result = search_field(data, options).result
+    tested = Significance(9.0, np.arange(20.0), 0.5, (0.4, 0.6), None, 0.01)
+    assert verdict(result, tested, tested, []).statement == "no companion"
+    alone = star_alone(result, data, noise_prior(data, options), per_file=True)
+    said = verdict(result, tested, tested, [], alone=alone)
+    assert said.statement == expected
+    assert ("a star alone does not fit: χ² of " in said.because) is (contrast > 0.0)
+    assert said.because.endswith("with a probability of 0.5")
 
 
 def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:

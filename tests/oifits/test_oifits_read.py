@@ -570,15 +570,15 @@ def test_values_that_no_calibration_error_explains_are_flagged(
     made: HandMade, tmp_path: Path
 ) -> None:
     vis2, phase = made.vis2.copy(), made.phase_deg.copy()
-    vis2[0, 0], vis2[1, 1], vis2[2, 2] = 1e8, -2e4, 9.0
+    vis2[0, 0], vis2[1, 1], vis2[2, 2], vis2[0, 1], vis2[0, 2] = 1e8, -2e4, 9.0, -999.0, -0.5
     phase[0, 0], phase[1, 1] = 1e20, 350.0
     made.put("OI_VIS2", "VIS2DATA", vis2)
     made.put("OI_T3", "T3PHI", phase)
     data = read_oifits(made.write(tmp_path / "a.fits"))
-    assert list(np.flatnonzero(data.vis2.flag)) == [0, 4]
+    assert list(np.flatnonzero(data.vis2.flag)) == [0, 1, 4]
     assert list(np.flatnonzero(data.closure_phase.flag)) == [0]
     note = "values that cannot be used were flagged"
-    assert f"OI_VIS2 (extension 4): {note}: 2 without a usable value" in data.notes
+    assert f"OI_VIS2 (extension 4): {note}: 3 without a usable value" in data.notes
     assert f"OI_T3 (extension 5): {note}: 1 without a usable value" in data.notes
 
 

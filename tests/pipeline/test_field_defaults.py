@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from interferometer import darkened_disc, four_telescopes, observed
 
 from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
@@ -13,6 +14,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.field import model_of, search_field
 from amibayes.pipeline.options import SearchOptions
+from amibayes.units import MAS
 
 STATIONS = np.array([[0.0, 0.0], [30.0, 10.0], [-20.0, 45.0], [60.0, -30.0]])
 
@@ -66,6 +68,64 @@ def test_a_bright_companion_nearer_than_the_default_field_is_found(separation, r
     moment = companion.contrast / (1.0 + companion.contrast) * companion.separation_mas
     assert moment == pytest.approx(separation * 0.1 / 1.1, rel=0.1)
     assert any("the field was widened" in said for said in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("east", "north", "contrast"), [(40.0, 20.0, 0.1), (20.0, -25.0, 0.2), (-30.0, 45.0, 0.3)]
+)
+def test_precise_data_do_not_put_a_near_companion_far_out(east, north, contrast, rng) -> None:
+    """At a signal-to-noise ratio of hundreds the gains of faint companions say little of it.
+
+    The best of those far out is notably larger, and a fit there is far worse.
+    """
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (east * u + north * v))
+        return (1.0 + contrast * fringe) / (1.0 + contrast)
+
+    found = search_field(observed(niriss(0.0005, 0.02), binary, rng), SearchOptions())
+    companion = found.result.companion
+    np.testing.assert_allclose([companion.east_mas, companion.north_mas], [east, north], atol=3.0)
+    assert found.result.chi2_binary < 2.0 * found.result.likelihood.n_independent
+    assert any("the field was widened" in said for said in found.warnings)
+
+
+def test_a_fit_on_the_inner_edge_is_followed_inwards(rng) -> None:
+    """At 1 mas, λ/4B: an alias at the edge of the default field fits to a reduced χ² near 1."""
+    sheet = four_telescopes(20, vis2_error=0.025, closure_error_deg=1.2)
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return (1.0 + 0.3 * np.exp(-2j * np.pi * MAS * (0.7 * u + 0.4 * v))) / 1.3
+
+    found = search_field(observed(sheet, binary, rng), SearchOptions()).result
+    assert found.grid.inner_mas < 0.6
+    assert found.companion.separation_mas == pytest.approx(np.hypot(0.7, 0.4), rel=0.4)
+    assert found.companion.position_angle_deg == pytest.approx(
+        np.degrees(np.arctan2(0.7, 0.4)), abs=4.0
+    )
+
+
+def test_a_bright_disc_outside_the_default_field_is_found(rng) -> None:
+    """A point outside fits worse than a disc inside: both are compared with their discs."""
+    stations = np.array([[0.0, 0.0], [125.0, 306.0], [-176.0, 216.0], [-69.0, 200.0]])
+    wavelengths = np.linspace(1.52e-6, 1.74e-6, 8)
+    sheet = join([
+        point_source(
+            stations @ np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]), wavelengths,
+            1e-10, vis2_error=0.02, closure_error_rad=0.02, mjd=60000.0 + a,
+        )
+        for a in (0.0, 0.2)
+    ])  # fmt: skip
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (3.0 * u - 6.0 * v))
+        star, other = (darkened_disc(d, 0.0, u, v) for d in (1.0, 1.2))
+        return (star + 0.5 * fringe * other) / 1.5
+
+    found = search_field(observed(sheet, binary, rng), SearchOptions())
+    companion = found.result.companion
+    np.testing.assert_allclose([companion.east_mas, companion.north_mas], [3.0, -6.0], atol=0.05)
+    assert companion.contrast == pytest.approx(0.5, abs=0.03)
 
 
 def test_baselines_without_length_are_refused_by_their_columns() -> None:

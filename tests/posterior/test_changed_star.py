@@ -80,6 +80,13 @@ def test_nodes_are_as_close_as_the_star_is_known_at_a_companion(slope: float) ->
         assert total == pytest.approx(1.0, abs=5e-3)
 
 
+def test_nodes_fill_the_prior_where_errors_are_not_known() -> None:
+    prior = Prior(1.0, 2.0, nuisance=((-20.0, 20.0),))
+    nodes = nuisance_nodes(prior, np.zeros((1, 1)), np.full((1, 1), np.nan))
+    assert np.isfinite(nodes.value).all()
+    assert np.exp(nodes.log_weight).sum() == pytest.approx(1.0, abs=1e-6)
+
+
 def test_integral_and_draws_have_the_evidence_of_brute_force() -> None:
     """4.5 errors of the sum; nodes by the disc's error beside a companion were 0.17 off."""
     likelihood, prior = problem(0)

@@ -31,7 +31,7 @@ from amibayes.report import Column, Page, Section, Statement, Table, captioned, 
 from amibayes.report.page import Sky, page_html, read_figure
 from amibayes.report.search_page import SECTIONS
 from amibayes.report.sections.joint import RESIDUALS
-from amibayes.report.statement import statement_of
+from amibayes.report.statement import sky_of, statement_of
 from amibayes.report.validation import validation_page, validation_pictures
 from amibayes.report.words import chance, count, measured, plain
 from amibayes.validation.tally import tally
@@ -212,6 +212,36 @@ def test_no_detection_states_a_limit(content) -> None:
     assert "Separation" not in " ".join(fact.name for fact in search_page(none).facts)
     none |= {"posterior": None, "limits": None}
     assert [fact.value for fact in search_page(none).facts] == ["34\u00a0%"]
+
+
+def test_a_companion_that_another_star_replaces_is_not_stated(content) -> None:
+    """Noise alone does not give it, and a star that changes with wavelength does."""
+    other = copy.deepcopy(content)
+    other["significance"]["detected"] = True
+    because = "a star whose diameter changes with wavelength, from 1 to 2 mas, fits as well"
+    other["verdict"] = {"statement": "no companion", "because": because, "note": ""}
+    said = statement_of(other)
+    assert (said.kind, said.label) == ("none", "No companion detected")
+    assert said.headline == f"No companion is stated: {because}."
+    assert [mark.kind for mark in sky_of(other).marks] == ["candidate"] + ["mode"] * (
+        len(sky_of(other).marks) - 1
+    )
+    assert "Separation" not in " ".join(fact.name for fact in search_page(other).facts)
+    other["verdict"]["statement"] = "model rejected"
+    assert "Separation" not in " ".join(fact.name for fact in search_page(other).facts)
+
+
+def test_what_the_data_leave_open_has_no_error(content) -> None:
+    open_place = copy.deepcopy(content)
+    open_place["significance"]["detected"] = True
+    open_place["verdict"] = None
+    open_place["fit"]["errors"] |= {"separation_mas": 1913.0, "position_angle_deg": 85346.0}
+    words = statement_of(open_place).headline.replace("\u00a0", " ")
+    assert "mas (undetermined), position angle" in words
+    assert "° (undetermined)" in words
+    assert not {"1913", "85346"} & set(words.split())
+    facts = {fact.name: fact.value for fact in search_page(open_place).facts}
+    assert facts["Separation"].endswith(" mas (undetermined)")
 
 
 def test_a_posterior_without_a_detection_is_no_measurement(content) -> None:

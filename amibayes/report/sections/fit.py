@@ -7,7 +7,7 @@ from typing import Any
 from amibayes.models.bands import band_name
 from amibayes.report.page import Column, Fact, Section, Table
 from amibayes.report.sections.joint import joint_tables
-from amibayes.report.statement import false_alarm, field
+from amibayes.report.statement import companion_stated, false_alarm, field
 from amibayes.report.words import (
     FARTHEST_TOLD,
     NONE,
@@ -85,7 +85,7 @@ def _modes(content: Json) -> tuple[Table, ...]:
         for m in modes[:MAX_MODES]
     )
     caption = "Positions that fit nearly as well, best first; the probability is among these"
-    if content["significance"]["detected"] is False:
+    if companion_stated(content) is False:
         caption = "Best positions of the field; the probability is among these, had it a companion"
     if len(modes) > MAX_MODES:
         caption += f" ({len(modes) - MAX_MODES} more in result.json)"
@@ -188,7 +188,7 @@ def posterior(content: Json) -> Section | None:
         f"{count(p['n_effective'], 'independent sample')}, split R̂ "
         f"{fixed(p['split_rhat'], 3)}.",
     ]
-    if content["significance"]["detected"] is False:
+    if companion_stated(content) is False:
         text.insert(
             0,
             "No companion was detected: these are the places and contrasts that the data leave to "
