@@ -135,6 +135,9 @@ def _companion(
     if not note and within_calibration(data, change_by_companion(result)):
         note = SMALL
     left += f"; but {note}" if note else ""
+    found = result.companion
+    if not found.separation_error_mas <= found.separation_mas:  # infinite, perhaps NaN
+        left += "; its place is undetermined"
     return Verdict("companion", _found(tested) + left, p_model, note)
 
 
@@ -330,10 +333,11 @@ def _found(tested: Significance) -> str:
 
 
 def _nothing(tested: Significance) -> str:
+    unsure = tested.probability < tested.alpha
     return (
         "noise alone gives something as good in the field with a probability of "
         f"{tested.probability:.2g}"
-    )
+    ) + (f", which is not below {tested.alpha:.2g} with 95 % confidence" if unsure else "")
 
 
 def _share(p: float) -> str:

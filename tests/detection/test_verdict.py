@@ -181,6 +181,32 @@ def test_no_star_alone_is_stated_that_does_not_fit(
     assert said.because.endswith("with a probability of 0.5")
 
 
+@pytest.mark.parametrize(("upper", "said"), [(0.008, False), (0.02, True)])
+def test_a_small_probability_that_few_draws_tell_is_said_not_to_be_sure(
+    upper: float, said: bool, rng: np.random.Generator
+) -> None:
+    """Detection asks for an interval below α = 0.01, and this one may reach past it."""
+    result = search(Likelihood(simulated(niriss(), [0.0, 150.0, 0.02], rng)), (60.0, 300.0))
+    tested = Significance(20.0, np.arange(1000.0), 0.004, (0.001, upper), None, 0.01)
+    nothing = Significance(1.0, np.arange(20.0), 0.9, (0.8, 1.0), None, 0.01)
+    found = verdict(result, tested, nothing, ())
+    assert (found.statement == "no companion") is said
+    assert found.because.endswith("0.004, which is not below 0.01 with 95 % confidence") is said
+
+
+@pytest.mark.parametrize("error", [200.0, np.inf, np.nan])
+def test_a_companion_without_a_place_is_said_to_have_none(
+    error: float, rng: np.random.Generator
+) -> None:
+    result = search(Likelihood(simulated(niriss(), [0.0, 150.0, 0.02], rng)), (60.0, 300.0))
+    tested = Significance(100.0, np.arange(1000.0), 1e-3, (0.0, 4e-3), None, 0.01)
+    nothing = Significance(1.0, np.arange(20.0), 0.9, (0.8, 1.0), None, 0.01)
+    unsure = replace(result, companion=replace(result.companion, separation_error_mas=error))
+    known, open_ = (verdict(r, tested, nothing, ()) for r in (result, unsure))
+    assert known.statement == open_.statement == "companion"
+    assert open_.because == f"{known.because}; its place is undetermined"
+
+
 def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:
     """At PA 0 in one file, at PA 90 in the other: no companion of both."""
     rng, parts = np.random.default_rng(2), []
