@@ -140,6 +140,11 @@ probability changes by about as large a part as a scale (measured at 0.01): at m
 quarter of what ten thousand draws leave uncertain, and scales themselves are known to 15 %."""
 
 
+NO_SCATTER = 1e-30
+"""Variance, in units of the stated one, of data that are all as the model: phases that were set to
+0, say. Single precision holds one over it."""
+
+
 @dataclass(frozen=True, eq=False)
 class FreeScale(ErrorTreatment):
     """Every group of data scatters by its own amount, which each data set tells by itself.
@@ -172,7 +177,7 @@ class FreeScale(ErrorTreatment):
 
     def _total(self, bank: TemplateBank, chi2: FloatArray) -> FloatArray:
         """χ² of data sets, not below what the least variance makes of their number."""
-        return np.maximum(chi2, self.least * (bank.n_data - bank.n_nuisance))
+        return np.maximum(chi2, max(self.least * (bank.n_data - bank.n_nuisance), NO_SCATTER))
 
     @property
     def null_rests_on_residuals(self) -> bool:
@@ -217,7 +222,7 @@ class FreeScale(ErrorTreatment):
         self, bank: TemplateBank, data: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Weigh data (n_data, n) by the scatter of their groups: (n_data, n), (n_groups, n), χ²."""
-        weight = 1.0 / np.maximum(self.groups.variances(data), self.least)
+        weight = 1.0 / np.maximum(self.groups.variances(data), max(self.least, NO_SCATTER))
         rows = weight[self.groups.label] * data
         return bank.project(rows), weight, (rows * data).sum(axis=0)
 
@@ -371,7 +376,8 @@ class Ratio:
         """Statistic of gains in χ² (n,) from a χ² without a companion (n,)."""
         if not np.isfinite(self.count):
             return gain
-        share = np.minimum(gain / (chi2 + self.added), 1.0 - 1e-15)
+        # Data without residuals, all phases 0 say, have nothing to gain.
+        share = np.minimum(gain / np.maximum(chi2 + self.added, NO_SCATTER), 1.0 - 1e-15)
         return np.asarray(-self.count * np.log1p(-share))
 
     def gain_at(self, statistic: FloatArray) -> FloatArray:

@@ -134,6 +134,16 @@ def test_gain_at_a_threshold_is_the_inverse_of_the_ratio() -> None:
         assert float(ratio(np.array([gain]), gain + 30.0)[0]) == pytest.approx(12.0)
 
 
+@pytest.mark.parametrize("kinds", [("vis2", "cp"), ("cp",)])
+def test_data_that_are_all_as_the_model_have_no_gain(kinds: tuple[str, ...]) -> None:
+    """Phases that were set to 0: neither a scatter of 0 nor 0 of it gained is a number's divisor."""
+    test = make_statistic(Likelihood(niriss().only(kinds)), make_grid(*FIELD, 31.0), np.empty(0))
+    assert isinstance(test.treatment, FreeScale)
+    nothing = np.zeros_like(test.observed)
+    assert test.hits(nothing[:, None]).statistic[0] == 0.0
+    assert not test.field(nothing).any()
+
+
 def test_scatter_of_few_data_is_as_stated_unless_they_say_otherwise() -> None:
     """Against Bayes' rule on a fine grid of ln v, half of the prior at 1."""
     rng, n = np.random.default_rng(4), 4000
