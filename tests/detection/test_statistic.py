@@ -136,7 +136,7 @@ def test_gain_at_a_threshold_is_the_inverse_of_the_ratio() -> None:
 
 @pytest.mark.parametrize("kinds", [("vis2", "cp"), ("cp",)])
 def test_data_that_are_all_as_the_model_have_no_gain(kinds: tuple[str, ...]) -> None:
-    """Phases that were set to 0: neither a scatter of 0 nor 0 of it gained is a number's divisor."""
+    """Phases that were set to 0: a scatter of 0 is not divided by, nor a gain of 0 out of 0."""
     test = make_statistic(Likelihood(niriss().only(kinds)), make_grid(*FIELD, 31.0), np.empty(0))
     assert isinstance(test.treatment, FreeScale)
     nothing = np.zeros_like(test.observed)
