@@ -105,6 +105,18 @@ def test_sums_of_residuals_have_the_likelihood_of_their_sums(kind, rng) -> None:
     np.testing.assert_allclose(noise.log_prob_of_sums(a, b, pairs), expected, rtol=1e-10)
 
 
+def test_a_scale_that_is_known_has_no_extra_noise_in_its_posterior(rng) -> None:
+    """Residuals of a t distribution whose scale is the stated one, however large they are."""
+    data = understated(TRUTH, 2.0, rng)
+    result, _ = averaged(data)
+    fits = [(result.likelihood, result.theta)]
+    noise = averaged_student_noise(result.likelihood.noise, data, fits, free_scale=False)
+    for found in noise.posterior(result.likelihood.difference(result.theta)).values():
+        assert found.probability_none == 1.0
+        assert found.interval() == (0.0, 0.0, 0.0)
+        assert len(found.amount.low) == len(found.amount.high) == len(found.amount.weight) == 1
+
+
 @pytest.mark.slow
 def test_noise_of_the_posterior_is_the_noise_of_the_data() -> None:
     """Right errors: probably right. Understated by 3: certainly not, and the amount is told."""

@@ -276,6 +276,16 @@ def test_each_mistake_is_found(name: str, tmp_path: Path) -> None:
         assert not finding.certain or finding.code in REMEDIES
 
 
+@pytest.mark.parametrize(
+    ("degrees", "told"), [(360.0, False), (-360.0, False), (361.0, True), (-361.0, True)]
+)
+def test_a_whole_turn_is_the_most_that_a_phase_may_be(
+    degrees: float, told: bool, tmp_path: Path
+) -> None:
+    path = changed(tmp_path / "a.fits", set_column("OI_T3", "T3PHI", 3, degrees))
+    assert ("phase-range" in codes(path)) == told
+
+
 def test_trailing_bytes(rng: np.random.Generator, tmp_path: Path) -> None:
     path = tmp_path / "a.fits"
     write_oifits(path, star(rng))
