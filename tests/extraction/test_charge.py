@@ -37,10 +37,11 @@ def visit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k, (ratio, n) in enumerate(((1.0, 40), (1.0, 40), (0.2, 80))):
         rate = ratio * PEAK_E / (share * GROUPS * MOVING.frame_time_s)
         observation = Observation(
-            Scene((Point(),), f"star {k}"), INSTRUMENT, Exposure(GROUPS, n, keep_ramps=True),
+            Scene((Point(),), f"star {k}"), INSTRUMENT,
+            Exposure(GROUPS, n, keep_ramps=True, n_pixels=56),
             replace(MOVING), count_rate_e_s=rate,
         )  # fmt: skip
-        maps = draw_maps(MOVING, (80, 80), np.random.default_rng(11))
+        maps = draw_maps(MOVING, (56, 56), np.random.default_rng(11))
         prepared = prepare_exposure(observation, np.random.SeedSequence([11, k]), maps)
         write_exposure(folder / f"star{k}_calints.fits", prepared, SerialExecutor())
     return folder

@@ -44,7 +44,7 @@ def with_companion(diameter_mas: float = 1.0) -> Observables:
 
 @cache
 def imaged() -> ab.ReconstructedImage:
-    return ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0)
+    return ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0, pixel_mas=0.6)
 
 
 def test_a_resolved_star_keeps_its_light() -> None:
@@ -87,7 +87,9 @@ def test_an_image_is_dark_as_far_as_the_star_is_not_told_from_its_surroundings()
 
 
 def test_a_star_of_a_given_diameter_keeps_its_light() -> None:
-    image = ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0, diameter_mas=1.0)
+    image = ab.reconstruct_image(
+        with_companion(), weight=10.0, field_mas=13.0, pixel_mas=0.6, diameter_mas=1.0
+    )
     assert image.beside_star == 0.0
     assert image.flux == pytest.approx(COMPANION[2], rel=0.4)
     assert image.p_fit > 1e-3
@@ -146,7 +148,7 @@ def test_the_flux_ends_at_its_bound_with_a_warning() -> None:
         lambda u, v, _: disc_visibility(np.hypot(u, v), 3.0).astype(complex),
         np.random.default_rng(2),
     )
-    image = ab.reconstruct_image(data, weight=1.0, pixel_mas=0.5, diameter_mas=0.0)
+    image = ab.reconstruct_image(data, weight=1.0, pixel_mas=0.7, diameter_mas=0.0)
     assert image.flux < 1.01 * MAX_FLUX
     assert image.beside_star > 0.1
     told = " ".join(warnings_of(image))

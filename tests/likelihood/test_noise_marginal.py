@@ -55,7 +55,7 @@ def test_average_is_the_integral_over_the_noise(kind, factor, rng) -> None:
     data = replace(data, covariance=niriss(covariance=kind).covariance)
     result, marginal = averaged(data, FLAT)
     theta = np.array([result.theta, result.theta + np.array([1.0, 2.0, 5e-4])])
-    x, w = np.polynomial.legendre.leggauss(150)
+    x, w = np.polynomial.legendre.leggauss(80)
     inflation = np.log(MAX_INFLATION) * 0.5 * (1.0 + x)
     expected = np.zeros(2)
     for kind_of, typical in (({"vis2"}, 0.005), ({"cp"}, np.radians(0.3))):
