@@ -153,6 +153,8 @@ def _unprinted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         return
     monkeypatch.setattr("matplotlib.figure.Figure.get_layout_engine", lambda figure: None)
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", _save_noise)
+    # A process that draws for the targets of a table would load all anew, and render.
+    monkeypatch.setattr("amibayes.parallel.run_apart", lambda function, *of: function(*of))
 
 
 def _save_noise(figure: Figure, path: str | Path, **options: object) -> None:

@@ -28,7 +28,7 @@ def functions(folder: Path = PACKAGE, *, docstrings: bool = False) -> dict[str, 
     """Lines of every function and method, by ``path:line name``."""
     out = {}
     for path in sorted(folder.rglob("*.py")):
-        for node in _nodes(path.read_text(encoding="utf-8")):
+        for node in nodes(path.read_text(encoding="utf-8")):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 name = f"{path.relative_to(folder)}:{node.lineno} {node.name}"
                 whole = int(node.end_lineno or node.lineno) - node.lineno + 1
@@ -53,7 +53,8 @@ def modules(folder: Path = PACKAGE) -> dict[str, int]:
 
 
 @cache
-def _nodes(source: str) -> list[ast.AST]:
+def nodes(source: str) -> list[ast.AST]:
+    """Everything in a module, parsed once."""
     return list(ast.walk(ast.parse(source)))
 
 
@@ -61,7 +62,7 @@ def _nodes(source: str) -> list[ast.AST]:
 def code(source: str) -> list[tuple[int, str]]:
     """Lines of code with their numbers: no comments, docstrings, imports or blank lines."""
     passed: set[int] = set()
-    for node in _nodes(source):
+    for node in nodes(source):
         text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
         if text or isinstance(node, ast.Import | ast.ImportFrom):
             passed |= set(range(node.lineno, int(node.end_lineno or node.lineno) + 1))
@@ -100,8 +101,8 @@ def public_names(folder: Path = PACKAGE) -> int:
     """Names that the package gives, as type checkers read them."""
     stub = folder / "__init__.pyi"
     source = (stub if stub.is_file() else folder / "__init__.py").read_text(encoding="utf-8")
-    nodes = [n for n in _nodes(source) if isinstance(n, ast.ImportFrom)]
-    own = [n for n in nodes if n.level or str(n.module).startswith("amibayes")]
+    imports = [n for n in nodes(source) if isinstance(n, ast.ImportFrom)]
+    own = [n for n in imports if n.level or str(n.module).startswith("amibayes")]
     return sum(len(node.names) for node in own)
 
 

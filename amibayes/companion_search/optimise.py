@@ -52,6 +52,10 @@ of them, the diameters of the minima are others), and how many of the best are f
 SIMPLEX_EVALUATIONS = 400
 """Of a fit without gradients of two or three parameters, which takes some 150."""
 
+STARS_AROUND, SIGMAS_AROUND = 512, 2.0
+"""Stars that V² allow, and how many of its errors they scatter by: those whose closure phases are
+on the right side of every null may be a hundredth of them."""
+
 FINEST_STEP = 0.0025
 """Scale of a star's parameters in their fit, as a part of their ranges."""
 
@@ -111,7 +115,7 @@ def _across_walls(
 
     Where a baseline is at a null its closure phases turn by 180° at once: χ² has walls there,
     at which a fit by gradients ends. That of V² has none, and its best star is next to that of
-    all data.
+    all data: the likeliest of those that V² allow is on the right side of the walls.
     """
     n = star.observables.n_vis2
     sigma = np.sqrt(star.noise.covariance.variance[:n, None])
@@ -124,8 +128,18 @@ def _across_walls(
 
     start, _ = min((_best_of(chi2_vis2, ladder) for ladder in ladders), key=lambda f: f[1])
     first, _ = _without_gradients(of_vis2, start, scale, bounds)
-    starts = [first, min(fits, key=lambda fit: fit[1])[0]]
+    nearest, _ = _best_of(star.chi2, _around(first, star.slopes(first)[:n] / sigma, bounds))
+    starts = [first, nearest, min(fits, key=lambda fit: fit[1])[0]]
     return [_without_gradients(objective, start, scale, bounds) for start in starts]
+
+
+def _around(best: FloatArray, slopes: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Parameters (n, n_dim) that data of these whitened slopes (n_data, n_dim) allow, in bounds."""
+    _, size, turn = np.linalg.svd(slopes, full_matrices=False)
+    error = SIGMAS_AROUND / np.maximum(size, 1e-300)
+    rng = np.random.default_rng(0)
+    draws = qmc.MultivariateNormalQMC(np.zeros(len(size)), rng=rng).random(STARS_AROUND)
+    return np.asarray(np.clip(best + (draws * error) @ turn, *bounds.T))
 
 
 def _without_gradients(

@@ -33,7 +33,8 @@ class Marginal:
     @cached_property
     def _knots(self) -> tuple[FloatArray, FloatArray]:
         """Values and the cumulative probability there; it is linear in between."""
-        least = MIN_WIDTH * max(float(self.high.max() - self.low.min()), 1e-300)
+        # A single amount has no range; one over the least width is a number still.
+        least = max(MIN_WIDTH * float(self.high.max() - self.low.min()), 1e-300)
         width = np.maximum(self.high - self.low, least)
         slope = self.weight / width
         value = np.concatenate([self.low, self.low + width])

@@ -242,3 +242,28 @@ def test_rules_that_make_no_sense(rng: np.random.Generator) -> None:
     first = float(np.degrees(np.sort(star.closure_phase.value)[0]))
     some = flag_by_rule(star, ["vis2>-9", f"cp_deg>{first}"])
     assert 0 < some.closure_phase.flag.sum() < len(some.closure_phase)
+
+
+@pytest.mark.parametrize("usable", ["vis2", "closure_phase", None])
+def test_bins_of_flagged_data_are_flagged_and_have_no_errors(usable: str | None) -> None:
+    """Whichever kind it is, or both: the covariance is of what may be used."""
+    data = noisy(np.random.default_rng(1), [1.60e-6, 1.62e-6, 1.64e-6, 1.66e-6])
+    kept = [np.full(len(data.vis2), usable == "vis2")]
+    kept += [np.full(len(data.closure_phase), usable == "closure_phase")]
+    some = replace(
+        data,
+        vis2=replace(data.vis2, flag=~kept[0]),
+        closure_phase=replace(data.closure_phase, flag=~kept[1]),
+        covariance=data.covariance.select(np.flatnonzero(np.concatenate(kept))),
+    )
+    binned = bin_channels(some, 2)
+    assert len(binned.vis2) == len(data.vis2) // 2
+    assert len(binned.closure_phase) == len(data.closure_phase) // 2
+    np.testing.assert_array_equal(binned.vis2.flag, usable != "vis2")
+    np.testing.assert_array_equal(binned.closure_phase.flag, usable != "closure_phase")
+    used = sum(map(len, kept)) - sum((~k).sum() for k in kept)
+    assert binned.covariance.size == used // 2
+    # Two independent channels of equal errors.
+    np.testing.assert_allclose(
+        2.0 * binned.covariance.variance, some.covariance.variance[: used // 2]
+    )

@@ -59,9 +59,10 @@ def test_a_star_of_several_lobes_is_fitted_as_well_as_by_brute_force(seed: int) 
     assert alone.chi2(theta[None])[0] == pytest.approx(deviance)
 
 
-def test_closure_phases_with_errors_too_small_at_the_nulls_do_not_stop_the_fit() -> None:
+@pytest.mark.parametrize("seed", [9, 13, 23])
+def test_closure_phases_with_errors_too_small_at_the_nulls_do_not_stop_the_fit(seed: int) -> None:
     """Their χ² has walls between stars that differ by a hundredth of a milliarcsecond."""
-    rng = np.random.default_rng(23)
+    rng = np.random.default_rng(seed)
     diameter, exponent = rng.uniform(2.0, 4.0), rng.uniform(0.1, 0.6)
     truth = BinaryModel(diameter_mas=diameter, limb_darkening=exponent)
     data = simulated(coverage("mirc6t", 0.005, 0.005), [5.0, 5.0, 0.0], rng, truth)
@@ -70,3 +71,13 @@ def test_closure_phases_with_errors_too_small_at_the_nulls_do_not_stop_the_fit()
     likelihood = with_noise(Likelihood(data, model), ExtraNoise(floors=(floor,)))
     at_truth = single_likelihood(likelihood).chi2(np.array([[diameter, exponent]]))[0]
     assert fit_single(likelihood)[1] < at_truth
+
+
+def test_one_baseline_is_fitted_by_many_stars_and_by_one_of_them_exactly() -> None:
+    """Two parameters and one number."""
+    data = simulated(coverage("mirc6t", 0.005, 0.005), [0.0, 0.0, 0.0], np.random.default_rng(1))
+    first = np.arange(len(data.vis2)) == 0
+    one = data.select(first, np.zeros(len(data.closure_phase), bool))
+    one = replace(one, vis2=replace(one.vis2, value=np.array([0.4])))
+    likelihood = Likelihood(one, BinaryModel(diameter_mas="free", limb_darkening="free"))
+    assert fit_single(likelihood)[1] < 1e-6

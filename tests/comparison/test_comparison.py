@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from helpers import niriss, simulated
 from scipy.special import logsumexp
 
 from amibayes.companion_search.search import search
-from amibayes.comparison.best_fits import NoiseSetting, _best_noise
+from amibayes.comparison.best_fits import NoiseSetting, _best_noise, best_fits
 from amibayes.comparison.compare import compare_sky_models
 from amibayes.comparison.fit_models import embedded, fit_model
 from amibayes.comparison.fitting import least_squares
@@ -89,6 +90,23 @@ def test_search_is_as_good_as_brute_force(truth: str, name: str) -> None:
     data = np.tile(base.observables.data[:, None], (1, len(starts)))
     _, chi2 = least_squares(found.model, starts, data)
     assert found.chi2[0] < chi2.min() + 1.0
+
+
+@pytest.mark.parametrize(("truth", "narrowed"), [("companion", False), ("disc", True)])
+def test_the_field_is_the_default_one_again_where_other_light_explains_the_data(
+    truth: str, narrowed: bool
+) -> None:
+    """A search that looked farther out did so for a companion, which it did not find inside."""
+    base = base_of(truth, TRUTHS[truth])
+    result = SimpleNamespace(likelihood=base, modes=[SimpleNamespace(theta=TRUTHS["companion"])])
+    asked = [Hypothesis(name) for name in ("star", "companion", "disc")]
+    wide, default = Prior(60.0, 700.0, contrast_min=1e-4), (70.0, 380.0)
+    streams = [np.random.default_rng(k) for k in range(4)]
+    fits, _ = best_fits(asked, result, wide, None, NoiseSetting(), (), default, streams)
+    found = fits[1].model.prior
+    expected = default if narrowed else (60.0, 700.0)
+    assert (found.inner_mas, found.outer_mas) == expected
+    assert expected[0] <= np.hypot(*fits[1].theta[:2]) <= expected[1]
 
 
 def test_least_squares_finds_the_truth() -> None:
@@ -312,6 +330,23 @@ def test_the_averaged_noise_has_the_errors_that_data_are_simulated_with() -> Non
     for term in noise.terms:
         size = ((term.whitening @ drawn) ** 2).sum(axis=0).mean() / term.n_independent
         assert 0.5 < size < 2.0
+
+
+@pytest.mark.parametrize("turn", [360.0, 180.0])
+@pytest.mark.parametrize("middle", [0.0, 0.25, 0.5, 0.75])
+def test_angles_spread_over_most_of_a_turn_are_cut_opposite_their_mean(
+    turn: float, middle: float
+) -> None:
+    """A uniform distribution of two thirds of a turn: 68 % of it about its middle."""
+    x = np.linspace(-1.0 / 3.0, 1.0 / 3.0, 4001)
+    values = turn * ((middle + x) % 1.0)
+    found = _interval(0.0, values, np.full(4001, 1.0 / 4001), turn)
+    half = 0.68 * turn / 3.0
+    assert (found.upper - found.median, found.median - found.lower) == pytest.approx(
+        (half, half), abs=1e-3 * turn
+    )
+    assert (found.median / turn - middle + 0.5) % 1.0 == pytest.approx(0.5, abs=1e-3)
+    assert -1e-9 * turn <= found.median < turn
 
 
 @pytest.mark.parametrize(("turn", "middle"), [(360.0, 2.0), (180.0, 175.0), (0.0, -3.0)])

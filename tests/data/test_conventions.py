@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amibayes.companion_search.search import search
-from amibayes.data.measurements import Measurements
+from amibayes.data.measurements import Measurements, exposure_labels
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
@@ -149,3 +149,29 @@ def test_naming_the_holes_otherwise_gives_the_same_data(names) -> None:
 
     expected = chi2_of(NIRISS_HOLES)
     assert chi2_of(NIRISS_HOLES[list(names)]) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "integrations_s", "exposures"),
+    [
+        (10.0, (1.0, 1.0), 1),
+        (25.0, (1.0, 1.0), 2),
+        (25.0, (40.0, 20.0), 1),
+        (35.0, (40.0, 20.0), 2),
+        (35.0, (40.0, np.nan), 2),
+    ],
+)
+def test_rows_go_together_that_were_taken_together(
+    gap_s: float, integrations_s: tuple[float, float], exposures: int
+) -> None:
+    """Nearer than 17 s, or begun before those before them had ended; times are mid-exposure."""
+    closure = SHEET.closure_phase
+    later = np.arange(len(closure)) >= 20
+    rows = replace(
+        closure,
+        row=np.arange(len(closure)),
+        mjd=60000.0 + later * gap_s / 86400.0,
+        integration_s=np.where(later, integrations_s[1], integrations_s[0]),
+    )
+    found = exposure_labels(rows)
+    np.testing.assert_array_equal(found, later * (exposures - 1))

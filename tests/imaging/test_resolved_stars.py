@@ -44,7 +44,7 @@ def with_companion(diameter_mas: float = 1.0) -> Observables:
 
 @cache
 def imaged() -> ab.ReconstructedImage:
-    return ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0)
+    return ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0, pixel_mas=0.6)
 
 
 def test_a_resolved_star_keeps_its_light() -> None:
@@ -62,8 +62,34 @@ def test_a_resolved_star_keeps_its_light() -> None:
     assert not image.bounds
 
 
+def test_an_image_is_dark_as_far_as_the_star_is_not_told_from_its_surroundings() -> None:
+    """To λ/4B of the longest baseline, 0.7 mas: a companion at 1.9 mas has its place.
+
+    That of the shortest, 2.4 mas, lies beyond the companion.
+    """
+    sheet = interferometer.four_telescopes(3, 1, vis2_error=0.01, closure_error_deg=0.6)
+    longest = max(np.hypot(sheet.vis2.u_m, sheet.vis2.v_m)[:, 0] / sheet.vis2.wavelength_m)
+
+    def visibility(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        companion = 0.1 * np.exp(-2j * np.pi * MAS * (1.6 * u + 1.0 * v))
+        return (disc_visibility(np.hypot(u, v), 1.0) + companion) / 1.1
+
+    data = interferometer.observed(sheet, visibility, np.random.default_rng(4))
+    image = ab.reconstruct_image(
+        data, weight=10.0, field_mas=6.0, pixel_mas=0.5, diameter_mas="free"
+    )
+    x = image.grid.offset_mas
+    dark = np.hypot(x, x[:, None]) < 0.25 / longest / MAS
+    assert dark.sum() > 1
+    assert image.light[dark].max() == 0.0
+    row, column = np.unravel_index(int(image.light.argmax()), image.light.shape)
+    assert x[[column, row]] == pytest.approx([1.6, 1.0], abs=0.3)
+
+
 def test_a_star_of_a_given_diameter_keeps_its_light() -> None:
-    image = ab.reconstruct_image(with_companion(), weight=10.0, field_mas=13.0, diameter_mas=1.0)
+    image = ab.reconstruct_image(
+        with_companion(), weight=10.0, field_mas=13.0, pixel_mas=0.6, diameter_mas=1.0
+    )
     assert image.beside_star == 0.0
     assert image.flux == pytest.approx(COMPANION[2], rel=0.4)
     assert image.p_fit > 1e-3
@@ -96,6 +122,24 @@ def test_gradient_with_a_free_diameter_is_that_of_finite_differences() -> None:
         assert (high - low) / 2.0 == pytest.approx(gradient @ step, rel=1e-4)
 
 
+def test_a_disc_beyond_the_largest_ends_there() -> None:
+    """The largest is known by its visibility at the shortest baseline, which is lower still."""
+    sheet = interferometer.four_telescopes(2, 1, vis2_error=0.01)
+    samples, grid = uv_points_of(sheet), PixelGrid(5, 1.0)
+    response = pixel_response(samples, grid)
+    problem = Problem(response, grid, REGULARISERS["tv"](grid), False, samples.frequency)
+    for part, ends, precise in ((0.5, (), 0.1), (1.2, ("diameter",), 1e-6)):
+        true = part * problem.largest_disc_mas
+        data = interferometer.observed(
+            sheet, lambda u, v, _, d=true: disc_visibility(np.hypot(u, v), d).astype(complex)
+        )
+        term = DataTerm.of(data, samples)
+        found = problem.solve(term, 1e4, np.append(np.full(25, 1e-6), 0.9 * true**2))
+        assert problem.ends(found) == ends
+        expected = min(true, problem.largest_disc_mas)
+        assert np.sqrt(found[-1]) == pytest.approx(expected, rel=precise)
+
+
 def test_the_flux_ends_at_its_bound_with_a_warning() -> None:
     """A star said to be a point that is a disc of 3 mas: the image takes its place."""
     sheet = interferometer.four_telescopes(3, vis2_error=0.01)
@@ -104,7 +148,7 @@ def test_the_flux_ends_at_its_bound_with_a_warning() -> None:
         lambda u, v, _: disc_visibility(np.hypot(u, v), 3.0).astype(complex),
         np.random.default_rng(2),
     )
-    image = ab.reconstruct_image(data, weight=1.0, pixel_mas=0.5, diameter_mas=0.0)
+    image = ab.reconstruct_image(data, weight=1.0, pixel_mas=0.7, diameter_mas=0.0)
     assert image.flux < 1.01 * MAX_FLUX
     assert image.beside_star > 0.1
     told = " ".join(warnings_of(image))

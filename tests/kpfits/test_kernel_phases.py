@@ -295,6 +295,16 @@ def test_audit_of_errors_that_frames_contradict(tmp_path: Path) -> None:
     assert content["files"][0]["findings"][0]["code"] == "kp-scatter"
 
 
+@pytest.mark.parametrize(("scale", "severity"), [(1.5, "error"), (0.6, "warning"), (1.0, None)])
+def test_errors_too_small_are_worse_than_errors_too_large(
+    scale: float, severity: str | None, tmp_path: Path
+) -> None:
+    """A search finds companions that are none with the former, and misses some with the latter."""
+    value = scale * noisy(np.random.default_rng(3), 10)
+    found = audit_kpfits(kernel_file(tmp_path / "a.fits", value)).findings
+    assert [(f.code, f.severity) for f in found] == [("kp-scatter", severity)] * bool(severity)
+
+
 @pytest.mark.slow
 def test_search_with_calibrators_writes_everything(tmp_path: Path) -> None:
     """The whole command, small; the calibrated kernel phases are a KPFITS file."""

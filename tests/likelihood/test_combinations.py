@@ -126,7 +126,8 @@ def test_every_combination_works_or_is_refused(channels, covariance, scope, bank
             with pytest.raises(UsageError, match=why[0]):
                 require(asked)
             continue
-        fitted, theta = fit(stated, asked, per_file=per_file)
+        if companions == 1:
+            fitted, theta = fit(stated, asked, per_file=per_file)
         model = replace(stated.model, companions=companions)
         delivered = fitted.with_model(model)
         sets = np.array([theta_of(stated, companions)] * 2)

@@ -14,7 +14,7 @@ from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.detection.treatments import Ratio
-from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise_fit import fit_noise
 
@@ -72,6 +72,15 @@ def test_honest_errors_get_no_extra_noise(n: int, most: int) -> None:
         for _ in range(n)
     )
     assert hits <= most
+
+
+def test_a_prior_of_no_extra_noise_leaves_none(rng) -> None:
+    """However much the data scatter."""
+    theta = np.array([120.0, -70.0, 0.02])
+    likelihood = Likelihood(understated(theta, rng))
+    assert fit_noise(likelihood, theta).vis2 > 0.01
+    none = fit_noise(likelihood, theta, prior=NoisePrior(0.0, 0.0))
+    assert none.vis2 == none.closure_phase_rad == 0.0
 
 
 @pytest.mark.slow

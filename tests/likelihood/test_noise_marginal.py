@@ -55,7 +55,7 @@ def test_average_is_the_integral_over_the_noise(kind, factor, rng) -> None:
     data = replace(data, covariance=niriss(covariance=kind).covariance)
     result, marginal = averaged(data, FLAT)
     theta = np.array([result.theta, result.theta + np.array([1.0, 2.0, 5e-4])])
-    x, w = np.polynomial.legendre.leggauss(150)
+    x, w = np.polynomial.legendre.leggauss(80)
     inflation = np.log(MAX_INFLATION) * 0.5 * (1.0 + x)
     expected = np.zeros(2)
     for kind_of, typical in (({"vis2"}, 0.005), ({"cp"}, np.radians(0.3))):
@@ -103,6 +103,18 @@ def test_sums_of_residuals_have_the_likelihood_of_their_sums(kind, rng) -> None:
     for i, k in np.argwhere(pairs):
         expected[i, k] = noise.log_prob((a[:, i] + b[:, k])[:, None])[0]
     np.testing.assert_allclose(noise.log_prob_of_sums(a, b, pairs), expected, rtol=1e-10)
+
+
+def test_a_scale_that_is_known_has_no_extra_noise_in_its_posterior(rng) -> None:
+    """Residuals of a t distribution whose scale is the stated one, however large they are."""
+    data = understated(TRUTH, 2.0, rng)
+    result, _ = averaged(data)
+    fits = [(result.likelihood, result.theta)]
+    noise = averaged_student_noise(result.likelihood.noise, data, fits, free_scale=False)
+    for found in noise.posterior(result.likelihood.difference(result.theta)).values():
+        assert found.probability_none == 1.0
+        assert found.interval() == (0.0, 0.0, 0.0)
+        assert len(found.amount.low) == len(found.amount.high) == len(found.amount.weight) == 1
 
 
 @pytest.mark.slow

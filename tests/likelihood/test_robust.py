@@ -216,7 +216,7 @@ def test_false_alarm_probability_stays_uniform(share) -> None:
     likelihood = Likelihood(data)
     frame, grid = symmetric_whitening(data), make_grid(*FIELD, 23.5)
     test = make_statistic(likelihood, grid, np.empty(0), whitening=frame)
-    null = np.sort(test.draw_null(20_000, rng))
+    null = np.sort(test.draw_null(5_000, rng))
     n = 400
     sets = [spoiled(np.zeros(3), rng, share)[0] for _ in range(n)]
     blank = likelihood.predict([np.zeros(3)])[:, 0]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -120,9 +122,18 @@ def test_closures_given_as_independent(rng: np.random.Generator, tmp_path: Path)
 Change = Callable[[fits.HDUList], None]
 
 
-def changed(rng: np.random.Generator, path: Path, change: Change, **options: Any) -> Path:
+@cache
+def clean(**options: Any) -> bytes:
+    """One of our clean files."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.fits"
+        write_oifits(path, star(np.random.default_rng(20201211), **options))
+        return path.read_bytes()
+
+
+def changed(path: Path, change: Change, **options: Any) -> Path:
     """One of our clean files with something done to it."""
-    write_oifits(path, star(rng, **options), overwrite=True)
+    path.write_bytes(clean(**options))
     with fits.open(path, memmap=False) as hdus:
         change(hdus)
         hdus.writeto(path.with_name("changed.fits"), overwrite=True)
@@ -254,15 +265,25 @@ CASES: dict[str, tuple[Change, set[str]]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_each_mistake_is_found(name: str, rng: np.random.Generator, tmp_path: Path) -> None:
+def test_each_mistake_is_found(name: str, tmp_path: Path) -> None:
     change, expected = CASES[name]
-    found = audit(changed(rng, tmp_path / "a.fits", change, sigma=1e-3))
+    found = audit(changed(tmp_path / "a.fits", change, sigma=1e-3))
     assert {f.code for f in found.findings} == expected
     for finding in found.findings:
         assert finding.what
         assert finding.why
         assert finding.remedy
         assert not finding.certain or finding.code in REMEDIES
+
+
+@pytest.mark.parametrize(
+    ("degrees", "told"), [(360.0, False), (-360.0, False), (361.0, True), (-361.0, True)]
+)
+def test_a_whole_turn_is_the_most_that_a_phase_may_be(
+    degrees: float, told: bool, tmp_path: Path
+) -> None:
+    path = changed(tmp_path / "a.fits", set_column("OI_T3", "T3PHI", 3, degrees))
+    assert ("phase-range" in codes(path)) == told
 
 
 def test_trailing_bytes(rng: np.random.Generator, tmp_path: Path) -> None:
@@ -272,11 +293,11 @@ def test_trailing_bytes(rng: np.random.Generator, tmp_path: Path) -> None:
     assert codes(path) == {"trailing-bytes"}
 
 
-def test_turned_triangle_is_named(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_turned_triangle_is_named(tmp_path: Path) -> None:
     def turn(hdus: fits.HDUList) -> None:
         hdus["OI_T3"].data["T3PHI"][4] *= -1
 
-    path = changed(rng, tmp_path / "a.fits", turn, sigma=1e-3)
+    path = changed(tmp_path / "a.fits", turn, sigma=1e-3)
     (finding,) = audit(path).findings
     assert finding.code == "non-closing"
     stations = open_oifits(path).named("OI_T3")[0].columns["STA_INDEX"][4]
@@ -289,7 +310,7 @@ def test_phases_that_fill_a_circle_of_radians(rng: np.random.Generator, tmp_path
         data["T3PHI"] = rng.uniform(-np.pi, np.pi, data["T3PHI"].shape)
         data["T3PHI"][0] = 3.1
 
-    assert "phase-in-radians" in codes(changed(rng, tmp_path / "a.fits", wild))
+    assert "phase-in-radians" in codes(changed(tmp_path / "a.fits", wild))
 
 
 def jwst_like(hdus: fits.HDUList, n: int, *, normalized: bool = False) -> None:
@@ -330,8 +351,8 @@ def jwst_like(hdus: fits.HDUList, n: int, *, normalized: bool = False) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 69])
-def test_vis2_errors_divided_twice(n: int, rng: np.random.Generator, tmp_path: Path) -> None:
-    path = changed(rng, tmp_path / "a.fits", lambda h: jwst_like(h, n))
+def test_vis2_errors_divided_twice(n: int, tmp_path: Path) -> None:
+    path = changed(tmp_path / "a.fits", lambda h: jwst_like(h, n))
     found = audit(path)
     assert {f.code for f in found.findings} == ({"vis2-error-divided-twice"} if n > 1 else set())
     if n > 1:
@@ -357,9 +378,7 @@ def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
         hdus["OI_VIS"].data["VISAMPERR"] = right / (2 * np.sqrt(value))
 
     for wrong in (True, False):
-        path = changed(
-            rng, tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal"
-        )
+        path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")
         assert ("exchanged-errors" in codes(path)) == wrong
 
 
@@ -375,15 +394,11 @@ def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: 
         data["T3PHIERR"] = np.degrees(across / (1 if wrong else amplitude))
 
     for wrong in (True, False):
-        path = changed(
-            rng, tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal"
-        )
+        path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")
         assert ("phase-error-times-amplitude" in codes(path)) == wrong
 
 
-def test_repair_mends_what_is_certain_and_nothing_else(
-    rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_repair_mends_what_is_certain_and_nothing_else(tmp_path: Path) -> None:
     def spoil(hdus: fits.HDUList) -> None:
         in_radians(hdus)
         hdus["OI_VIS2"].data["VIS2DATA"][3] = np.nan
@@ -391,7 +406,7 @@ def test_repair_mends_what_is_certain_and_nothing_else(
         hdus[0].header["OBSERVER"] = ""
         hdus[0].header["DATE-OBS"] = ""
 
-    path = changed(rng, tmp_path / "a.fits", spoil)
+    path = changed(tmp_path / "a.fits", spoil)
     path.write_bytes(path.read_bytes() + b"\0" * 10)
     found = audit(path)
     fixed = repair(found.oifits, list(found.findings), tmp_path / "fixed.fits")
@@ -490,15 +505,15 @@ def test_any_column_may_be_anything(spoilt: str, tmp_path: Path) -> None:
         assert any(column in text for text in said), (name, column)
 
 
-def test_numbers_of_stations_are_unique(rng: np.random.Generator, tmp_path: Path) -> None:
-    twice = changed(rng, tmp_path / "a.fits", set_column("OI_ARRAY", "STA_INDEX", 1, 1))
+def test_numbers_of_stations_are_unique(tmp_path: Path) -> None:
+    twice = changed(tmp_path / "a.fits", set_column("OI_ARRAY", "STA_INDEX", 1, 1))
     (finding,) = [f for f in audit(twice).findings if f.code == "repeated"]
     assert "STA_INDEX in OI_ARRAY" in finding.what
 
 
 @pytest.mark.parametrize(("minutes", "told"), [(10.0, False), (2000.0, True)])
 def test_integration_times_are_read_in_their_unit(
-    minutes: float, told: bool, rng: np.random.Generator, tmp_path: Path
+    minutes: float, told: bool, tmp_path: Path
 ) -> None:
     """2000 minutes are longer than a night, 2000 s are not."""
 
@@ -506,14 +521,12 @@ def test_integration_times_are_read_in_their_unit(
         hdus["OI_VIS2"].columns["INT_TIME"].unit = "min"
         hdus["OI_VIS2"].data["INT_TIME"] = minutes
 
-    found = codes(changed(rng, tmp_path / "a.fits", in_minutes))
+    found = codes(changed(tmp_path / "a.fits", in_minutes))
     assert ("integration-time" in found) == told
 
 
 @pytest.mark.parametrize("vis2", [0.1, 0.8])
-def test_errors_in_radians_are_told_at_any_vis2(
-    vis2: float, rng: np.random.Generator, tmp_path: Path
-) -> None:
+def test_errors_in_radians_are_told_at_any_vis2(vis2: float, tmp_path: Path) -> None:
     """σ(CP) = √3 σ(V²)/2V², as given by three independent baselines of equal V²."""
     right = np.sqrt(3.0) * 1e-3 / (2.0 * vis2)
 
@@ -526,7 +539,7 @@ def test_errors_in_radians_are_told_at_any_vis2(
         return change
 
     for sigma, told in ((right, True), (np.degrees(right), False)):
-        path = changed(rng, tmp_path / "a.fits", with_errors(sigma), kind="diagonal")
+        path = changed(tmp_path / "a.fits", with_errors(sigma), kind="diagonal")
         assert ("phase-in-radians" in codes(path)) == told
         said = errors_in(open_oifits(path), read_oifits(path))
         assert any("look like radians" in line for line in said) == told
@@ -566,40 +579,38 @@ def reformatted(name: str, column: str, form: str) -> Change:
     ],
 )
 def test_columns_of_another_format_are_told(
-    table: str, column: str, form: str, told: bool, rng: np.random.Generator, tmp_path: Path
+    table: str, column: str, form: str, told: bool, tmp_path: Path
 ) -> None:
     """The standard: doubles, a number for each channel, two stations, texts of any length."""
-    path = changed(rng, tmp_path / "a.fits", reformatted(table, column, form))
+    path = changed(tmp_path / "a.fits", reformatted(table, column, form))
     formats = [f for f in audit(path).findings if f.code == "column-format"]
     assert [column in f.what for f in formats] == [True] * told
 
 
-def test_tables_without_flags_are_looked_at(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_tables_without_flags_are_looked_at(tmp_path: Path) -> None:
     def without(hdus: fits.HDUList) -> None:
         hdus["OI_VIS2"].columns.del_col("FLAG")
         hdus["OI_VIS2"].data["VIS2DATA"][3] = 1.4
 
-    found = codes(changed(rng, tmp_path / "a.fits", without, sigma=1e-3))
+    found = codes(changed(tmp_path / "a.fits", without, sigma=1e-3))
     assert {"vis2-above-one", "column-missing"} <= found
 
 
-def test_unknown_stations_are_no_station_twice(rng: np.random.Generator, tmp_path: Path) -> None:
+def test_unknown_stations_are_no_station_twice(tmp_path: Path) -> None:
     """Zeros say that stations are not known; they are made of (u, v) then."""
     zeros = set_column("OI_VIS2", "STA_INDEX", slice(None), 0)
-    assert "station-twice" not in codes(changed(rng, tmp_path / "a.fits", zeros))
+    assert "station-twice" not in codes(changed(tmp_path / "a.fits", zeros))
 
 
-def test_correlations_of_the_datum_before_the_first(
-    rng: np.random.Generator, tmp_path: Path
-) -> None:
-    path = changed(rng, tmp_path / "a.fits", set_column("OI_CORR", "IINDX", 3, 0))
+def test_correlations_of_the_datum_before_the_first(tmp_path: Path) -> None:
+    path = changed(tmp_path / "a.fits", set_column("OI_CORR", "IINDX", 3, 0))
     assert any("indices outside" in f.what for f in audit(path).findings)
 
 
 @pytest.mark.parametrize("column", ["STAXYZ", "DIAMETER"])
 @pytest.mark.parametrize("damage", ["gone", "text", "zero"])
 def test_arrays_without_positions_or_sizes_are_read(
-    column: str, damage: str, rng: np.random.Generator, tmp_path: Path
+    column: str, damage: str, tmp_path: Path
 ) -> None:
     def change(hdus: fits.HDUList) -> None:
         if damage == "zero":
@@ -612,7 +623,7 @@ def test_arrays_without_positions_or_sizes_are_read(
         new.header.update({key: old.header[key] for key in ("EXTNAME", "OI_REVN", "ARRNAME")})
         hdus[hdus.index_of("OI_ARRAY")] = new
 
-    path = changed(rng, tmp_path / "a.fits", change)
+    path = changed(tmp_path / "a.fits", change)
     found, whole = read_oifits(path), read_oifits(tmp_path / "a.fits")
     np.testing.assert_array_equal(found.vis2.u_m, whole.vis2.u_m)
     assert len(found.vis2) == 21

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.io import fits
+from astropy.time import Time
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oi_builders import HandMade, table
@@ -651,3 +652,19 @@ def test_sign_of_a_shared_baseline_is_that_of_its_direction() -> None:
     found = shared_baseline_sign(phases, np.array([0, 0, 0, 0]), np.array([1, 2, 3, 4]))
     # 2 → 0 closes the first triangle; the last one goes from 0 to 2.
     np.testing.assert_array_equal(found, [1.0, -1.0, 0.0, -1.0])
+
+
+def test_rows_without_a_date_have_that_of_their_table(tmp_path: Path) -> None:
+    """Its night, and the second of it at which they were taken; other rows keep their own."""
+    made = HandMade(np.random.default_rng(3))
+    mjd = 57000.5 + np.arange(6.0)
+    given = mjd.copy()
+    given[[1, 4]] = np.nan, 0.0
+    made.put("OI_VIS2", "MJD", given)
+    made.put("OI_VIS2", "TIME", 3600.0 * np.arange(6))
+    found = read_oifits(made.write(tmp_path / "a.fits"))
+    night = Time("2014-12-09").mjd
+    mjd[[1, 4]] = night + np.array([1.0, 4.0]) / 24.0
+    by_row = np.unique(np.stack([found.vis2.row, found.vis2.mjd], axis=1), axis=0)[:, 1]
+    np.testing.assert_allclose(by_row, mjd, rtol=0.0, atol=1e-8)
+    assert "MJD missing; taken from DATE-OBS and TIME" in " ".join(found.notes)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from oi_builders import diagonal, random_observables
 
 from amibayes.data.assumed_covariance import covariance_of_errors
-from amibayes.data.covariance import dense_covariance
+from amibayes.data.covariance import dense_covariance, diagonal_covariance
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, RunError, UsageError
@@ -418,3 +418,28 @@ def test_frame_of_the_stations_is_kept(rng: np.random.Generator, tmp_path: Path)
     again = read_oifits(tmp_path / "a.fits")
     assert again.setups[0].array_frame == "GEOCENTRIC"
     assert again.setups[0].array_centre_m == centre
+
+
+def test_entries_of_two_tables_of_one_file_stay_apart(
+    rng: np.random.Generator, tmp_path: Path
+) -> None:
+    """A table that another program has copied into the file: both say the same places."""
+    data = random_observables(rng, n_stations=5, kind="diagonal")
+    order = rng.permutation(len(data.vis2))
+    shuffled = replace(
+        data,
+        vis2=data.vis2.select(order),
+        covariance=diagonal_covariance(
+            np.concatenate([data.errors[0][order], data.errors[1]]) ** 2
+        ),
+    )
+    write_oifits(tmp_path / "a.fits", shuffled)
+    np.testing.assert_array_equal(read_oifits(tmp_path / "a.fits").vis2.value, shuffled.vis2.value)
+    with fits.open(tmp_path / "a.fits") as hdus:
+        again = hdus["OI_VIS2"].copy()
+        again.data["VIS2DATA"] += 1.0
+        hdus.append(again)
+        hdus.writeto(tmp_path / "b.fits")
+    first, second = np.split(read_oifits(tmp_path / "b.fits").vis2.value, 2)
+    np.testing.assert_allclose(second, first + 1.0)
+    np.testing.assert_allclose(np.sort(first), np.sort(data.vis2.value))

@@ -18,12 +18,14 @@ from jwst_products import (
     binary,
     columns_of,
     integrations,
+    product,
     with_other_numbers,
     write_product,
 )
 
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.reading import check_together, read_observations
+from amibayes.instrument import load_instrument
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.oifits.audit import audit, repair
 from amibayes.oifits.products import open_products, pointing_of, product_of, read_product
@@ -105,6 +107,19 @@ def test_each_repair_is_named(tmp_path: Path, rng: np.random.Generator) -> None:
     assert "one calibrator" in " ".join(
         read_oifits(made("aminorm-oi", tmp_path / "c.fits", rng)).notes
     )
+
+
+def test_the_band_of_a_filter_that_is_not_known_is_widened_alike(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """The stated width is that of F480M's product: within 1 % of the filter's at half height."""
+    unknown = product("ami-oi", draws(rng))
+    unknown[0].header["FILTER"] = "F999X"
+    unknown.writeto(tmp_path / "a.fits")
+    low, high = load_instrument("niriss", "F480M").bandpass.half_power_m
+    found = read_oifits(tmp_path / "a.fits")
+    np.testing.assert_allclose(found.vis2.band_m, high - low, rtol=0.01)
+    np.testing.assert_allclose(found.closure_phase.band_m, high - low, rtol=0.01)
 
 
 def quoted_over_true(

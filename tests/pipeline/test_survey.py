@@ -169,6 +169,8 @@ def test_the_picture_of_few_and_of_many(n: int, tmp_path: Path) -> None:
     assert np.array(Image.open(tmp_path / "picture.png")).std() > 1
 
 
+# With the process beside this one that draws for all targets, as a user has it.
+@pytest.mark.usefixtures("full_pictures")
 def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert run("limits", "--batch", survey, "--out", out, *CLOSED) == 4

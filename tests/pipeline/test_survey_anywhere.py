@@ -87,6 +87,7 @@ def cluster() -> Iterator[str]:
         end(process)
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_two_dask_workers_of_two_threads(survey: Path, tmp_path: Path, cluster: str) -> None:
     """With their pictures, which both threads want at a time."""
     Table({"target": ["s2.oifits", "s3.oifits"]}).write(survey / "two.ecsv")

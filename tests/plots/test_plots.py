@@ -493,7 +493,7 @@ def test_residuals_of_angles_go_the_short_way_round() -> None:
 def test_numbers_of_colour_bars_stay_apart(tmp_path: Path) -> None:
     """A companion far outside of the stated star's light: 21 000 of its flux in a pixel."""
     data = simulated(niriss(), [110.0, -75.0, 0.02], np.random.default_rng(3))
-    found = reconstruct_image(data, weight=10.0, rng=np.random.default_rng(4))
+    found = reconstruct_image(data, weight=100.0, pixel_mas=60.0, rng=np.random.default_rng(4))
     bright = replace(found, light=found.light * 21_000.0 / found.light.max())
     figure = image_plot(bright)
     save(figure, tmp_path / "image.png")

@@ -87,6 +87,19 @@ def test_nodes_fill_the_prior_where_errors_are_not_known() -> None:
     assert np.exp(nodes.log_weight).sum() == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("error", [0.0, 50.0])
+def test_nodes_cover_a_range_in_which_the_data_tell_nothing(error: float) -> None:
+    """Moments of a uniform prior, whatever the fit; beside it one that the data tell."""
+    prior = Prior(1.0, 2.0, nuisance=((2.0, 5.0), (-20.0, 20.0)))
+    errors = np.array([[error**2, 0.5 * error], [0.5 * error, 1.0]])
+    nodes = nuisance_nodes(prior, np.array([[4.0, 0.0]]), errors)
+    mass, x = np.exp(nodes.log_weight), nodes.value[:, 0]
+    second = np.exp(-0.5 * nodes.value[:, 1] ** 2) / np.sqrt(2.0 * np.pi) * 40.0
+    for power in (0, 1, 2, 5):
+        expected = (5.0 ** (power + 1) - 2.0 ** (power + 1)) / (3.0 * (power + 1))
+        assert (mass * second) @ x**power == pytest.approx(expected, rel=1e-3)
+
+
 def test_integral_and_draws_have_the_evidence_of_brute_force() -> None:
     """4.5 errors of the sum; nodes by the disc's error beside a companion were 0.17 off."""
     likelihood, prior = problem(0)

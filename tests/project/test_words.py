@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -40,12 +41,17 @@ def texts() -> list[Path]:
     return [p for p in found if not made & set(p.parts) and str(p.relative_to(ROOT)) not in LATER]
 
 
-@pytest.mark.parametrize("word", INSTEAD)
-def test_plain_words(word: str) -> None:
-    found = [
-        f"{path.relative_to(ROOT)}:{n}: {line.strip()[:90]}"
+@cache
+def lines() -> list[tuple[str, str]]:
+    """Every line with its place."""
+    return [
+        (f"{path.relative_to(ROOT)}:{n}", line)
         for path in texts()
         for n, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
-        if re.search(word, line)
     ]
+
+
+@pytest.mark.parametrize("word", INSTEAD)
+def test_plain_words(word: str) -> None:
+    found = [f"{at}: {line.strip()[:90]}" for at, line in lines() if re.search(word, line)]
     assert not found, f"instead: {INSTEAD[word]}\n" + "\n".join(found)

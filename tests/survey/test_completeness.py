@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import special
 
 from amibayes.limits.mass_table import MassTable
 from amibayes.survey.completeness import Crossings, DetectionProbability, from_counts, stack
+from amibayes.survey.rows import Outcome
+from amibayes.survey.together import statistics
 from amibayes.units import delta_mag_to_contrast
 
 
@@ -77,3 +81,19 @@ def test_au_and_masses_are_of_each_target_by_itself() -> None:
                 contrast = delta_mag_to_contrast([mag])
                 each.append(one(np.array([rho]), contrast)[0, 0] if known else 0.0)
             assert found.mean[i, j] == pytest.approx(np.mean(each))
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_masses_have_the_unit_of_their_tables(n: int, tmp_path: Path) -> None:
+    """And reach from the least of all tables to the largest, of one target as of several."""
+    rng, outcomes = np.random.default_rng(4), []
+    for k in range(n):
+        table = tmp_path / f"{k}.csv"
+        table.write_text(f"mass_mjup,absolute_mag\n{100 + k},8\n30,10\n{10 - k},14\n")
+        facts = {"mass_table": str(table), "primary_magnitude": 4.0, "distance_pc": 10.0}
+        found = target(rng)
+        row = {"limit_delta_mag_best": 6.0}
+        outcomes.append(Outcome(f"s{k}", "done", row=row, detection=found, facts=facts))
+    found = statistics(outcomes)[1]["completeness_au"]
+    assert found["mass_unit"] == "M_Jup"
+    assert (found["mass"][0], found["mass"][-1]) == pytest.approx((11.0 - n, 99.0 + n))
