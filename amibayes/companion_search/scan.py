@@ -62,6 +62,11 @@ MAX_UNEQUAL = 100.0
 """Variances of groups, in units of the mean, are not told apart beyond this and its inverse."""
 
 
+NO_SCATTER = 1e-30
+"""Variance, in units of the stated one, of data that are all as the model: phases that were set to
+0, say. Single precision holds one over it."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScaleGroups:
     """Which independent data share a scale of their errors.

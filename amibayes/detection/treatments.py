@@ -14,7 +14,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 from scipy import special, stats
 
-from amibayes.companion_search.scan import GroupWeights, ScaleGroups, weighted_gain
+from amibayes.companion_search.scan import NO_SCATTER, GroupWeights, ScaleGroups, weighted_gain
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.noise_terms import MAX_INFLATION, PRIOR_STATED_ERRORS_CORRECT
 from amibayes.likelihood.student import SymmetricWhitening, scores
@@ -138,11 +138,6 @@ LATTICE = 0.05
 """Step of ln scale at which null sets are drawn, so that targets of equal errors share them. A
 probability changes by about as large a part as a scale (measured at 0.01): at most by 2.5 %, a
 quarter of what ten thousand draws leave uncertain, and scales themselves are known to 15 %."""
-
-
-NO_SCATTER = 1e-30
-"""Variance, in units of the stated one, of data that are all as the model: phases that were set to
-0, say. Single precision holds one over it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +371,6 @@ class Ratio:
         """Statistic of gains in χ² (n,) from a χ² without a companion (n,)."""
         if not np.isfinite(self.count):
             return gain
-        # Data without residuals, all phases 0 say, have nothing to gain.
         share = np.minimum(gain / np.maximum(chi2 + self.added, NO_SCATTER), 1.0 - 1e-15)
         return np.asarray(-self.count * np.log1p(-share))
 
