@@ -13,9 +13,9 @@ from amibayes.companion_search.result import RIVAL, Mode, SearchResult
 from amibayes.companion_search.seeds import MAX_COARSE_DATA, MODE_LIMIT, coarse_likelihood
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.errors import DataError
-from amibayes.likelihood.extra_noise import NoisePrior, with_noise
+from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 from amibayes.units import MAS, FloatArray
@@ -227,6 +227,7 @@ def choose_field(
     near = make_grid(NEARER * inner, inner, NEARER * step)
     gains = _gains(still, near, single)
     separation = float(np.hypot(*place))
+    widened = MARGIN * separation
     if gains.max(initial=0.0) > min(gain - MODE_LIMIT, (1.0 - NOTABLY_BETTER) * gain):
         # What is nearer to the star than two baselines can tell has aliases far out.
         best = int(gains.argmax())
@@ -237,9 +238,8 @@ def choose_field(
         bank, box = TemplateBank(still, near, single), Box(NEARER * inner, farthest, fringe)
         fits = [_fit_from(at, bank, still, single, box, 0.0) for at in (nearer, place)]
         if fits[0].delta_chi2 > fits[1].delta_chi2 - MODE_LIMIT:
-            separation = fits[0].companion.separation_mas
-            return (NEARER * inner, MARGIN * float(np.hypot(*place))), separation
-    return (inner, MARGIN * separation), separation
+            return (NEARER * inner, widened), fits[0].companion.separation_mas
+    return (inner, widened), separation
 
 
 def wider_fields(result: SearchResult) -> list[tuple[float, float]]:
@@ -315,8 +315,7 @@ def _holds(
     """Whether a companion outside still fits notably better with the noise fitted beside it."""
     bank = TemplateBank(likelihood, within, single)
     theta = np.array(_fit_from(place, bank, likelihood, single, box, 0.0).theta)
-    stated = likelihood.expecting(theta)
-    noisy = with_noise(stated, fit_noise(stated, theta, prior=prior))
+    _, noisy = noise_beside(likelihood, theta, prior=prior)
     alone, chi2 = fit_single(noisy)
     gain = chi2 - float(noisy.deviance(noisy.chi2(theta))[0])
     return bool(gain > _gains(noisy, within, alone).max(initial=0.0) + MODE_LIMIT)

@@ -18,10 +18,9 @@ from amibayes.likelihood.extra_noise import (
     MAX_ROUNDS,
     ExtraNoise,
     NoisePrior,
-    with_noise,
 )
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.likelihood.student import averaged_student_noise
 
 
@@ -87,9 +86,7 @@ def _best_noise(
     found = []
     for mode in result.modes[:MODES_TRIED]:
         theta = np.array(mode.theta)
-        likelihood = stated.expecting(theta)
-        noise = fit_noise(likelihood, theta, per_file=per_file, prior=prior)
-        found.append((noise, with_noise(likelihood, noise), theta))
+        found.append((*noise_beside(stated, theta, per_file=per_file, prior=prior), theta))
     noise, noisy, _ = max(found, key=lambda f: float(f[1].log_prob(f[2])[0]))
     return noise, noisy
 

@@ -13,9 +13,9 @@ from amibayes.comparison.hypotheses import MORE_GENERAL, Hypothesis, prior_of
 from amibayes.comparison.unit_cube import CubeModel
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import averaged_noise
-from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.posterior.priors import Prior, PriorSetting
 from amibayes.units import FloatArray
 
@@ -156,9 +156,10 @@ def _best_noise(
     clean = Likelihood(stated, base.model)
     tried = []
     for fit in fits:
-        likelihood = clean.with_model(fit.model.likelihood.model).expecting(fit.theta)
-        found = fit_noise(likelihood, fit.theta, per_file=setting.per_file, prior=setting.prior)
-        noisy = with_noise(likelihood, found)
+        likelihood = clean.with_model(fit.model.likelihood.model)
+        found, noisy = noise_beside(
+            likelihood, fit.theta, per_file=setting.per_file, prior=setting.prior
+        )
         tried.append((float(noisy.log_prob(fit.theta[None])[0]), noisy, found, fit.hypothesis))
     value, noisy, found, one = max(tried, key=lambda t: t[0])
     same = found == setting.found

@@ -17,9 +17,9 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import SEE, note_of
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
-from amibayes.likelihood.extra_noise import MAX_ROUNDS, NoisePrior, with_noise
+from amibayes.likelihood.extra_noise import MAX_ROUNDS, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.likelihood.residuals import files_of
 from amibayes.units import FloatArray
 
@@ -167,10 +167,8 @@ def star_alone(
     likelihood = Likelihood(stated, single_likelihood(result.likelihood).model)
     theta = fit_single(likelihood)[0]
     for _ in range(MAX_ROUNDS):
-        expecting = likelihood.expecting(theta)
-        noise = fit_noise(expecting, theta, per_file=per_file, prior=prior)
-        noisy, before = with_noise(expecting, noise), theta
-        theta = fit_single(noisy)[0]
+        _, noisy = noise_beside(likelihood, theta, per_file=per_file, prior=prior)
+        before, theta = theta, fit_single(noisy)[0]
         if np.allclose(theta, before, rtol=1e-2, atol=0.0):
             break
     return noisy, theta

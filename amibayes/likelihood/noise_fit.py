@@ -39,6 +39,7 @@ from amibayes.likelihood.extra_noise import (
     NoisePrior,
     covariance_of,
     mean_of_files,
+    with_noise,
 )
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.residuals import groups_of
@@ -87,6 +88,22 @@ def fit_noise(
         extra = mean_of_files(data, found)
     told = any(np.isfinite(c.error) or c.any for s in shares for c in (s.vis2, s.closure_phase))
     return replace(extra, channels=tuple(shares) if told else (), floors=prior.floors)
+
+
+def noise_beside(
+    stated: Likelihood,
+    theta: FloatArray,
+    *,
+    per_file: bool = False,
+    prior: NoisePrior | None = None,
+) -> tuple[ExtraNoise, Likelihood]:
+    """Fit the noise beside a model of parameters (n_dim,), and give the likelihood with it.
+
+    ``stated`` has the stated errors; see `fit_noise` for the others.
+    """
+    expecting = stated.expecting(theta)
+    noise = fit_noise(expecting, theta, per_file=per_file, prior=prior)
+    return noise, with_noise(expecting, noise)
 
 
 class _Fit:

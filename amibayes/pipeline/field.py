@@ -33,10 +33,10 @@ from amibayes.detection.outlying_rows import (
     outlying_rows,
     without_rows,
 )
-from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, with_noise
+from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.models.bands import reference_wavelength
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
@@ -192,13 +192,17 @@ def _in_wider_field(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
+    fields = wider_fields(first)
+    if not fields:
+        return first, []
     prior = noise_prior(likelihood.observables, options)
-    for field in wider_fields(first):
+    score = _score(first, prior)
+    for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
         found = _with_its_disc(likelihood, search(likelihood, field, check=False), options)
         if found.chi2_binary < EXPLAINED * first.chi2_binary or (
             found.chi2_binary < first.chi2_binary
-            and _score(first, prior) - _score(found, prior) > SURELY_NOT_NOISE
+            and score - _score(found, prior) > SURELY_NOT_NOISE
         ):
             place = found.companion.separation_mas
             return found, [
@@ -210,8 +214,7 @@ def _in_wider_field(
 
 def _score(result: SearchResult, prior: NoisePrior) -> float:
     """−2 ln L of a search with stated errors, with the noise that its best fit leaves."""
-    likelihood = result.likelihood.expecting(result.theta)
-    noisy = with_noise(likelihood, fit_noise(likelihood, result.theta, prior=prior))
+    _, noisy = noise_beside(result.likelihood, result.theta, prior=prior)
     return float(-2.0 * noisy.log_prob(result.theta)[0])
 
 

@@ -27,17 +27,15 @@ from amibayes.report.statement import (
     companion_stated,
     false_alarm,
     field,
+    numbers_of_place,
     refused,
     sky_of,
     statement_of,
 )
 from amibayes.report.words import (
-    LARGEST_ANGLE_DEG,
-    LARGEST_MAG,
     chance,
     count,
     fixed,
-    known,
     plain,
     sentence,
 )
@@ -130,23 +128,17 @@ def _subtitle(content: Json) -> str:
 
 def _tiles(content: Json) -> tuple[Fact, ...]:
     """The companion's numbers, or where none was detected those of what there is not."""
-    fit, errors = content["fit"], content["fit"]["errors"]
     chance_text = false_alarm(content["significance"])
     alarm = Fact("False-alarm probability", chance_text, "by noise, anywhere in the field")
     if companion_stated(content) is False:
         return (alarm, *_excluded(content))
-    if fit["contrast"] <= 0.0 or refused(content):
+    if content["fit"]["contrast"] <= 0.0 or refused(content):
         return (alarm,)
     label = "" if content["significance"]["detected"] else " (best fit)"
     label = " (of one companion)" if by_comparison(content) else label
-    place = (
-        Fact(f"{name}{label}", known(fit[key], errors[key], unit, largest))
-        for name, key, unit, largest in (
-            ("Separation", "separation_mas", " mas", fit["separation_mas"]),
-            ("Position angle", "position_angle_deg", "°", LARGEST_ANGLE_DEG),
-            ("Magnitude difference", "delta_mag", "", LARGEST_MAG),
-        )
-    )
+    names = ("Separation", "Position angle", "Magnitude difference")
+    texts = numbers_of_place(content, " mas", "")
+    place = (Fact(f"{name}{label}", text) for name, text in zip(names, texts, strict=True))
     return (*place, alarm)
 
 

@@ -49,9 +49,8 @@ def statement_of(content: Json) -> Statement:
     """
     if by_comparison(content):
         return _compared(content)
-    refused = _refused(content)
-    if refused is not None:
-        return refused
+    if refused(content):
+        return _refused(content)
     detected = companion_stated(content)
     kind = {True: "found", False: "none", None: "open"}[detected]
     headline = {True: _found, False: _nothing, None: _unjudged}[detected](content)
@@ -84,11 +83,9 @@ def refused(content: Json) -> bool:
     return stated and not by_comparison(content)
 
 
-def _refused(content: Json) -> Statement | None:
+def _refused(content: Json) -> Statement:
     """The statement where neither a star nor a star with a companion explains the data."""
-    verdict = content.get("verdict")
-    if verdict is None or verdict["statement"] not in REFUSED:
-        return None
+    verdict = content["verdict"]
     label, advice = REFUSED[verdict["statement"]]
     sentences = (advice, _summary(content), _chance(content))
     return Statement("open", label, sentence(verdict["because"]), tuple(s for s in sentences if s))
@@ -134,13 +131,20 @@ def _note(content: Json) -> str:
 
 def place(content: Json) -> str:
     """Where the best fit is, and how bright, with errors."""
-    fit, errors = content["fit"], content["fit"]["errors"]
-    rho = fit["separation_mas"]
-    separation = known(rho, errors["separation_mas"], "\u00a0mas", largest=rho)
-    angle = known(fit["position_angle_deg"], errors["position_angle_deg"], "°", LARGEST_ANGLE_DEG)
-    magnitude = known(fit["delta_mag"], errors["delta_mag"], "\u00a0mag", LARGEST_MAG)
+    separation, angle, magnitude = numbers_of_place(content, "\u00a0mas", "\u00a0mag")
     text = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
     return text.replace(" ±", "\u00a0±")
+
+
+def numbers_of_place(content: Json, mas: str, mag: str) -> list[str]:
+    """Separation, position angle and magnitude of the best fit with errors, in these units."""
+    fit, errors = content["fit"], content["fit"]["errors"]
+    numbers = (
+        ("separation_mas", mas, fit["separation_mas"]),
+        ("position_angle_deg", "°", LARGEST_ANGLE_DEG),
+        ("delta_mag", mag, LARGEST_MAG),
+    )
+    return [known(fit[key], errors[key], unit, largest) for key, unit, largest in numbers]
 
 
 def field(content: Json) -> str:

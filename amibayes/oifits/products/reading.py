@@ -17,7 +17,7 @@ from amibayes.oifits.products.mask_map import map_of
 from amibayes.oifits.products.recognise import (
     DATA_MODEL,
     Product,
-    is_product_header,
+    by_pipeline,
     product_of,
 )
 from amibayes.oifits.products.repairs import Repair, repaired
@@ -114,7 +114,7 @@ def read_product(oifits: OIFits, **options: Any) -> Observables | None:
         Where it cannot be read, or lacks V² or closure phases.
     """
     product = product_of(oifits)
-    if product is None and is_product_header(oifits.header, tuple(t.name for t in oifits.tables)):
+    if product is None and by_pipeline(oifits):
         raise _incomplete(oifits.path)
     return None if product is None else read_products([product], **options)[0]
 

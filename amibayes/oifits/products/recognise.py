@@ -80,14 +80,21 @@ def is_product_header(header: Header, names: tuple[str, ...]) -> bool:
     return plain(header.get("DATAMODL", "")) == DATA_MODEL or "OI_Q4" in names
 
 
+def by_pipeline(oifits: OIFits) -> bool:
+    """Whether a file is a product of the jwst package, by `is_product_header`."""
+    return is_product_header(oifits.header, tuple(t.name for t in oifits.tables))
+
+
 def product_of(oifits: OIFits) -> Product | None:
     """Find which product a file is; None for any other file."""
-    by_pipeline = is_product_header(oifits.header, tuple(t.name for t in oifits.tables))
-    if not by_pipeline and not any(IMPLANEIA in t.columns for t in oifits.named("OI_ARRAY")):
+    jwst = by_pipeline(oifits)
+    if not jwst and not any(IMPLANEIA in t.columns for t in oifits.named("OI_ARRAY")):
         return None
-    if any([len(t) > 0 for t in oifits.named(name)] != [True] for name in ("OI_VIS2", "OI_T3")):
-        return None
-    if not by_pipeline:
+    for name in ("OI_VIS2", "OI_T3"):
+        found = oifits.named(name)
+        if len(found) != 1 or not len(found[0]):
+            return None
+    if not jwst:
         return Product(oifits, "amimulti-oi", 0) if _has_integrations(oifits) else None
     count = oifits.header.get("NINTS")
     return Product(oifits, _kind(oifits), count if isinstance(count, int) else 0)
@@ -95,9 +102,7 @@ def product_of(oifits: OIFits) -> Product | None:
 
 def by_implaneia(product: Product) -> bool:
     """Whether integrations are ImPlaneIA's, whose T3AMP are no amplitudes of the triangles."""
-    return not is_product_header(
-        product.oifits.header, tuple(t.name for t in product.oifits.tables)
-    )
+    return not by_pipeline(product.oifits)
 
 
 def is_normalized(header: Header, columns: Collection[str]) -> bool:
