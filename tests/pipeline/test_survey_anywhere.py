@@ -21,7 +21,8 @@ from helpers import niriss, simulated
 
 from amibayes.oifits import write_oifits
 
-pytestmark = pytest.mark.slow
+# Pages hold their pictures, and the runs compared draw them in this process or in another.
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("full_pictures")]
 
 HERE = Path(__file__).parents[1]
 SUMMARIES = ("survey.json", "survey.ecsv", "survey.html")
@@ -87,7 +88,6 @@ def cluster() -> Iterator[str]:
         end(process)
 
 
-@pytest.mark.usefixtures("full_pictures")
 def test_two_dask_workers_of_two_threads(survey: Path, tmp_path: Path, cluster: str) -> None:
     """With their pictures, which both threads want at a time."""
     Table({"target": ["s2.oifits", "s3.oifits"]}).write(survey / "two.ecsv")
