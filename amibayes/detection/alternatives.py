@@ -30,6 +30,10 @@ choice among the field's positions."""
 MAX_NODES = 32
 """Wavelengths at which a diameter is free, linear in between; all channels' if there are fewer."""
 
+LARGEST_CHANGE = 1.6
+"""Ratio of diameters at two wavelengths that single stars are known to have: 1.4 of a Mira from 1.3
+to 2.3 µm (Wittkowski et al. 2008, A&A 479, L21), with room for their errors."""
+
 STEPS = 40
 """Evaluations of the Jacobian: a fit from the grey star's diameter takes 5 to 20."""
 
@@ -60,11 +64,14 @@ class Alternative:
         model: so much a parameter takes of noise.
     words : str
         What it is, for the reason of a verdict.
+    plausible : bool
+        Whether single stars of the kind are known.
     """
 
     kind: str
     chi2: float
     words: str
+    plausible: bool = True
 
 
 def alternative(result: SearchResult) -> Alternative | None:
@@ -145,7 +152,8 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
         f"a star whose diameter changes with wavelength, from {fit.x.min():.4g} to "
         f"{fit.x.max():.4g} mas"
     )
-    return Alternative("chromatic star", 2.0 * float(fit.cost) + max(more, 0), words)
+    plausible = bool(fit.x.max() <= LARGEST_CHANGE * fit.x.min())
+    return Alternative("chromatic star", 2.0 * float(fit.cost) + max(more, 0), words, plausible)
 
 
 def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative:

@@ -5,6 +5,9 @@ function drifts (`amibayes.likelihood.exposure_rows`). What a test takes for the
 residuals of the fit without a companion show: the best companion has taken a part of it. The mean
 of the covariance over its posterior weights the data, and null sets are drawn with values
 of the posterior: few exposures tell little, and then it is as wide as the prior.
+
+So is the size of calibration errors, which a table has of an instrument on a good night
+(`amibayes.data.systematics`): the gains of a few baselines hardly tell what they are that night.
 """
 
 from __future__ import annotations
@@ -13,24 +16,41 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from amibayes.companion_search.reduction import Roots
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.data.systematics import MIN_EXPOSURES
 from amibayes.likelihood.channel_noise import ChannelCovariance
-from amibayes.likelihood.channel_rows import ChannelRows, channel_layout, independent_rows
+from amibayes.likelihood.channel_rows import (
+    ChannelLayout,
+    ChannelRows,
+    channel_layout,
+    independent_rows,
+)
 from amibayes.likelihood.exposure_rows import Drift, Series, drift_of, series_of, turned_rows
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise import GaussianNoise
+from amibayes.likelihood.noise_fit import MIN_ROWS
 from amibayes.support.evenly import evenly
 from amibayes.units import FloatArray
 
-DRAWN = 32
-"""Pairs of κ and τ that null sets are drawn with, of equal probability."""
+DRAWN, DRAWN_OF_FLOORS = 32, 128
+"""Pairs of κ and τ that null sets are drawn with, of equal probability; and with sizes of floors,
+whose largest ones make the smallest false-alarm probabilities."""
+
+FLOOR_SPREAD = 0.5
+"""Standard deviation of ln of a floor's size: published ones of an instrument differ by factors
+of three to five (PIONIER, 3 to 15 % of V²), which is what two of these are to either side."""
+
+KNOWN = 0.1
+"""Standard deviation of ln of a size below which null sets are drawn with it as it is: thresholds
+would move by some hundredths. Two hundred gains tell their size as well."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureNoise:
-    """Noise that exposures share, and how well it is known.
+    """Noise that exposures and channels share, and how well it is known.
 
     Parameters
     ----------
@@ -39,7 +59,8 @@ class ExposureNoise:
     noise : GaussianNoise
         With the mean of the covariance over the posterior.
     roots : tuple of Roots
-        Of the covariance, whitened by that mean, for values of κ and τ of equal probability.
+        Of the covariance, whitened by that mean, for values of κ and τ and sizes of floors of
+        equal probability.
     """
 
     vis2: Drift | None
@@ -68,10 +89,10 @@ class ExposureNoise:
 
 
 def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise | None:
-    """Find what exposures share, from the residuals of a fit without a companion.
+    """Find what exposures share, and how large floors are, from a fit without a companion.
 
-    None where no baseline was observed twice in a night, and where the covariance was estimated
-    from scatter.
+    None where no baseline was observed twice in a night and no calibration errors are known, and
+    where the covariance was estimated from scatter.
 
     Parameters
     ----------
@@ -84,41 +105,82 @@ def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise 
     if rows is None and layout.any:
         return None  # no row of the whitened data is common to the channels
     rows = independent_rows(len(layout.order)) if rows is None else rows.apart or rows
-    series = series_of(data, layout)
-    if not series:
+    series, floor = series_of(data, layout), likelihood.noise.floor
+    # Long series have large matrices, of which so many would fill the memory.
+    many = floor and all(len(one.rows) < MIN_EXPOSURES for one in series)
+    sizes = _sizes(rows, layout, DRAWN_OF_FLOORS if many else DRAWN)
+    if not (series or np.ptp(sizes, axis=0).any()):
         return None
-    floor = likelihood.noise.floor
     alone = GaussianNoise(ChannelCovariance(data.covariance, rows), rows=rows, floor=floor)
     star = single_likelihood(likelihood.with_noise(alone))
     both = np.column_stack([star.residuals(single)[:, 0], star.jacobian(single)])
     of_kinds = [[one for one in series if one.vis2 == kind] for kind in (True, False)]
     vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
-    turned, roots = _turned(rows, series, vis2, closure)
+    turned, roots = _turned(rows, sizes, series, vis2, closure)
     covariance = ChannelCovariance(data.covariance, turned)
     return ExposureNoise(vis2, closure, GaussianNoise(covariance, rows=turned, floor=floor), roots)
 
 
+def _sizes(rows: ChannelRows, layout: ChannelLayout, n: int) -> FloatArray:
+    """Standard deviations of rows (n, rank), for floors of sizes of equal probability.
+
+    Offsets and slopes of V² and of closure phases of each file have a size of their own. m of them
+    that are larger than the table says are found so (`amibayes.likelihood.noise_fit`) where ln of
+    their size is off by √(2/m).
+    """
+    variance = np.tile(rows.sigma**2, (n, 1))
+    group = np.empty((2, len(layout.order)), dtype=np.intp)
+    group[:, layout.order] = layout.source, layout.vis2
+    of_floor = np.where(rows.floor > 0.0, rows.level, 0)
+    middle = ndtri((np.arange(n) + 0.5) / n)
+    for seed, key in enumerate(np.unique(np.array([*group, of_floor])[:, of_floor > 0], axis=1).T):
+        here = np.flatnonzero((np.array([*group, of_floor]) == key[:, None]).all(axis=0))
+        share = rows.floor[here] / rows.sigma[here] ** 2
+        told = 0.5 * (share**2).mean() * max(len(here) - MIN_ROWS, 0)
+        spread = 1.0 / np.sqrt(FLOOR_SPREAD**-2 + told)
+        if spread < KNOWN:
+            continue
+        # Sizes do not depend on each other: each comes in an order of its own.
+        size = np.random.default_rng(seed).permutation(np.exp(spread * middle))
+        variance[:, here] += (size**2 - 1.0)[:, None] * rows.floor[here]
+    return np.sqrt(variance)
+
+
 def _turned(
-    rows: ChannelRows, series: Sequence[Series], vis2: Drift | None, closure: Drift | None
+    rows: ChannelRows,
+    sizes: FloatArray,
+    series: Sequence[Series],
+    vis2: Drift | None,
+    closure: Drift | None,
 ) -> tuple[ChannelRows, tuple[Roots, ...]]:
     """Rows turned by the mean of their covariance, and roots of the covariance of new rows.
 
-    These for κ and τ of equal probability.
+    These for κ and τ, and standard deviations of rows (n, rank), of equal probability.
     """
     # The kinds' shares do not depend on each other: those of closure phases come in another order.
-    mixed = np.argsort(evenly(DRAWN))
+    n = len(sizes)
+    mixed = np.argsort(evenly(n))
     nodes = {
-        kind: [drift.nodes(DRAWN)[k] for k in (np.arange(DRAWN) if kind else mixed)]
+        kind: [drift.nodes(n)[k] for k in (np.arange(n) if kind else mixed)]
         for kind, drift in ((True, vis2), (False, closure))
         if drift is not None
     }
-    each = [np.array([one.correlation(*node) for node in nodes[one.vis2]]) for one in series]
-    means = [correlation.mean(axis=0) for correlation in each]
-    turned, axes = turned_rows(rows, list(zip(series, means, strict=True)))
+    mean = np.sqrt((sizes**2).mean(axis=0))
+    alone = np.ptp(sizes, axis=0) > 0.0
+    each, means = [], []
+    for one in series:
+        correlation = np.array([one.correlation(*node) for node in nodes[one.vis2]])
+        own = sizes[:, one.rows]
+        each.append(correlation * own[:, :, None] * own[:, None])
+        means.append(each[-1].mean(axis=0) / np.outer(mean[one.rows], mean[one.rows]))
+        alone[one.rows] = False
+    turned, axes = turned_rows(replace(rows, sigma=mean), list(zip(series, means, strict=True)))
     blocks = []
-    for axis, correlation in zip(axes, each, strict=True):
-        own = rows.sigma[axis.rows]
+    for axis, covariance in zip(axes, each, strict=True):
         turn = axis.vectors / np.sqrt(axis.values)
-        covariance = turn.T @ (correlation * np.outer(own, own)) @ turn
-        blocks.append([(axis.rows, root) for root in np.linalg.cholesky(covariance)])
+        roots = np.linalg.cholesky(turn.T @ covariance @ turn)
+        blocks.append([(axis.rows, root) for root in roots])
+    if alone.any():
+        at = np.flatnonzero(alone)
+        blocks.append([(at, np.diag(own)) for own in sizes[:, at] / mean[at]])
     return turned, tuple(zip(*blocks, strict=True))

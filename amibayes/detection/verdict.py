@@ -179,9 +179,15 @@ def without_companion(
 ) -> Verdict:
     """The verdict where a source without a companion fits as well as the one that was found.
 
-    A star that changes with wavelength is one star; light around it is outside of the model.
+    A star that changes with wavelength is one star, if by no more than is known of any; light
+    around it is outside of the model.
     """
     against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
+    if other.kind == "chromatic star" and not other.plausible:
+        because = (
+            f"{other.words}, {against}: no single star is known to, and these data do not tell"
+        )
+        return Verdict("model rejected", because, found.p_model)
     if other.kind == "chromatic star":
         return Verdict("no companion", f"{other.words}, {against}", found.p_model)
     because = f"{other.words} {against}: {SEE if compared else 'compare by --models'}"

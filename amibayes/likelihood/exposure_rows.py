@@ -198,6 +198,8 @@ def turned_rows(
     list of Axes
         Of the covariance of each series.
     """
+    if not correlated:
+        return rows, []
     sigma, axes = np.array(rows.sigma), []
     for one, correlation in correlated:
         own = rows.sigma[one.rows]

@@ -183,7 +183,7 @@ def _randomised(weight: Significance) -> Json | None:
 
 
 def _exposures(shared: ExposureNoise | None) -> Json | None:
-    if shared is None:
+    if shared is None or (shared.vis2 is None and shared.closure_phase is None):
         return None
     names = ("share", "share_error", "hours")
     return {

@@ -13,6 +13,7 @@ from interferometer import darkened_disc
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import alternative, symmetric_chi2
+from amibayes.detection.verdict import Verdict, without_companion
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.units import MAS
@@ -70,6 +71,25 @@ def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | 
     assert (None if found is None else found.kind) == kind
     if found is not None:
         assert abs(found.chi2 - n) < 4.0 * np.sqrt(2.0 * n)  # it is the true kind of source
+
+
+def swelling(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+    """A source twice as large at one end of the band as at the other: no single star."""
+    x = 1.2 * (1.0 + (wavelength - wavelength.min()) / np.ptp(wavelength))
+    return darkened_disc(1.0, 0.0, x * u, x * v) + 0j
+
+
+@pytest.mark.parametrize(("source", "plausible"), [(chromatic, True), (swelling, False)])
+def test_a_star_that_changes_more_than_any_is_no_reason_for_no_companion(
+    source: Visibility, plausible: bool
+) -> None:
+    result = search(Likelihood(observed(source, 1), MODEL), (0.7, 10.0))
+    found = alternative(result)
+    assert found is not None
+    assert (found.kind, found.plausible) == ("chromatic star", plausible)
+    first = Verdict("companion", "", 0.5)
+    stated = without_companion(first, found, result).statement
+    assert stated == ("no companion" if plausible else "model rejected")
 
 
 def test_closure_phases_of_a_symmetric_source_leave_their_noise() -> None:

@@ -15,10 +15,12 @@ from amibayes.companion_search.reduction import Roots
 from amibayes.companion_search.search import search
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import Systematics
 from amibayes.detection.exposure_noise import exposure_noise
 from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import make_statistic, statistic_of
-from amibayes.likelihood.channel_rows import channel_layout
+from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.channel_rows import OFFSET, SLOPE, ChannelRows, channel_layout
 from amibayes.likelihood.exposure_rows import HOURS, SHARES, Series, drift_of, series_of
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
@@ -237,3 +239,38 @@ def test_times_of_a_series_are_hours() -> None:
     sheet = four_telescopes(4, channels=3)
     for one in series_of(sheet, channel_layout(sheet)):
         np.testing.assert_allclose(np.diff(one.hours), 1.0 / 6.0, rtol=1e-4)
+
+
+def of_nights(rows: ChannelRows, spread: float, rng: np.random.Generator, n: int) -> np.ndarray:
+    """Noise (rank, n) in rows of one exposure; gains and slopes have sizes of their nights."""
+    normals = rng.standard_normal((len(rows.sigma), n))
+    size = np.exp(spread * rng.standard_normal((2, n)))
+    variance = np.repeat(rows.sigma[:, None] ** 2, n, axis=1)
+    for level, own in zip((OFFSET, SLOPE), size, strict=True):
+        here = rows.level == level
+        variance[here] += rows.floor[here, None] * (own**2 - 1.0)
+    return normals * np.sqrt(variance)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_night_that_is_worse_than_the_table_gives_no_companions(
+    monkeypatch: pytest.MonkeyPatch, known: bool
+) -> None:
+    """One exposure of six baselines: its gains do not tell how large they are that night."""
+    rng = np.random.default_rng(3)
+    sheet = four_telescopes(1, channels=8)
+    floor = Systematics(sheet.setups[0].source, 0.05, 0.0)
+    noise = noise_with_channels(sheet, (), (floor,))
+    if known:
+        monkeypatch.setattr("amibayes.detection.exposure_noise.FLOOR_SPREAD", 1e-6)
+    test = statistic_of(search(Likelihood(sheet, noise=noise), (2.0, 12.0)))
+    null = np.sort(test.draw_null(20_000, rng))
+    nights = of_nights(noise.rows, 0.5, rng, 10_000)
+    values = test.evaluate(nights / test.likelihood.noise.rows.sigma[:, None])
+    often = np.mean(values > np.quantile(null, [[0.997], [0.99], [0.9]]), axis=1)
+    wanted = np.array([0.003, 0.01, 0.1])
+    if known:
+        assert (often[:2] > 1.5 * wanted[:2]).all()
+    else:
+        error = np.sqrt(wanted * (1.0 / 10_000 + 1.0 / 20_000))
+        assert (np.abs(often - wanted) < 4.5 * error).all(), often
