@@ -21,7 +21,12 @@ from amibayes.detection.tails import pareto_quantile
 from amibayes.errors import UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.limits.components import over_components
-from amibayes.limits.critical import CriticalContrasts, Draws, critical_contrasts
+from amibayes.limits.critical import (
+    CriticalContrasts,
+    Draws,
+    critical_contrasts,
+    directions_of,
+)
 from amibayes.limits.limit import SHARES, DetectionLimit
 from amibayes.limits.pooled import Pooled, quantiles
 from amibayes.limits.rings import Rings, make_rings
@@ -94,8 +99,8 @@ def detection_limit(
     separation_mas : sequence of float, optional
         These rings instead.
     trials : int
-        Companions that are injected per separation, each with noise and at a position angle of
-        its own; its contrast is found.
+        Companions that are injected per separation at most, each with noise and at a position
+        angle of its own; its contrast is found. Large data get as many as `WANTED` asks for.
     noise : ExtraNoise, optional
         What the search fitted beside the stated errors; where there is any the errors are
         not taken to be as stated.
@@ -115,11 +120,42 @@ def detection_limit(
     rings, draws = _planned(result, test, n_separations, separation_mas, trials, noise, rng)
     threshold = pareto_quantile(null.null, null.alpha)
     typical = _root(test, threshold) + stats.norm.ppf(COMPLETENESS)
-    critical = critical_contrasts(
-        test, threshold, rings, draws, typical=typical**2, most_ambiguous=MAX_AMBIGUOUS,
-        executor=executor, progress=progress, journals=journals,
+    directions = directions_of(
+        test, rings, typical=typical**2, most_ambiguous=MAX_AMBIGUOUS,
+        executor=executor, journals=journals,
     )  # fmt: skip
+
+    def injected(draws: Draws, job: str) -> CriticalContrasts:
+        journal = journals.of(job) if journals else None
+        return critical_contrasts(
+            test, threshold, rings, directions, draws,
+            executor=executor, progress=progress, journal=journal,
+        )  # fmt: skip
+
+    critical = injected(draws, "injections")
+    if more := _more(critical, trials):
+        further = replace(draws, per_place=more, seed=draws.seed + 1)
+        critical = critical.joined(injected(further, "more injections"))
     return _summarised(test, null, threshold, rings, critical)
+
+
+def _more(critical: CriticalContrasts, trials: int) -> int:
+    """Draws of noise for each place that are wanted beside those of large data, up to ``trials``.
+
+    Large data begin with few: an error of `WANTED` asks for more.
+    """
+    n_angles, n = (int(size) for size in critical.located.shape[1:])
+    pooled = Pooled.of(critical, over_components(critical))
+    error = pooled.contrast(np.array([COMPLETENESS]))[1]
+    known = error[np.isfinite(error)]
+    if not len(known):
+        return 0
+    wanted = int(np.ceil(n * (float(np.median(known)) / WANTED) ** 2))
+    return max(min(wanted, trials // n_angles) - n, 0)
+
+
+WANTED = 0.025
+"""Error of ln of a limit by its injections: 0.027 mag, and with that of the threshold 0.03."""
 
 
 def _without_companion(
@@ -182,7 +218,8 @@ SEARCHES = 2.5
 """Searches that one companion takes, on average."""
 
 LEAST_TRIALS = 80
-"""However large the data are: rings together then tell a limit to 0.03 mag."""
+"""However large the data are. Rings together then tell a limit to 0.03 mag, or how many more it
+takes."""
 
 
 def _summarised(

@@ -8,7 +8,7 @@ smoothly with the data, so that a limit does not depend on rounding.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from amibayes.detection.statistic import Statistic
 from amibayes.limits.aliases import ambiguous, nearer_aliases
 from amibayes.limits.injection import classify_recovery
 from amibayes.limits.rings import Rings
-from amibayes.parallel import Executor, Journals, Progress, SerialExecutor, run_job
+from amibayes.parallel import Executor, Journal, Journals, Progress, SerialExecutor, run_job
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 ROUNDS = 8
@@ -72,6 +72,13 @@ class CriticalContrasts:
     ambiguous: FloatArray
     by_detection: BoolArray
 
+    def joined(self, other: CriticalContrasts) -> CriticalContrasts:
+        """These with those of other draws of noise at the same places."""
+        names = ("detected", "located", "component", "width")
+        both = ((getattr(self, name), getattr(other, name)) for name in names)
+        each = (np.concatenate(pair, axis=2) for pair in both)
+        return replace(self, **dict(zip(names, each, strict=True)))
+
 
 @dataclass(frozen=True)
 class Draws:
@@ -91,17 +98,70 @@ class Draws:
     stated_probable: bool
 
 
-def critical_contrasts(
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """What is known of the places of rings before any noise is drawn.
+
+    Parameters
+    ----------
+    sigma : (n_places,) float array
+        Error of a faint companion's contrast.
+    nearer : (n_places, …) float array
+        As `amibayes.limits.aliases.nearer_aliases` gives it.
+    ambiguous : (n_rings,) float array
+        Share of the directions in which a typical companion is taken for one nearer in.
+    by_detection : (n_rings,) bool array
+        Where a companion counts wherever it is seen.
+    """
+
+    sigma: FloatArray
+    nearer: FloatArray
+    ambiguous: FloatArray
+    by_detection: BoolArray
+
+
+def directions_of(
     test: Statistic,
-    threshold: float,
     rings: Rings,
-    draws: Draws,
     *,
     typical: float,
     most_ambiguous: float,
     executor: Executor | None = None,
-    progress: Progress | None = None,
     journals: Journals | None = None,
+) -> Directions:
+    """Find which places of rings are ambiguous.
+
+    Parameters
+    ----------
+    test : Statistic
+    rings : Rings
+    typical : float
+        Gain in χ² of a companion at the limit, for which ambiguity is stated.
+    most_ambiguous : float
+        Share of the directions above which detection alone is counted.
+    executor, journals : optional
+        As in `amibayes.limits.completeness.detection_limit`.
+    """
+    places = rings.places
+    nearer = nearer_aliases(
+        test.bank, places, resolution_mas(test.likelihood),
+        executor=executor, journal=journals.of("aliases") if journals else None,
+    )  # fmt: skip
+    every = ambiguous(nearer, np.full(len(places), typical))
+    lost = every.reshape(rings.east_mas.shape).mean(axis=1)
+    return Directions(test.contrast_error(places), nearer, lost, lost > most_ambiguous)
+
+
+def critical_contrasts(
+    test: Statistic,
+    threshold: float,
+    rings: Rings,
+    directions: Directions,
+    draws: Draws,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    journal: Journal | None = None,
 ) -> CriticalContrasts:
     """Find the critical contrasts at all places of some rings, for several draws of noise.
 
@@ -111,31 +171,20 @@ def critical_contrasts(
     threshold : float
         Statistic of a detection.
     rings : Rings
+    directions : Directions
+        Of these rings.
     draws : Draws
-    typical : float
-        Gain in χ² of a companion at the limit, for which ambiguity is stated.
-    most_ambiguous : float
-        Share of the directions above which detection alone is counted.
-    executor, progress, journals : optional
-        As in `amibayes.limits.completeness.detection_limit`.
+    executor, progress, journal : optional, see `amibayes.parallel.run_job`
     """
     shape, places = rings.east_mas.shape, rings.places
-    nearer = nearer_aliases(
-        test.bank, places, resolution_mas(test.likelihood),
-        executor=executor, journal=journals.of("aliases") if journals else None,
-    )  # fmt: skip
-    lost = ambiguous(nearer, np.full(len(places), typical)).reshape(shape).mean(axis=1)
-    by_detection = lost > most_ambiguous
-    sigma = test.contrast_error(places)
-    every, anywhere = np.arange(len(places)), np.repeat(by_detection, shape[1])
-    whole = _Part(every, places, sigma, nearer, anywhere)
-    work = partial(_piece, test, threshold, draws, shape[1])
+    every, anywhere = np.arange(len(places)), np.repeat(directions.by_detection, shape[1])
+    whole = _Part(every, places, directions.sigma, directions.nearer, anywhere)
     done = list(
         run_job(
-            work,
+            partial(_piece, test, threshold, draws, shape[1]),
             [whole.at(k) for k in _parts(shape, draws, test.bank.n_data)],
             executor or SerialExecutor(),
-            journal=journals.of("injections") if journals else None,
+            journal=journal,
             progress=progress,
         )
     )
@@ -143,8 +192,10 @@ def critical_contrasts(
         np.concatenate([d[key] for d in done]).reshape(*shape, -1)
         for key in ("detected", "located", "component", "width")
     )
-    sigma = sigma.reshape(shape)
-    return CriticalContrasts(detected, located, sigma, component, width, lost, by_detection)
+    return CriticalContrasts(
+        detected, located, directions.sigma.reshape(shape), component, width,
+        directions.ambiguous, directions.by_detection,
+    )  # fmt: skip
 
 
 def _parts(shape: tuple[int, int], draws: Draws, n_data: int) -> list[IntArray]:

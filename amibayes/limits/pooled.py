@@ -30,11 +30,14 @@ class Pooled:
         ln of that error, the median over the position angle.
     kind : (n_rings,) bool array
         Rings are pooled with those of the same kind.
+    repeated : int
+        Values that each trial has.
     """
 
     values: FloatArray
     typical: FloatArray
     kind: BoolArray
+    repeated: int = 1
 
     @classmethod
     def of(cls, critical: CriticalContrasts, in_errors: FloatArray) -> Pooled:
@@ -42,7 +45,7 @@ class Pooled:
         typical = np.median(critical.sigma, axis=1)
         values = in_errors * (critical.sigma / typical[:, None])[..., None, None]
         merged = np.maximum(values, FAINTEST).reshape(len(values), -1, values.shape[3])
-        return cls(np.log(merged), np.log(typical), critical.by_detection)
+        return cls(np.log(merged), np.log(typical), critical.by_detection, in_errors.shape[2])
 
     def contrast(self, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Contrasts above which shares of companions are recovered; NaN where none up to 1 is.
@@ -51,7 +54,8 @@ class Pooled:
         -------
         contrast : (n_rings, n_shares) float array
         error : (n_rings, n_shares) float array
-            Of its logarithm, by the injections.
+            Of its logarithm, by the injections. NaN where companions that no contrast shows are
+            so many that their number decides whether there is a limit.
         """
         found = np.full((len(self.values), len(shares)), np.nan)
         error = np.zeros_like(found)
@@ -79,7 +83,20 @@ class Pooled:
         between = np.maximum((apart**2).sum(axis=0) / np.maximum(count - 1, 1) - chance, 0.0)
         share = between / np.maximum(between + chance, 1e-300) if len(rings) > 1 else 1.0
         shrunk = np.where(known, np.where(known, common, 0.0) + share * apart, own)
-        return shrunk, np.sqrt(chance * np.maximum(share, 1.0 / count)) * np.ones_like(own)
+        error = np.sqrt(chance * np.maximum(share, 1.0 / count)) * np.ones_like(own)
+        if known.all():
+            return shrunk, error
+        # A realisation shows none up to any contrast: what all of them together tell is left.
+        by_rank = np.array([_rank_error(ring, shares, self.repeated) for ring in values])
+        return shrunk, np.where(known, error, by_rank)
+
+
+def _rank_error(values: FloatArray, shares: FloatArray, repeated: int) -> FloatArray:
+    """Errors of quantiles by the chance of how many values lie below, NaN where infinite."""
+    spread = np.sqrt(shares * (1.0 - shares) * repeated / values.size)
+    ends = [quantiles(values, np.clip(shares + side * spread, 0.0, 1.0)) for side in (-1.0, 1.0)]
+    half = 0.5 * (np.where(np.isfinite(ends[1]), ends[1], np.nan) - ends[0])
+    return np.asarray(half)
 
 
 def quantiles(values: FloatArray, shares: FloatArray) -> FloatArray:

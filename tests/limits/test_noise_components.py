@@ -14,7 +14,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.components import NODES, over_components
-from amibayes.limits.critical import CriticalContrasts, Draws, critical_contrasts
+from amibayes.limits.critical import CriticalContrasts, Draws, critical_contrasts, directions_of
 from amibayes.limits.pooled import Pooled
 from amibayes.limits.rings import Rings
 from amibayes.units import offset
@@ -112,9 +112,8 @@ def test_components_of_a_ring_are_one_of_each_part_of_the_normal_law() -> None:
     test, angle = statistic(0), np.arange(0.0, 360.0, 18.0)
     east, north = (x[None] for x in offset(200.0, angle))
     rings = Rings(np.array([200.0]), east, north)
-    found = critical_contrasts(
-        test, 25.0, rings, Draws(6, 3, stated_probable=False), typical=40.0, most_ambiguous=0.5
-    )
+    directions = directions_of(test, rings, typical=40.0, most_ambiguous=0.5)
+    found = critical_contrasts(test, 25.0, rings, directions, Draws(6, 3, stated_probable=False))
     level = np.sort(stats.norm.cdf(found.component[0]), axis=0) * len(angle)
     np.testing.assert_array_equal(np.floor(level), np.arange(20)[:, None] * np.ones(6))
     assert found.width.mean() == pytest.approx(1.0, abs=0.1)

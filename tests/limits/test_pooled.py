@@ -46,6 +46,22 @@ def test_a_share_that_is_not_reached_has_no_contrast() -> None:
     assert np.isnan(contrast[0, 1])
 
 
+def test_the_error_allows_for_companions_that_no_contrast_shows() -> None:
+    """Of 40 on one ring: some realisations of the noise show more of them than others."""
+    rng = np.random.default_rng(4)
+    found = []
+    for _ in range(400):
+        hidden = rng.random((1, 20, 2)) < 0.1
+        values = np.where(hidden, np.inf, rng.normal(0.0, 0.3, hidden.shape))
+        found.append(Pooled(values, np.zeros(1) - 5.0, np.ones(1, dtype=bool)).contrast(SHARES))
+    contrast, error = np.array(found)[:, :, 0].swapaxes(0, 1)
+    assert np.isfinite(contrast[:, :2]).all()
+    spread = np.log(contrast[:, :2]).std(axis=0)
+    np.testing.assert_allclose(np.nanmean(error[:, :2], axis=0), spread, rtol=0.25)
+    # Eight tenths end at a value, or are not reached: chance decides.
+    assert np.isnan(error[:, 2]).mean() > 0.1
+
+
 def test_contrasts_are_those_of_the_injections_where_places_are_alike() -> None:
     """Whatever the contrast error that all places have."""
     sigma = np.full((2, 30), 3e-4)
