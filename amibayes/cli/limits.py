@@ -67,7 +67,8 @@ def _add_limit(group: argparse._ArgumentGroup) -> None:
         type=common.positive_integer,
         default=LIMITS_TRIALS,
         metavar="N",
-        help="companions injected per separation (default: %(default)s)",
+        help="companions injected per separation at most; large data get fewer, until the limit is "
+        "known to 0.03 mag (default: %(default)s)",
     )
     group.add_argument(
         "--null-draws",

@@ -119,24 +119,42 @@ def detection_limit(
     test, null = _without_companion(result, significance, rng, executor, journals)
     rings, draws = _planned(result, test, n_separations, separation_mas, trials, noise, rng)
     threshold = pareto_quantile(null.null, null.alpha)
+    critical = _injected(
+        test, threshold, rings, draws, trials,
+        executor=executor, progress=progress, journals=journals,
+    )  # fmt: skip
+    return _summarised(test, null, threshold, rings, critical)
+
+
+def _injected(
+    test: Statistic,
+    threshold: float,
+    rings: Rings,
+    draws: Draws,
+    trials: int,
+    *,
+    executor: Executor | None,
+    progress: Progress | None,
+    journals: Journals | None,
+) -> CriticalContrasts:
+    """Critical contrasts on rings, of as many draws of noise as their limits take to be known."""
     typical = _root(test, threshold) + stats.norm.ppf(COMPLETENESS)
     directions = directions_of(
         test, rings, typical=typical**2, most_ambiguous=MAX_AMBIGUOUS,
         executor=executor, journals=journals,
     )  # fmt: skip
 
-    def injected(draws: Draws, job: str) -> CriticalContrasts:
-        journal = journals.of(job) if journals else None
+    def of(draws: Draws, job: str) -> CriticalContrasts:
         return critical_contrasts(
-            test, threshold, rings, directions, draws,
-            executor=executor, progress=progress, journal=journal,
+            test, threshold, rings, directions, draws, executor=executor, progress=progress,
+            journal=journals.of(job) if journals else None,
         )  # fmt: skip
 
-    critical = injected(draws, "injections")
+    critical = of(draws, "injections")
     if more := _more(critical, trials):
         further = replace(draws, per_place=more, seed=draws.seed + 1)
-        critical = critical.joined(injected(further, "more injections"))
-    return _summarised(test, null, threshold, rings, critical)
+        critical = critical.joined(of(further, "more injections"))
+    return critical
 
 
 def _more(critical: CriticalContrasts, trials: int) -> int:
