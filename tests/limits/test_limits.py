@@ -225,6 +225,29 @@ def test_same_seed_same_limit(setting) -> None:
     np.testing.assert_array_equal(first.contrast, again.contrast)
 
 
+def test_large_data_get_as_many_companions_as_a_limit_takes(
+    setting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 80 on a ring, up to what was asked for; the limit is that of many companions."""
+    result, _, weight, whole = setting
+    monkeypatch.setattr("amibayes.limits.completeness.AFFORDABLE", 0.0)
+    monkeypatch.setattr("amibayes.limits.completeness.WANTED", 0.006)
+    counts, errors = [], []
+    for trials in (80, 450, 2000):
+        rng = np.random.default_rng(5)
+        limit = detection_limit(result, weight, rng, n_separations=6, trials=trials)
+        counts.append(int(limit.trials[0, 0]))
+        errors.append(float(limit.log_error[0]))
+        both = np.hypot(limit.log_error, whole.log_error)
+        assert (np.abs(np.log(limit.contrast / whole.contrast)) < 4.5 * both).all()
+    assert counts[0] == 80
+    assert 400 < counts[1] <= 450 < counts[2] <= 2000
+    assert sorted(errors, reverse=True) == errors
+    monkeypatch.setattr("amibayes.limits.completeness.WANTED", 0.1)  # 80 tell it as well
+    rng = np.random.default_rng(5)
+    assert detection_limit(result, weight, rng, n_separations=6).trials[0, 0] == 80
+
+
 @pytest.mark.slow
 def test_robust_search_has_limits_of_its_own_statistic() -> None:
     """One closure phase is 30 sigma off: threshold, rate and limit are those of robust searches.
