@@ -195,14 +195,13 @@ def _in_wider_field(
     fields = wider_fields(first)
     if not fields:
         return first, []
-    prior = noise_prior(likelihood.observables, options)
-    score = _score(first, prior)
+    score = _score(first, options)
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
         found = _with_its_disc(likelihood, search(likelihood, field, check=False), options)
         if found.chi2_binary < EXPLAINED * first.chi2_binary or (
             found.chi2_binary < first.chi2_binary
-            and score - _score(found, prior) > SURELY_NOT_NOISE
+            and score - _score(found, options) > SURELY_NOT_NOISE
         ):
             place = found.companion.separation_mas
             return found, [
@@ -212,9 +211,11 @@ def _in_wider_field(
     return first, []
 
 
-def _score(result: SearchResult, prior: NoisePrior) -> float:
+def _score(result: SearchResult, options: SearchOptions) -> float:
     """−2 ln L of a search with stated errors, with the noise that its best fit leaves."""
-    _, noisy = noise_beside(result.likelihood, result.theta, prior=prior)
+    likelihood, apart = result.likelihood, options.file_noise is not False
+    prior = noise_prior(likelihood.observables, options)
+    _, noisy = noise_beside(likelihood, result.theta, per_file=apart, prior=prior)
     return float(-2.0 * noisy.log_prob(result.theta)[0])
 
 
