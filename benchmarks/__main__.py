@@ -1,6 +1,7 @@
 """Measure everything in one run and print ratios.
 
-    python -m benchmarks --peers FOLDER [--only PART …]
+    python -m benchmarks --peers FOLDER [--only PART …] \\
+        | python docs/pages.py benchmarks.md "ratios: benchmarks/__main__.py"
 
 FOLDER keeps the environments of AMICAL, virgil, fouriever and PMOIRED, which are installed
 from PyPI the first time; one that cannot be had is reported so. All numbers are CPU time

@@ -1,6 +1,7 @@
 """Integrations per second of every method, one thread, CPU time, beside AMICAL's.
 
-    python benchmarks/extraction.py CUBE.fits [--amical PYTHON] [--frames 1000]
+    python -m benchmarks.extraction CUBE.fits [--amical PYTHON] [--frames 1000] \\
+        | python docs/pages.py benchmarks.md "extraction: benchmarks/extraction.py"
 
 CUBE.fits is a cube of NIRISS F480M, tiled to ``--frames`` integrations. PYTHON is an
 interpreter that has AMICAL (the extra ``bench``); both read the same tiled file, clean it
@@ -66,23 +67,24 @@ def seconds(path: Path, method: str) -> list[float]:
 
 
 def own(whole: Path, half: Path, n: int) -> None:
+    """Print a row for every method."""
     for method in METHODS:
         first, *later = seconds(whole, method)
         slope = (min(later) - min(seconds(half, method))) / (n - n // 2)
         print(
-            f"{method:8} first {n / first:6.0f}/s   whole {n / min(later):6.0f}/s   "
-            f"each {1.0 / slope:6.0f}/s",
+            f"| `{method}` | {n / first:.0f} | {n / min(later):.0f} | {1.0 / slope:.0f} |",
             flush=True,
         )
 
 
 def amical(python: str, path: Path) -> None:
+    """Print a row for every method of AMICAL's."""
     for peak, multi in (("unique", "0"), ("gauss", "0"), ("fft", "0"), ("fft", "1")):
         command = [python, "-c", AMICAL, str(path), peak, multi]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         rate, version = done.stdout.split()
-        label = f"{peak}{', many triangles' if multi == '1' else ''}"
-        print(f"AMICAL {version} {label:22} {float(rate):6.0f}/s", flush=True)
+        label = f"`{peak}`{', many triangles' if multi == '1' else ''}"
+        print(f"| AMICAL {version}, {label} | | {float(rate):.0f} | |", flush=True)
 
 
 def main() -> int:
@@ -91,6 +93,8 @@ def main() -> int:
     parser.add_argument("--amical", metavar="PYTHON")
     parser.add_argument("--frames", type=int, default=1000)
     given = parser.parse_args()
+    print("| method | at the start of a process | later | each, past the set-up |")
+    print("|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as folder, threadpool_limits(1):
         whole, half = (
             tiled(given.cube, n, Path(folder)) for n in (given.frames, given.frames // 2)

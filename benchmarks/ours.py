@@ -40,9 +40,10 @@ def searches(path: Path, field: tuple[float, float], model: BinaryModel) -> dict
     bank = test.bank
     null, _ = cpu(lambda: test.draw_null(DRAWS, np.random.default_rng(1)), repeat=1)
     noise, _ = cpu(
-        lambda: np.random.default_rng(1).standard_normal((bank.n_data, DRAWS), dtype=np.float32)
+        lambda: np.random.default_rng(1).standard_normal((bank.n_rows, DRAWS), dtype=np.float32)
     )
-    floor = gemm_seconds(2.0 * (len(bank) / 2) * bank.n_data * DRAWS)
+    # Of the numbers that data are reduced to, which is what the draws have.
+    floor = gemm_seconds(2.0 * (len(bank) / 2) * bank.n_rows * DRAWS)
     theta = np.tile(result.theta, (4096, 1)) * np.linspace(0.9, 1.1, 4096)[:, None]
     density, _ = cpu(lambda: likelihood.log_prob(theta))
     prior = default_prior(likelihood, *field)
