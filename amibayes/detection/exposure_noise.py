@@ -43,6 +43,9 @@ FLOOR_SPREAD = 0.5
 """Standard deviation of ln of a floor's size: published ones of an instrument differ by factors
 of three to five (PIONIER, 3 to 15 % of V²), which is what two of these are to either side."""
 
+FEW_ROWS = 16
+"""Rows of one diagonal root: matrices of all rows of many files would fill the memory."""
+
 KNOWN = 0.1
 """Standard deviation of ln of a size below which null sets are drawn with it as it is: thresholds
 would move by some hundredths. Two hundred gains tell their size as well."""
@@ -180,7 +183,8 @@ def _turned(
         turn = axis.vectors / np.sqrt(axis.values)
         roots = np.linalg.cholesky(turn.T @ covariance @ turn)
         blocks.append([(axis.rows, root) for root in roots])
-    if alone.any():
-        at = np.flatnonzero(alone)
-        blocks.append([(at, np.diag(own)) for own in sizes[:, at] / mean[at]])
+    few = np.arange(FEW_ROWS, np.count_nonzero(alone), FEW_ROWS)
+    for at in np.split(np.flatnonzero(alone), few):
+        if len(at):
+            blocks.append([(at, np.diag(own)) for own in sizes[:, at] / mean[at]])
     return turned, tuple(zip(*blocks, strict=True))
