@@ -25,6 +25,11 @@ def orthonormal(columns: FloatArray) -> FloatArray:
     """
     columns = np.asarray(columns, dtype=float)
     least = INDEPENDENT * float(np.linalg.norm(columns, axis=0).max(initial=0.0))
+    if 0 < columns.shape[1] <= len(columns):
+        # Of independent columns it is Q of QR, with the signs of the columns.
+        turned, upper = np.linalg.qr(columns)
+        if (np.abs(np.diag(upper)) > least).all():
+            return np.asarray(turned * np.sign(np.diag(upper)))
     basis = np.empty((len(columns), 0))
     for column in columns.T:
         rest = column - basis @ (basis.T @ column)
