@@ -240,11 +240,12 @@ def make_setup(
         right_ascension_deg=target.right_ascension_deg,
         declination_deg=target.declination_deg,
         array_frame="" if array is None else array.keyword("FRAME").replace("SKY", ""),
-        array_centre_m=(0.0, 0.0, 0.0) if array is None else _centre(array),
+        array_centre_m=(0.0, 0.0, 0.0) if array is None else centre_m(array),
     )
 
 
-def _centre(array: OITable) -> tuple[float, float, float]:
+def centre_m(array: OITable) -> tuple[float, float, float]:
+    """Centre of an array in its frame; 0 along an axis that it does not state in numbers."""
     values = [array.header.get(f"ARRAY{axis}", 0.0) for axis in "XYZ"]
     x, y, z = (float(v) if isinstance(v, int | float) else 0.0 for v in values)
     return x, y, z

@@ -249,6 +249,13 @@ CASES: dict[str, tuple[Change, set[str]]] = {
         {"non-closing"},
     ),
     "off the Earth": (keyword("OI_ARRAY", "FRAME", "GEOCENTRIC"), {"array-centre"}),
+    "no number": (
+        lambda h: (
+            [keyword("OI_ARRAY", *k)(h) for k in (("FRAME", "GEOCENTRIC"), ("ARRAYX", "X"))]
+            and None
+        ),
+        {"array-centre"},
+    ),
     "correlation 2": (set_column("OI_CORR", "CORR", 3, 2.0), {"correlations"}),
     "correlation index": (keyword("OI_CORR", "NDATA", 5), {"correlations"}),
     "correlation order": (

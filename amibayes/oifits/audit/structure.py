@@ -21,6 +21,7 @@ from amibayes.oifits.audit.finding import (
 from amibayes.oifits.columns import same
 from amibayes.oifits.rows import KINDS
 from amibayes.oifits.scales import ANGLE
+from amibayes.oifits.setups import centre_m
 from amibayes.oifits.standard import PRIMARY_KEYWORDS, TABLES, ColumnRule
 from amibayes.oifits.tables import OIFits, OITable, plain
 
@@ -337,13 +338,13 @@ def numbers_below_one(oifits: OIFits) -> Findings:
 def array_centre(oifits: OIFits) -> Findings:
     """A geocentric array whose centre is not on the Earth."""
     for table in oifits.named("OI_ARRAY"):
-        centre = [float(table.header.get(f"ARRAY{axis}", 0.0) or 0.0) for axis in "XYZ"]
-        if table.keyword("FRAME") == "GEOCENTRIC" and not 6.3e6 < np.linalg.norm(centre) < 6.5e6:
+        centre = np.linalg.norm(centre_m(table))
+        if table.keyword("FRAME") == "GEOCENTRIC" and not 6.3e6 < centre < 6.5e6:
             yield Finding(
                 "warning",
                 "array-centre",
                 table.label,
-                f"FRAME is GEOCENTRIC and the centre is {np.linalg.norm(centre) / 1e3:.0f} km from "
+                f"FRAME is GEOCENTRIC and the centre is {centre / 1e3:.0f} km from "
                 "that of the Earth",
                 "what needs the place of the observatory (hour angles, altitudes) is wrong",
                 "set ARRAYX, ARRAYY, ARRAYZ",
