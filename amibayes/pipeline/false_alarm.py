@@ -200,7 +200,7 @@ def _seen_in_one_night(
     """Say which night by itself shows a companion; empty where none does, or there is but one.
 
     One that moves from night to night fits all of them together so badly that it passes for
-    noise. Each night is searched, tested and judged as if there were no other, and the nights
+    noise. Each night is searched and tested as if there were no other, and the nights
     share the probability of a false alarm.
     """
     data = stated.only(options.observables).unflagged()
