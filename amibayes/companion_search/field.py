@@ -182,7 +182,7 @@ def outermost(likelihood: Likelihood) -> float:
     data = likelihood.observables
     widths = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase) if len(m)]
     smeared = resolution_mas(likelihood) / max(float(np.concatenate(widths).min()), 1e-6)
-    known = [s.response.reach / MAS for s in data.setups if s.response is not None]
+    known = [s.response.reach() / MAS for s in data.setups if s.response is not None]
     return min([smeared, *known])
 
 

@@ -59,7 +59,6 @@ class OffAxisResponse:
         """Coefficients along each axis."""
         return int(self.coefficients.shape[-1])
 
-    @property
     def reach(self) -> float:
         """Distance from the axis, in radians, to which it was measured in every direction."""
         steps = 0.5 * (self.n_nodes - BSPLINE_NODES + 1)
