@@ -175,10 +175,15 @@ def notices_disc(likelihood: Likelihood, diameter_mas: float) -> bool:
 
 
 def outermost(likelihood: Likelihood) -> float:
-    """Separation, mas, at which the narrowest channel smears a companion out: R·λ/B_max."""
+    """Separation, mas, at which the narrowest channel smears a companion out: R·λ/B_max.
+
+    Of images no farther than the response of the extraction is known.
+    """
     data = likelihood.observables
     widths = [m.band_m / m.wavelength_m for m in (data.vis2, data.closure_phase) if len(m)]
-    return resolution_mas(likelihood) / max(float(np.concatenate(widths).min()), 1e-6)
+    smeared = resolution_mas(likelihood) / max(float(np.concatenate(widths).min()), 1e-6)
+    known = [s.response.reach() / MAS for s in data.setups if s.response is not None]
+    return min([smeared, *known])
 
 
 def choose_field(

@@ -59,6 +59,11 @@ class OffAxisResponse:
         """Coefficients along each axis."""
         return int(self.coefficients.shape[-1])
 
+    def reach(self) -> float:
+        """Distance from the axis, in radians, to which it was measured in every direction."""
+        steps = 0.5 * (self.n_nodes - BSPLINE_NODES + 1)
+        return float(steps / np.linalg.norm(self.to_node, 2))
+
 
 def bspline_weights(place: FloatArray, n_nodes: int) -> tuple[IntArray, FloatArray]:
     """Find what values at places (2, n), in steps from the middle, are made of.

@@ -91,7 +91,7 @@ def consistency(
     every: list[tuple[Split, dict[str, BoolArray]]] = [
         ("observables", _kinds(data)),
         ("files", files),
-        ("epochs", _epochs(data)),
+        ("epochs", by_night(data)),
     ]
     splits = [(name, parts) for name, parts in every if 1 < len(parts) <= MAX_PARTS]
     wanted = int(DRAWS_PER_RATE * (len(splits) + len(calibrators)) / alpha)
@@ -140,8 +140,8 @@ def _kinds(data: Observables) -> dict[str, BoolArray]:
     return {name: mask for name, mask in (("vis2", vis2), ("cp", ~vis2)) if mask.any()}
 
 
-def _epochs(data: Observables) -> dict[str, BoolArray]:
-    """Nights, by their mean date."""
+def by_night(data: Observables) -> dict[str, BoolArray]:
+    """Nights, by their mean date: masks (n_data,); empty where a date is unknown."""
     mjd = np.concatenate([data.vis2.mjd, data.closure_phase.mjd])
     if not np.isfinite(mjd).all():
         return {}

@@ -6,14 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter, rank_filter
 
 from amibayes.cube import Cube
 from amibayes.cube.source import Source
 from amibayes.data.outliers import TO_SIGMA
 from amibayes.errors import DataError
 from amibayes.extraction.fourier.sampling import PixelArray
+from amibayes.extraction.image_plane import FringeFit, fringe_fit
 from amibayes.extraction.noise import NoiseModel, noise_model
+from amibayes.extraction.view import View
 from amibayes.units import BoolArray, FloatArray, read_only
 
 SAMPLE, RUN = 32, 4
@@ -27,6 +29,26 @@ ALWAYS_BAD = 0.5
 
 OUTLIER = 7.0
 """Pixels of the sample that are outliers by more standard deviations are left out of it."""
+
+NOISE = 7.0
+"""Standard deviations of noise by which a hot pixel differs, at least."""
+
+AROUND = np.ones((3, 3), dtype=bool)
+AROUND[1, 1] = False
+BESIDE, NEIGHBOURS = 5.0, 3
+"""How many times as far from the fit as the third of the pixels around it: what a companion far
+from the star, a wrong spectrum, jitter or aberrations leave goes on over λ/D, two pixels or more;
+two or three hot pixels may be neighbours."""
+
+LIGHT, FAINT = 0.1, 0.01
+"""… and by this part of the brightest light that is fitted within two pixels of it, and of the
+brightest of all: a companion far from the star leaves as much, between dark fringes too."""
+
+MOST = 0.02
+"""Share of the pixels beyond which they are not hot: the model is another one."""
+
+ROUNDS = 8
+"""Fits: the brightest pixels hide others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,3 +227,55 @@ def _filled(image: FloatArray, good: BoolArray) -> FloatArray:
     weight = gaussian_filter(good.astype(float), 1.0)
     smooth = gaussian_filter(np.where(good, image, 0.0), 1.0) / np.maximum(weight, 1e-12)
     return np.where(good, image, smooth)
+
+
+def without_hot(reference: Reference, view: View, even: FringeFit) -> Reference:
+    """Leave hot and dead pixels out of a reference, by a fit of even weights to its image.
+
+    A hot pixel that every integration has is no outlier of any, and beside bright fringes or
+    another hot pixel it is not out of the range of its neighbours either. The fit of the fringes
+    knows what it should be: it is fitted to all others, and asked. The very reference comes back
+    where there is none.
+    """
+    image, good = reference.image[view.part], reference.good[view.part].copy()
+    variance = reference.noise.variance[view.part] * (np.pi / 2.0 / len(reference.sample))
+    fit, before = even, good.sum()
+    for _ in range(ROUNDS):
+        found = _misfitting(image, good, variance, fit)
+        if not found.any():
+            break
+        good &= ~found
+        if before - good.sum() > MOST * before:
+            return reference
+        fit = fringe_fit(even.model, np.ones(image.shape), good)
+    if good.sum() == before:
+        return reference
+    everywhere = reference.good.copy()
+    everywhere[view.part] = good
+    return replace(
+        reference,
+        image=_filled(reference.image, everywhere),
+        good=everywhere,
+        n_bad=int((~everywhere).sum()),
+    )
+
+
+def _misfitting(
+    image: FloatArray, good: BoolArray, variance: FloatArray, fit: FringeFit
+) -> BoolArray:
+    """Hot pixels, if any: of all that differ too much, those at least half as far as the worst.
+
+    A bright one pulls the fit of others along.
+    """
+    pixels = np.where(good, image, 0.0).reshape(1, -1)
+    model = (fit.design @ fit.solve(pixels)[0]).reshape(image.shape)
+    own = np.einsum("np,np->n", fit.design, fit.inverse).reshape(image.shape)
+    # What a fit to all other pixels would leave here.
+    left = np.where(good, np.abs(image - model) / np.maximum(1.0 - own, 0.1), 0.0)
+    light = np.maximum(LIGHT * maximum_filter(np.abs(model), 5), FAINT * model.max())
+    least = np.maximum(
+        NOISE * np.sqrt(variance) + light,
+        BESIDE * rank_filter(left, -NEIGHBOURS, footprint=AROUND),
+    )
+    found = good & (left > least)
+    return np.asarray(found & (left >= 0.5 * np.max(left, initial=0.0, where=found)))

@@ -7,7 +7,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from amibayes.cube.source import Source
 from amibayes.errors import DataError
-from amibayes.extraction.cleaning import Reference, median_and_scatter, reference_of
+from amibayes.extraction.cleaning import Reference, median_and_scatter, reference_of, without_hot
 from amibayes.extraction.fourier.sampling import split
 from amibayes.extraction.geometry import Geometry, fit_geometry
 from amibayes.extraction.image_plane import (
@@ -53,9 +53,8 @@ def map_estimate(file: Source, options: ExtractOptions) -> tuple[MapEstimate | N
     reference = reference_of(file)
     view = look_at(reference.image, template, options)
     prior = view.instrument.distortion
-    view = view.mapped(prior.matrix)
-    image, good = reference.image[view.part], reference.good[view.part]
-    view, _, even = centre_on(view, image, good, template.source)
+    reference, view, _, even = _centred(reference, view.mapped(prior.matrix))
+    image = reference.image[view.part]
     return estimate_map(view, image, _fit_of_median(view, even, reference)), prior
 
 
@@ -79,8 +78,8 @@ def make_operator(
     view = look_at(reference.image, template, options)
     if mask_map is not None:
         view = view.mapped(mask_map.matrix)
+    reference, view, basis, even = _centred(reference, view)
     image, good = reference.image[view.part], reference.good[view.part]
-    view, basis, even = centre_on(view, image, good, template.source)
     geometry = Geometry(mask_map=mask_map)
     if options.geometry == "fitted" and mask_map is None:
         median = _fit_of_median(view, even, reference)
@@ -95,6 +94,17 @@ def make_operator(
     return ExtractionOperator(
         view, geometry, reference, fit, scatter, sampling, variance, third, options
     )
+
+
+def _centred(reference: Reference, view: View) -> tuple[Reference, View, FringeBasis, FringeFit]:
+    """Move the view to the star, and leave out of the reference the pixels that are hot."""
+    seen = reference.image[view.part], reference.good[view.part]
+    view, basis, even = centre_on(view, *seen, reference.source)
+    clean = without_hot(reference, view, even)
+    if clean is not reference:
+        seen = clean.image[view.part], clean.good[view.part]
+        view, basis, even = centre_on(view, *seen, clean.source)
+    return clean, view, basis, even
 
 
 def _fit_of_median(view: View, even: FringeFit, reference: Reference) -> FringeFit:

@@ -324,9 +324,17 @@ def check_together(
     return uncalibrated(ours, theirs)
 
 
+EXTRACTED = "AMIBAYES METHOD"
+"""A card that files have from an extraction and lose when they are calibrated."""
+
+
 def uncalibrated_images(paths: Sequence[str | Path]) -> tuple[str, ...]:
-    """Name the image cubes of a target that is given without calibrators."""
-    raw = [str(path) for path in paths if format_of(path).read is _extracted]
+    """Name the image cubes, and what was extracted from some, of a target without calibrators."""
+    raw = [
+        str(path)
+        for path in paths
+        if format_of(path).read is _extracted or EXTRACTED in contents_of(path).header
+    ]
     if not raw:
         return ()
     return (

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
+from amibayes.data.closure import canonical
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
 from amibayes.likelihood.chi2 import restricted_loss
@@ -116,13 +117,12 @@ def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
         np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
         for name in ("setup", "mjd")
     )
-    stations = [*data.vis2.stations.tolist(), *data.closure_phase.stations.tolist()]
+    names = _names(data)
     at = layout.starts & ~layout.stated & np.isfinite(mjd[layout.datum])
     of: dict[tuple[object, ...], list[tuple[float, int]]] = {}
     for row, datum, place in zip(layout.order[at], layout.datum[at], layout.place[at], strict=True):
         own, vis2 = data.setups[setup[datum]], bool(datum < data.n_vis2)
-        names = [own.stations[k] for k in stations[datum]]
-        key = own.source, vis2, own.insname, *(sorted(names) if vis2 else names), int(place)
+        key = own.source, vis2, own.insname, names[datum], int(place)
         of.setdefault(key, []).append((24.0 * float(mjd[datum]), int(row)))
     found = []
     for (source, kind, *_), members in of.items():
@@ -135,6 +135,28 @@ def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
                 if len(few) > 1
             ]
     return tuple(found)
+
+
+def _names(data: Observables) -> list[tuple[object, ...]]:
+    """What each datum is of, whatever the order of rows and stations in a file.
+
+    Triangles that share baselines are one: their combinations do not depend on the order, nor on
+    the sense of each. One that stands alone changes its sign with its sense.
+    """
+    names: list[tuple[object, ...]] = []
+    for m in (data.vis2, data.closure_phase):
+        sign = canonical(m.stations)[1].tolist()
+        for k, (setup, stations) in enumerate(zip(m.setup, m.stations.tolist(), strict=True)):
+            own = data.setups[setup].stations
+            names.append((*sorted(own[i] for i in stations), sign[k]))
+    if data.covariance_kind != "assumed":
+        return names
+    for entries in data.closure_phase.sets:
+        at = data.n_vis2 + np.asarray(entries)
+        together = tuple(sorted({names[i][:-1] for i in at.tolist()}))
+        for i in at.tolist():
+            names[i] = together
+    return names
 
 
 def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:

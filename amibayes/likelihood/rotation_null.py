@@ -19,6 +19,11 @@ from amibayes.units import FloatArray, read_only
 NEGLIGIBLE = 1e-9
 """Share of the largest variance of the scatter below which a direction was not measured."""
 
+LEAST_SCATTER = 4.0
+"""Degrees of freedom of scatter from which rotations tell noise from a companion: with two (a pair
+of integrations, and of a calibrator) one in 160 is the residuals nearly as they are, however large
+these are; with four one in 10 000."""
+
 
 @dataclass(frozen=True, eq=False)
 class RotationNull:
@@ -70,7 +75,10 @@ class RotationNull:
 
 
 def rotation_null(noise: NoiseModel, residual: FloatArray) -> RotationNull | None:
-    """Lay out what an estimated covariance rests on; None where the covariance is known.
+    """Lay out what an estimated covariance rests on.
+
+    None where the covariance is known, or rests on so little scatter that it is as good as that
+    of the expected noise: on less than `LEAST_SCATTER`.
 
     Parameters
     ----------
@@ -91,5 +99,7 @@ def rotation_null(noise: NoiseModel, residual: FloatArray) -> RotationNull | Non
     # A target and its calibrators, few integrations of each, scatter in more directions than they
     # have degrees of freedom together: what is drawn must have the variance of the estimate still.
     freedom = max(noise.freedom.scatter, float(measured.sum()))
+    if freedom < min(LEAST_SCATTER, p):
+        return None
     factor = axes[:, measured] * np.sqrt(freedom * variance[measured])
     return RotationNull(degrees, freedom + 1.0, factor, residual)

@@ -11,8 +11,13 @@ from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import alternative
-from amibayes.detection.consistency import consistency
-from amibayes.detection.false_alarm import Significance, draws_needed, significance
+from amibayes.detection.consistency import MAX_PARTS, by_night, consistency
+from amibayes.detection.false_alarm import (
+    Significance,
+    beside_bright,
+    draws_needed,
+    significance,
+)
 from amibayes.detection.randomised import Randomised, randomised
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import BankStatistic, statistic_of
@@ -25,8 +30,9 @@ from amibayes.detection.verdict import (
     without_companion,
 )
 from amibayes.detection.whiteness import correlated
+from amibayes.errors import DataError
 from amibayes.parallel import Executor, Journal, Progress, spawn
-from amibayes.pipeline.field import FieldSearch, noise_prior
+from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
 from amibayes.pipeline.options import SearchOptions
 from amibayes.support.options import NULL_DRAWS
 
@@ -183,4 +189,45 @@ def verdict_of(
     )  # fmt: skip
     if said.statement == "companion" and (other := alternative(result)) is not None:
         said = without_companion(said, other, result, compared=compared)
+    if said.statement == "no companion" and (seen := _seen_in_one_night(stated, options, rng)):
+        said = Verdict("inconsistent data", seen, said.p_model)
     return said, splits
+
+
+def _seen_in_one_night(
+    stated: Observables, options: SearchOptions, rng: np.random.Generator
+) -> str:
+    """Say which night by itself shows a companion; empty where none does, or there is but one.
+
+    One that moves from night to night fits all of them together so badly that it passes for
+    noise. Each night is searched and tested as if there were no other, and the nights
+    share the probability of a false alarm.
+    """
+    data = stated.only(options.observables).unflagged()
+    masks = by_night(data)
+    if not 1 < len(masks) <= MAX_PARTS:
+        return ""
+    own = replace(options, alpha=options.alpha / len(masks), motion=False, null_draws=None)
+    few = replace(own, null_draws=FIRST_DRAWS)
+    for night, mask in masks.items():
+        try:
+            found = search_field(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), own)
+        except DataError:  # too few data to be searched
+            continue
+        if false_alarm(found.result, few, rng).probability > NOT_SMALL:
+            continue
+        tested = beside_bright(false_alarm(found.result, own, rng), found.result, found.noise)
+        if tested.detected and verdict_of(found, tested, own, rng)[0].statement == "companion":
+            return _told(night, found, moves=options.motion)
+    return ""
+
+
+def _told(night: str, found: FieldSearch, *, moves: bool) -> str:
+    """Say where the companion of one night is."""
+    c = found.result.companion
+    why = "--fastest, or another kind of motion" if moves else "a motion (--motion)"
+    return (
+        f"the night of {night} shows a companion by itself ({c.delta_mag:.1f} mag at "
+        f"{c.separation_mas:.3g} mas, PA {c.position_angle_deg:.0f} deg), all nights together none "
+        f"that is as likely; {why} may explain it"
+    )

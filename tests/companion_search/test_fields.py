@@ -16,6 +16,7 @@ from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.result import Companion, Mode
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
+from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
@@ -76,6 +77,19 @@ def test_scales_of_the_data() -> None:
     reach = 2.0 * expected[0] * longest / band
     assert field.outermost(likelihood) == pytest.approx(reach)
     assert field.outermost(Likelihood(niriss(channels=4).only(["vis2"]))) == pytest.approx(reach)
+
+
+def test_no_default_field_is_wider_than_the_response_is_known() -> None:
+    """Beyond its lattice it is that of the edge: V² that err together look like light there."""
+    data, nodes = niriss(channels=4), 43
+    c, s = np.cos(0.3), np.sin(0.3)
+    response = OffAxisResponse(
+        np.ones((7, 7, nodes, nodes)), np.array([[c, s], [-s, c]]) / (50.0 * MAS), np.zeros(2)
+    )
+    setups = tuple(replace(setup, response=response) for setup in data.setups)
+    found = field.outermost(Likelihood(replace(data, setups=setups)))
+    assert found == pytest.approx(20.0 * 50.0)  # two nodes a side are for the slope at the edge
+    assert found < field.outermost(Likelihood(data))
 
 
 @pytest.mark.parametrize(("z", "resolved"), [(0.199, False), (0.201, True)])

@@ -17,10 +17,10 @@ from amibayes.data.systematics import Systematics
 from amibayes.detection.consistency import (
     _apart,
     _apart_by_noise,
-    _epochs,
     _kinds,
     _Part,
     _share_errors,
+    by_night,
     compare,
 )
 from amibayes.likelihood.channel_noise import ChannelShare, Correlation, noise_with_channels
@@ -77,7 +77,7 @@ def test_star_and_background_may_differ_between_parts(rng) -> None:
     data = join(nights)
     likelihood = Likelihood(data, model)
     theta = np.array(refine(likelihood, np.array([*truth, 1.05]), Box(2, 15, 3.1), 0.0).theta)
-    found = compare(likelihood, theta, "epochs", _epochs(data), rng)
+    found = compare(likelihood, theta, "epochs", by_night(data), rng)
     assert found.p > 1e-3
     assert len(found.parts) == 2
 
@@ -88,7 +88,7 @@ def test_a_companion_that_moved_between_nights_is_found_out(rng) -> None:
     there = at(simulated(sheet, [150.0, -40.0, 0.02], rng), 60030.0, "b")
     data = join([first, there])
     likelihood, theta = fitted(data)
-    found = compare(likelihood, theta, "epochs", _epochs(data), rng)
+    found = compare(likelihood, theta, "epochs", by_night(data), rng)
     assert found.p < 1e-3
     assert found.delta_chi2 > 30.0
     assert found.parts == ("MJD 60000.000", "MJD 60030.000")
@@ -111,7 +111,7 @@ def test_slopes_by_noise_are_those_of_noise_that_is_drawn(rng) -> None:
     sheet = four_telescopes(4)
     nights = [at(simulated(sheet, [5.0, -4.0, 0.05], rng), 60000.0 + k, "ab"[k]) for k in (0, 1)]
     data = join(nights)
-    masks = list(_epochs(data).values())
+    masks = list(by_night(data).values())
     share = ChannelShare(Correlation(0.4, 0.3, 0.58, 0.1), Correlation(0.3, 0.2, 0.44, 0.1))
     parts = []
     for mask in masks:

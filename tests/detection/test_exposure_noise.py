@@ -84,6 +84,23 @@ def test_series_are_baselines_and_combinations_of_a_night() -> None:
     assert all(np.ptp(s.hours) == 0.0 for s in apart if s.vis2)
 
 
+def test_series_do_not_depend_on_the_order_of_triangles_nor_on_their_sense() -> None:
+    """Combinations of triangles do not: exposures with another order of rows belong to them."""
+    sheet = four_telescopes(5, channels=3)
+    closure = sheet.closure_phase
+    stations = closure.stations.copy()
+    for k, entries in enumerate(closure.sets):
+        stations[entries] = np.roll(stations[entries], k // 3, axis=0)
+        if k % 2:
+            stations[entries] = stations[entries][:, ::-1]
+    turned = replace(sheet, closure_phase=replace(closure, stations=stations))
+    found = [one for one in series_of(turned, channel_layout(turned)) if not one.vis2]
+    assert [len(s.rows) for s in found] == [5] * 3
+    # A triangle that stands alone changes its sign: it is another series then.
+    alone = replace(turned, covariance_kind="diagonal")
+    assert max(len(s.rows) for s in series_of(alone, channel_layout(alone)) if not s.vis2) < 5
+
+
 def test_share_and_time_are_found(rng) -> None:
     # The posterior covers the truth: of 60 draws of known κ and τ, quantiles are uniform.
     hours = np.arange(12) / 3.0

@@ -32,7 +32,7 @@ from amibayes.detection.alternatives import (
     symmetric_chi2,
 )
 from amibayes.detection.calibrator_consistency import compare_calibrators
-from amibayes.detection.consistency import _epochs, compare, consistency
+from amibayes.detection.consistency import by_night, compare, consistency
 from amibayes.detection.exposure_noise import exposure_noise
 from amibayes.detection.false_alarm import (
     Significance,
@@ -203,7 +203,7 @@ def test_probabilities(result: SearchResult, num_regression) -> None:
 def test_agreement_of_the_parts(result: SearchResult, num_regression) -> None:
     data, theta = result.likelihood.observables, result.theta
     apart = consistency(result, np.random.default_rng(3), alpha=0.05)
-    masks = _epochs(data)
+    masks = by_night(data)
     estimated = compare(
         Likelihood(of_two_files(True)), theta, "epochs", masks, np.random.default_rng(4), 200
     )

@@ -195,6 +195,10 @@ def test_images_without_calibrators_are_named(tmp_path: Path) -> None:
     images = [cube(tmp_path / f"{k}.fits") for k in range(2)]
     (said,) = uncalibrated_images([images[0], made, images[1]])
     assert said.startswith(f"{images[0]}, {images[1]}: not calibrated: ")
+    with fits.open(made, mode="update") as hdus:
+        hdus[0].header["HIERARCH AMIBAYES METHOD"] = "fringes"
+    (said,) = uncalibrated_images([made])
+    assert said.startswith(f"{made}: not calibrated: ")
 
 
 def test_charge_is_that_of_the_first_cube_else_of_the_first_header(tmp_path: Path) -> None:

@@ -1,0 +1,57 @@
+"""Hot pixels that every integration has, beside bright fringes and beside each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from amibayes.cube import Cube
+from amibayes.cube.source import InMemoryCube
+from amibayes.extraction.extract import extract_all
+from amibayes.extraction.options import ExtractOptions
+from amibayes.extraction.preparation import make_operator
+from amibayes.instrument import load_instrument
+from amibayes.optics import psf
+from amibayes.units import FloatArray
+
+NIRISS = load_instrument("niriss", "F480M")
+HOT = [(19, 37), (31, 18), (49, 0), (49, 1), (40, 45)]
+"""One in a bright fringe, one in the dark, and two that hide each other from their neighbours."""
+
+
+def stars(contrast: float, step_px: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
+    """Three integrations of 1e7 photons, with read noise, of a star and a companion."""
+    rng, channels = np.random.default_rng(8), NIRISS.bandpass.channels()
+    both = [
+        share * psf(NIRISS, channels, 64, centre_px=(0.1 + f * step_px[0], -0.2 + f * step_px[1]))
+        for f, share in ((0.0, 1.0), (1.0, contrast))
+        if share
+    ]
+    image = 1e7 * np.sum(both, axis=0)
+    return np.array([rng.poisson(image) + rng.normal(0.0, 12.0, image.shape) for _ in range(3)])
+
+
+def cube(images: FloatArray) -> Cube:
+    """Images without flags or errors."""
+    return Cube(images, NIRISS.pixel_scale_rad, "NIRISS", "F480M")
+
+
+def test_hot_pixels_of_every_integration_are_left_out() -> None:
+    """As bright as 0.3 of the image's peak, and dead ones; V² and phases as without them."""
+    clean = stars(0.02, (-2.3, -1.8))
+    hot = clean.copy()
+    for k, (y, x) in enumerate(HOT):
+        hot[:, y, x] += (-0.3 if k == 4 else 0.3) * clean.max()
+    good = make_operator(InMemoryCube(cube(hot)), ExtractOptions()).reference.good
+    assert sorted(map(tuple, np.argwhere(~good).tolist())) == sorted(HOT)
+    (one,), (two,) = (extract_all(cube(images)) for images in (clean, hot))
+    assert np.abs(one.average.vis2 - two.average.vis2).max() < 2e-3
+    apart = one.average.closure_phase - two.average.closure_phase
+    assert np.abs(apart).max() < np.radians(0.1)
+
+
+@pytest.mark.parametrize(("contrast", "step"), [(0.3, (7.0, 3.0)), (0.9, (-4.3, 1.6))])
+def test_light_far_off_the_axis_is_no_hot_pixel(contrast: float, step: tuple[float, float]) -> None:
+    """Its envelope is not the star's: the fit leaves tens of percent of the peak."""
+    made = make_operator(InMemoryCube(cube(stars(contrast, step))), ExtractOptions())
+    assert made.reference.good.all()

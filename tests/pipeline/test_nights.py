@@ -1,0 +1,44 @@
+"""A companion that one night shows by itself, and all nights together do not."""
+
+from __future__ import annotations
+
+import numpy as np
+from epochs import epoch, noisy
+
+from amibayes.data.observables import join
+from amibayes.detection.verdict import Verdict
+from amibayes.pipeline.false_alarm import false_alarm, verdict_of
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions
+
+OPTIONS = SearchOptions(observables=("cp",), separation_mas=(60.0, 300.0), null_draws=3000)
+PLACES = [(150.0, 0.0), (-60.0, 140.0), (-80.0, -150.0)]
+
+
+def stated(contrast: float) -> Verdict:
+    """The verdict on three nights of a companion that is elsewhere in each."""
+    rng = np.random.default_rng(3)
+    nights = [
+        noisy(
+            epoch(mjd=60000.0 + 100.0 * k, source=f"{k}.oifits", turn_deg=50.0 * k),
+            (*place, contrast),
+            rng,
+        )
+        for k, place in enumerate(PLACES)
+    ]
+    found = search_field(join(nights), OPTIONS)
+    tested = false_alarm(found.result, OPTIONS, rng)
+    return verdict_of(found, tested, OPTIONS, rng)[0]
+
+
+def test_a_companion_that_moves_is_not_denied() -> None:
+    """All nights together show nothing that is unlikely for noise; each has a clear companion."""
+    said = stated(0.02)
+    assert said.statement == "inconsistent data"
+    assert "the night of MJD 60000.000 shows a companion by itself" in said.because
+    assert "PA 90 deg" in said.because
+    assert "--motion" in said.because
+
+
+def test_nights_without_a_companion_have_none() -> None:
+    assert stated(0.0).statement == "no companion"
