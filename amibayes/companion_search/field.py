@@ -23,6 +23,9 @@ from amibayes.units import MAS, FloatArray
 SURELY_NOT_NOISE = 30.0
 """Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
 
+PERHAPS_NOT_NOISE = 20.0
+"""Δχ² from which a companion may be stated."""
+
 SURELY_ONE_PLACE = 1000.0
 """Δχ² with which another place that fits to within 9 predicts the same data to 1 %: an alias."""
 
@@ -102,7 +105,7 @@ def look_outside(result: SearchResult) -> float | None:
     float or None
         Its separation in mas; None where nothing outside is as good.
     """
-    if not SURELY_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE:
+    if not PERHAPS_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE:
         return None
     likelihood, outer = result.likelihood, result.grid.outer_mas
     fringe = resolution_mas(likelihood)
