@@ -24,13 +24,17 @@ from amibayes.companion_search.optimise import fit_single
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
+from amibayes.data.systematics import systematics_of
 from amibayes.detection.false_alarm import Significance, beside_bright, significance
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.treatments import Ratio
+from amibayes.detection.verdict import change_by_companion, within_calibration
 from amibayes.errors import DataError
+from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.noise import NoiseModel
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
@@ -65,6 +69,9 @@ class Vetted:
         Charge level over that of the target.
     limit : DetectionLimit or None
         Which companions its data rule out.
+    small_companion, small_disc : bool
+        They change the data by less than the calibration errors known of the instrument: no
+        reason to drop it.
     """
 
     path: str
@@ -77,6 +84,8 @@ class Vetted:
     diameter_probability: float | None = None
     charge_ratio: float | None = None
     limit: DetectionLimit | None = None
+    small_companion: bool = False
+    small_disc: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,12 +235,21 @@ def _chance(left: Observables, n_others: int) -> float:
     the ratio follows F, not χ² (conservative where the stated errors dominate).
     """
     expected = np.concatenate([np.ones(left.n_vis2), np.zeros(left.n_closure_phases)])
-    white = left.covariance.whiten(left.data - expected)
+    white = _noise(left).whiten(left.data - expected)
     chi2, n = float((white**2).sum()), left.n_independent
     if n_others == 1:
         return chi2_survival(chi2, n, left.degrees_of_freedom)
     known = min(left.degrees_of_freedom, n * (n_others - 1))
     return float(stats.f.sf(chi2 / n, n, known))
+
+
+def _noise(data: Observables) -> NoiseModel:
+    """Noise of what is left of a calibrator, with calibration errors as its instrument has them.
+
+    Calibrators of one night differ by the drift of the instrument, which few of them cannot tell
+    from stars that are no points.
+    """
+    return noise_with_channels(data, (), systematics_of(data))
 
 
 def _by_itself(
@@ -245,24 +263,32 @@ def _by_itself(
 ) -> Vetted:
     """Search one calibrator for a companion, a disc, and what it rules out."""
     free = resolves_stars(Likelihood(data))
-    likelihood = Likelihood(data, BinaryModel(diameter_mas="free" if free else 0.0))
-    found = search(likelihood, separation_mas)
+    noise, model = _noise(data), BinaryModel(diameter_mas="free" if free else 0.0)
+    found = search(Likelihood(data, model, noise=noise), separation_mas)
     # Neither test takes the size of the stated errors for known.
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
     enough = limits and found_by_noise.detected is not None
     limit = detection_limit(found, found_by_noise, rng) if enough else None
     found_by_noise = beside_bright(found_by_noise, found, ExtraNoise())
-    vetted = replace(vetted, companion=found, significance=found_by_noise, limit=limit)
+    vetted = replace(
+        vetted, companion=found, significance=found_by_noise, limit=limit,
+        small_companion=within_calibration(data, change_by_companion(found)),
+    )  # fmt: skip
     if not data.n_vis2:
         return vetted
-    disc = Likelihood(data, BinaryModel(diameter_mas="free"))
+    disc = Likelihood(data, BinaryModel(diameter_mas="free"), noise=noise)
     best, _ = fit_single(disc)
     chi2 = float(single_likelihood(disc).chi2(best)[0])
     point = float(disc.chi2([[0.0, 0.0, 0.0, 0.0]])[0])
     # A diameter cannot be negative: half of the χ² distribution of one degree of freedom.
     gain = Ratio.scale_free(data.n_independent)(np.array([max(point - chi2, 0.0)]), point)
     probability = 0.5 * float(stats.chi2.sf(gain[0], 1))
-    return replace(vetted, diameter_mas=float(best[0]), diameter_probability=probability)
+    star, single = single_likelihood(disc), np.array([best, np.zeros_like(best)])
+    change = star.predict(single)
+    return replace(
+        vetted, diameter_mas=float(best[0]), diameter_probability=probability,
+        small_disc=within_calibration(data, change[:, 0] - change[:, 1]),
+    )  # fmt: skip
 
 
 def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
@@ -270,13 +296,18 @@ def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
     if disagrees:
         reasons.append(f"disagrees with the other calibrators (p = {vetted.agreement:.2g})")
     tested, found = vetted.significance, vetted.companion
-    if tested is not None and found is not None and tested.probability < alpha:
+    seen = tested is not None and tested.probability < alpha and not vetted.small_companion
+    if seen and tested is not None and found is not None:
         c = found.companion
         reasons.append(
             f"companion of {c.delta_mag:.1f} mag at {c.separation_mas:.1f} mas, "
             f"PA {c.position_angle_deg:.0f} deg (false-alarm probability {tested.probability:.2g})"
         )
-    elif vetted.diameter_probability is not None and vetted.diameter_probability < alpha:
+    elif (
+        vetted.diameter_probability is not None
+        and vetted.diameter_probability < alpha
+        and not vetted.small_disc
+    ):
         reasons.append(
             f"resolved: {vetted.diameter_mas:.2f} mas (p = {vetted.diameter_probability:.2g})"
         )
@@ -288,6 +319,16 @@ def notes(vetted: Vetted, alpha: float) -> list[str]:
     found = []
     if vetted.kept and vetted.agreement is not None and vetted.agreement < alpha:
         found.append("disagrees with the only other calibrator left: either may be wrong")
+    tested, disc = vetted.significance, vetted.diameter_probability
+    small = {
+        "a companion": tested is not None and tested.probability < alpha and vetted.small_companion,
+        "a disc": disc is not None and disc < alpha and vetted.small_disc,
+    }
+    found += [
+        f"{name} may be in its data, smaller than the calibration errors known of the instrument"
+        for name, there in small.items()
+        if there
+    ]
     ratio = vetted.charge_ratio
     if ratio is not None and not 1.0 / CHARGE_FACTOR <= ratio <= CHARGE_FACTOR:
         found.append(f"its charge level is {ratio:.2g} times the target's")

@@ -161,8 +161,8 @@ def test_a_look_inside_has_a_bounded_number_of_places(looked: SimpleNamespace) -
 @pytest.mark.parametrize(
     ("options", "gain", "fitted", "seen"),
     [
-        ({"delta_chi2": 29.9}, 1e3, 1e3, False),
-        ({"delta_chi2": 30.0}, 1e3, 1e3, True),
+        ({"delta_chi2": 19.9}, 1e3, 1e3, False),
+        ({"delta_chi2": 20.0}, 1e3, 1e3, True),
         ({"delta_chi2": 1000.0}, 1e3, 1e3, True),
         ({"delta_chi2": 1000.1}, 1e3, 1e3, False),
         ({}, 70.9, 1e3, False),  # 0.8 · 100 − 9
