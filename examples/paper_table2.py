@@ -1,6 +1,8 @@
 """Table 2 of Soulain et al. (2020): how faint a companion NIRISS sees, in three filters.
 
     python examples/paper_table2.py [--simulate 1e8] [--picture limits.png]
+    python examples/paper_table2.py --simulate 1e9 --markdown | python docs/pages.py \\
+        paper_table2.md "table: examples/paper_table2.py"
 
 Prints the 3σ limits, as the range of the azimuthal median over 50 to 400 mas, beside the
 paper's for 1e7 to 1e10 photons, under several readings of "3σ":
@@ -257,6 +259,27 @@ def report(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
     return lines
 
 
+def markdown(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
+    """The same as two tables of Markdown, with a line between them."""
+    names = [*READINGS, *(["cubes"] if any("cubes" in cell for cell in table.values()) else [])]
+    columns = ["photons", "filter", "paper", *(name.replace("V2", "V²") for name in names)]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    superscript = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+    for (filter, photons), cell in table.items():
+        power = str(round(np.log10(photons))).translate(superscript)
+        published = "{:.1f}–{:.1f}".format(*PUBLISHED[filter, photons])
+        ours = ["{:.2f}–{:.2f}".format(*cell[n].range) if n in cell else "" for n in names]
+        lines.append(f"| {' | '.join([f'10{power}', filter, published, *ours])} |")
+    lines += ["", "| reading | smallest limit | largest limit | rms |", "|---|---|---|---|"]
+    for name in names:
+        gap = np.array([np.subtract(c[name].range, PUBLISHED[k]) for k, c in table.items()
+                        if name in c])  # fmt: skip
+        mean = [f"{x:+.2f}".replace("-", "−") for x in gap.mean(axis=0)]
+        rms = float(np.sqrt((gap**2).mean()))
+        lines.append(f"| {name.replace('V2', 'V²')} | {mean[0]} | {mean[1]} | {rms:.2f} |")
+    return lines
+
+
 @styled()
 def draw(table: dict[tuple[str, float], dict[str, Limit]], path: str) -> None:
     """Contrast curves of two readings, and the paper's ranges as bars."""
@@ -305,8 +328,12 @@ def main() -> None:
     parser.add_argument("--simulate", type=float, default=0.0, metavar="N",
                         help="simulate images too, up to so many photons")  # fmt: skip
     parser.add_argument("--picture", metavar="PNG", help="draw the curves")
+    parser.add_argument("--markdown", action="store_true", help="print tables of Markdown")
     arguments = parser.parse_args()
     table = limits(arguments.simulate)
+    if arguments.markdown:
+        print("\n".join(markdown(table)))
+        return
     print("\n".join(report(table)))
     for filter in FILTERS:
         real, independent = false_alarms(filter)
