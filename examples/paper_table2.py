@@ -236,9 +236,20 @@ def limits(largest_simulated: float = 0.0) -> dict[tuple[str, float], dict[str, 
     return out
 
 
+def readings_of(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
+    """Names of the readings, with that of simulated images where there are any."""
+    return [*READINGS, *(["cubes"] if any("cubes" in cell for cell in table.values()) else [])]
+
+
+def beyond_paper(table: dict[tuple[str, float], dict[str, Limit]], name: str) -> FloatArray:
+    """Ends of a reading's ranges less the paper's, (n_cells, 2)."""
+    gaps = [np.subtract(c[name].range, PUBLISHED[k]) for k, c in table.items() if name in c]
+    return np.array(gaps)
+
+
 def report(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
     """The table as lines, and how far each reading is from the paper."""
-    names = [*READINGS, *(["cubes"] if any("cubes" in cell for cell in table.values()) else [])]
+    names = readings_of(table)
     head = f"{'photons':8}{'filter':8}{'paper':^12}" + "".join(f"{name:^14}" for name in names)
     lines = [head + f"{'-2.5 log σ':>12}"]
     for (filter, photons), cell in table.items():
@@ -249,8 +260,7 @@ def report(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
             line += f"{found:14}"
         lines.append(line + f"{-2.5 * np.log10(sigma_closure_rad(photons)):11.2f}")
     for name in names:
-        gap = np.array([np.subtract(c[name].range, PUBLISHED[k]) for k, c in table.items()
-                        if name in c])  # fmt: skip
+        gap = beyond_paper(table, name)
         mean, rms = gap.mean(axis=0), np.sqrt((gap**2).mean())
         lines.append(
             f"{name:11}minus the paper: smallest {mean[0]:+.2f}, largest {mean[1]:+.2f} mag on "
@@ -261,7 +271,7 @@ def report(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
 
 def markdown(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
     """The same as two tables of Markdown, with a line between them."""
-    names = [*READINGS, *(["cubes"] if any("cubes" in cell for cell in table.values()) else [])]
+    names = readings_of(table)
     columns = ["photons", "filter", "paper", *(name.replace("V2", "V²") for name in names)]
     lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
     superscript = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -272,8 +282,7 @@ def markdown(table: dict[tuple[str, float], dict[str, Limit]]) -> list[str]:
         lines.append(f"| {' | '.join([f'10{power}', filter, published, *ours])} |")
     lines += ["", "| reading | smallest limit | largest limit | rms |", "|---|---|---|---|"]
     for name in names:
-        gap = np.array([np.subtract(c[name].range, PUBLISHED[k]) for k, c in table.items()
-                        if name in c])  # fmt: skip
+        gap = beyond_paper(table, name)
         mean = [f"{x:+.2f}".replace("-", "−") for x in gap.mean(axis=0)]
         rms = float(np.sqrt((gap**2).mean()))
         lines.append(f"| {name.replace('V2', 'V²')} | {mean[0]} | {mean[1]} | {rms:.2f} |")

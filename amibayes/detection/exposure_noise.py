@@ -109,6 +109,8 @@ def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise 
         return None  # no row of the whitened data is common to the channels
     rows = independent_rows(len(layout.order)) if rows is None else rows.apart or rows
     series, floor = series_of(data, layout), likelihood.noise.floor
+    if not (series or floor):
+        return None
     # Long series have large matrices, of which so many would fill the memory.
     many = floor and all(len(one.rows) < MIN_EXPOSURES for one in series)
     sizes = _sizes(rows, layout, DRAWN_OF_FLOORS if many else DRAWN)

@@ -183,14 +183,14 @@ def without_companion(
     around it is outside of the model.
     """
     against = f"fits as well (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
-    if other.kind == "chromatic star" and not other.plausible:
+    if other.kind != "chromatic star":
+        because = f"{other.words} {against}: {SEE if compared else 'compare by --models'}"
+    elif other.plausible:
+        return Verdict("no companion", f"{other.words}, {against}", found.p_model)
+    else:
         because = (
             f"{other.words}, {against}: no single star is known to, and these data do not tell"
         )
-        return Verdict("model rejected", because, found.p_model)
-    if other.kind == "chromatic star":
-        return Verdict("no companion", f"{other.words}, {against}", found.p_model)
-    because = f"{other.words} {against}: {SEE if compared else 'compare by --models'}"
     return Verdict("model rejected", because, found.p_model)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from amibayes.data.closure import canonical
+from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
 from amibayes.likelihood.chi2 import restricted_loss
@@ -117,12 +118,13 @@ def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
         np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
         for name in ("setup", "mjd")
     )
-    names = _names(data)
     at = layout.starts & ~layout.stated & np.isfinite(mjd[layout.datum])
+    names = _names(data, layout.datum[at])
     of: dict[tuple[object, ...], list[tuple[float, int]]] = {}
-    for row, datum, place in zip(layout.order[at], layout.datum[at], layout.place[at], strict=True):
+    rows_of_data = zip(layout.order[at], layout.datum[at], names, layout.place[at], strict=True)
+    for row, datum, name, place in rows_of_data:
         own, vis2 = data.setups[setup[datum]], bool(datum < data.n_vis2)
-        key = own.source, vis2, own.insname, names[datum], int(place)
+        key = own.source, vis2, own.insname, name, int(place)
         of.setdefault(key, []).append((24.0 * float(mjd[datum]), int(row)))
     found = []
     for (source, kind, *_), members in of.items():
@@ -137,26 +139,34 @@ def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
     return tuple(found)
 
 
-def _names(data: Observables) -> list[tuple[object, ...]]:
-    """What each datum is of, whatever the order of rows and stations in a file.
+def _names(data: Observables, which: IntArray) -> list[tuple[object, ...]]:
+    """What some data are of, whatever the order of rows and stations in a file.
 
     Triangles that share baselines are one: their combinations do not depend on the order, nor on
     the sense of each. One that stands alone changes its sign with its sense.
     """
-    names: list[tuple[object, ...]] = []
-    for m in (data.vis2, data.closure_phase):
-        sign = canonical(m.stations)[1].tolist()
-        for k, (setup, stations) in enumerate(zip(m.setup, m.stations.tolist(), strict=True)):
-            own = data.setups[setup].stations
-            names.append((*sorted(own[i] for i in stations), sign[k]))
-    if data.covariance_kind != "assumed":
-        return names
-    for entries in data.closure_phase.sets:
-        at = data.n_vis2 + np.asarray(entries)
-        together = tuple(sorted({names[i][:-1] for i in at.tolist()}))
-        for i in at.tolist():
-            names[i] = together
-    return names
+    n, closure = data.n_vis2, data.closure_phase
+    together = data.covariance_kind == "assumed"
+    of_set = np.empty(len(closure), dtype=np.intp)
+    for k, entries in enumerate(closure.sets if together else ()):
+        of_set[entries] = k
+
+    def name(k: int) -> tuple[object, ...]:
+        if k < n:
+            return _named(data, data.vis2, k)
+        if together:
+            entries = closure.sets[of_set[k - n]]
+            return tuple(sorted({_named(data, closure, i) for i in entries.tolist()}))
+        sign = canonical(closure.stations[k - n : k - n + 1])[1]
+        return (*_named(data, closure, k - n), int(sign[0]))
+
+    return [name(k) for k in which.tolist()]
+
+
+def _named(data: Observables, table: Measurements, k: int) -> tuple[object, ...]:
+    """Names of the stations of a row, in order."""
+    own = data.setups[table.setup[k]].stations
+    return tuple(sorted(own[i] for i in table.stations[k]))
 
 
 def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:

@@ -30,7 +30,7 @@ from amibayes.likelihood.channel_rows import (
     channel_layout,
 )
 from amibayes.likelihood.chi2 import chi2_survival
-from amibayes.likelihood.exposure_rows import drift_of, series_of
+from amibayes.likelihood.exposure_rows import Series, drift_of, series_of
 from amibayes.likelihood.extra_noise import (
     BOUND,
     UNLIKELY,
@@ -185,6 +185,11 @@ class _Kind:
         """Of the stated errors: extra noise hardly changes their shape over an exposure."""
         return channel_layout(self.data)
 
+    @cached_property
+    def _series(self) -> tuple[Series, ...]:
+        """Exposures that may err alike: no amount of noise changes which they are."""
+        return series_of(self.data, self._layout)
+
     def explained(self, shared: Correlation) -> bool:
         """Whether the stated errors explain the residuals, for any share within 2σ."""
         near = [-2.0, 0.0, 2.0] if np.isfinite(shared.error) else [0.0]
@@ -273,14 +278,13 @@ class _Kind:
 
     def with_exposures(self, amount: float, shared: Correlation) -> Correlation:
         """The same with what exposures that follow each other share, as the residuals show."""
-        series = series_of(self.data, self._layout)
-        if not series:
+        if not self._series:
             return shared
         alone = replace(shared, lasting=())
         rows = channel_rows(self._layout, [ChannelShare(alone, alone)], self._own_floors)
         noise = ChannelCovariance(self._with(amount), rows)
         white = noise.whiten(np.column_stack([self.residual, self.jacobian]))
-        return replace(shared, lasting=drift_of(series, white).lasting)
+        return replace(shared, lasting=drift_of(self._series, white).lasting)
 
     def _growth(
         self, square: FloatArray, variance: FloatArray, floor: FloatArray, ratio: float

@@ -163,13 +163,16 @@ def _more(critical: CriticalContrasts, trials: int) -> int:
     Large data begin with few: an error of `WANTED` asks for more.
     """
     n_angles, n = (int(size) for size in critical.located.shape[1:])
+    most = trials // n_angles
+    if most <= n:
+        return 0
     pooled = Pooled.of(critical, over_components(critical))
     error = pooled.contrast(np.array([COMPLETENESS]))[1]
     known = error[np.isfinite(error)]
     if not len(known):
         return 0
     wanted = int(np.ceil(n * (float(np.median(known)) / WANTED) ** 2))
-    return max(min(wanted, trials // n_angles) - n, 0)
+    return max(min(wanted, most) - n, 0)
 
 
 WANTED = 0.025

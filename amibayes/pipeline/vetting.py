@@ -87,6 +87,14 @@ class Vetted:
     small_companion: bool = False
     small_disc: bool = False
 
+    def shows_companion(self, alpha: float) -> bool:
+        """Whether there is a companion, large enough for a reason or not."""
+        return self.significance is not None and self.significance.probability < alpha
+
+    def shows_disc(self, alpha: float) -> bool:
+        """Likewise a disc."""
+        return self.diameter_probability is not None and self.diameter_probability < alpha
+
 
 @dataclass(frozen=True, eq=False)
 class Vetting:
@@ -296,18 +304,14 @@ def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
     if disagrees:
         reasons.append(f"disagrees with the other calibrators (p = {vetted.agreement:.2g})")
     tested, found = vetted.significance, vetted.companion
-    seen = tested is not None and tested.probability < alpha and not vetted.small_companion
+    seen = vetted.shows_companion(alpha) and not vetted.small_companion
     if seen and tested is not None and found is not None:
         c = found.companion
         reasons.append(
             f"companion of {c.delta_mag:.1f} mag at {c.separation_mas:.1f} mas, "
             f"PA {c.position_angle_deg:.0f} deg (false-alarm probability {tested.probability:.2g})"
         )
-    elif (
-        vetted.diameter_probability is not None
-        and vetted.diameter_probability < alpha
-        and not vetted.small_disc
-    ):
+    elif vetted.shows_disc(alpha) and not vetted.small_disc:
         reasons.append(
             f"resolved: {vetted.diameter_mas:.2f} mas (p = {vetted.diameter_probability:.2g})"
         )
@@ -319,10 +323,9 @@ def notes(vetted: Vetted, alpha: float) -> list[str]:
     found = []
     if vetted.kept and vetted.agreement is not None and vetted.agreement < alpha:
         found.append("disagrees with the only other calibrator left: either may be wrong")
-    tested, disc = vetted.significance, vetted.diameter_probability
     small = {
-        "a companion": tested is not None and tested.probability < alpha and vetted.small_companion,
-        "a disc": disc is not None and disc < alpha and vetted.small_disc,
+        "a companion": vetted.shows_companion(alpha) and vetted.small_companion,
+        "a disc": vetted.shows_disc(alpha) and vetted.small_disc,
     }
     found += [
         f"{name} may be in its data, smaller than the calibration errors known of the instrument"
