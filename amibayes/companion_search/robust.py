@@ -1,7 +1,7 @@
 """A search with Student-t residuals: data that fit nothing lose their weight, step by step.
 
 What channels of an exposure share is fitted to the residuals of a first search, outliers at
-little weight; the search that counts has it in the covariance, as if the file had stated it.
+little weight; the search that counts has it in its noise, in units of the stretched errors.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
-from amibayes.data.observables import Observables
-from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.channel_noise import noise_with_channels, noise_with_rows
 from amibayes.likelihood.combinations import combination_of, require
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, NoisePrior, mean_of_files
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -89,16 +88,18 @@ def search_robust(
     first, _, _, _ = found
     shared = shared_noise(first.likelihood, first.theta, prior or NoisePrior(), per_file=per_file)
     correlated = with_shared(likelihood.expecting(first.theta), shared)
-    if correlated.observables.covariance is not data.covariance:
+    if correlated.noise.rows is not None:
         likelihood = correlated
         work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
         found = work.converge(likelihood.residuals(first.theta)[:, 0])
     result, weights, residuals, scale = found
-    stated = likelihood.observables
-    base = reweighted(stated, scale)
-    robustness = Robustness(base, stated, weights, residuals)
-    student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
-    noise = _as_noise(stated, scale, shared, per_file=per_file)
+    base = work.stretched(scale)
+    robustness = Robustness(
+        base.observables, likelihood.observables, likelihood.noise.covariance, weights, residuals
+    )
+    symmetric = symmetric_whitening(base.observables, base.noise.covariance)
+    student = StudentNoise(result.likelihood.noise, base.noise, symmetric)
+    noise = _as_noise(likelihood, scale, shared, per_file=per_file)
     likelihood = result.likelihood.with_noise(student)
     return replace(result, likelihood=likelihood, robustness=robustness), noise
 
@@ -119,24 +120,20 @@ def shared_noise(
 
 
 def with_shared(likelihood: Likelihood, noise: ExtraNoise) -> Likelihood:
-    """The likelihood of data whose covariance holds what channels share, and floors."""
+    """The likelihood with noise of which channels share some, and floors."""
     data = likelihood.observables
-    covariance = noise_with_channels(data, noise.channels, noise.floors).covariance
-    if covariance is data.covariance:
-        return likelihood
-    blocks = covariance.select(np.arange(covariance.size))
-    return Likelihood(replace(data, covariance=blocks), likelihood.model)
+    return likelihood.with_noise(noise_with_channels(data, noise.channels, noise.floors))
 
 
 def _as_noise(
-    stated: Observables, scale: FloatArray, shared: ExtraNoise, *, per_file: bool
+    stated: Likelihood, scale: FloatArray, shared: ExtraNoise, *, per_file: bool
 ) -> ExtraNoise:
     """Fitted scales (n_data,), in quadrature to the typical error of each kind (and file).
 
     Beside what channels share.
     """
-    data = stated.unflagged()
-    added = data.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
+    data = stated.observables
+    added = stated.noise.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
 
     def of(which: BoolArray) -> float:
         return float(np.sqrt(np.median(added[which]))) if which.any() else 0.0
@@ -156,7 +153,7 @@ class RobustFits:
     Parameters
     ----------
     likelihood : Likelihood
-        With the stated errors.
+        With the stated errors, and what channels share.
     separation_mas : (inner, outer), optional
     free_scale, per_file : bool
     """
@@ -169,11 +166,11 @@ class RobustFits:
         *,
         per_file: bool = False,
     ) -> None:
-        data = likelihood.observables
+        data, covariance = likelihood.observables, likelihood.noise.covariance
         self.likelihood, self.field = likelihood, separation_mas
-        self.symmetric = symmetric_whitening(data)
+        self.symmetric = symmetric_whitening(data, covariance)
         self.free_scale = free_scale
-        self.terms: list[StudentTerm] = student_terms(data, per_file=per_file)
+        self.terms: list[StudentTerm] = student_terms(data, covariance, per_file=per_file)
         parts = groups_of(data, per_file=per_file)
         kinds = self.symmetric.groups
         self.groups = [here & kind for _, here in parts for kind in kinds if (here & kind).any()]
@@ -189,7 +186,7 @@ class RobustFits:
         """Search, and again with new weights until the place holds."""
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):
-            result = search(self.weighted(stretch), self.field)
+            result = search(self.stretched(stretch), self.field)
             grid = result.grid
             box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
             stretch, _ = self.steps(result.theta, box)
@@ -197,13 +194,16 @@ class RobustFits:
             moved, place = np.hypot(*(here - place)), here
             if moved < CONVERGED * resolution_mas(self.likelihood):
                 break
-        result = search(self.weighted(stretch), self.field)
+        result = search(self.stretched(stretch), self.field)
         _, weights, residuals, scale = self._stretch(self.likelihood.residuals(result.theta)[:, 0])
         return result, weights, residuals, scale
 
-    def weighted(self, stretch: FloatArray) -> Likelihood:
+    def stretched(self, stretch: FloatArray) -> Likelihood:
         """The Gaussian likelihood of stretched errors (n_data,)."""
-        return Likelihood(reweighted(self.likelihood.observables, stretch), self.likelihood.model)
+        given = self.likelihood
+        data = reweighted(given.observables, stretch)
+        noise = noise_with_rows(data, given.noise.rows, floor=given.noise.floor)
+        return Likelihood(data, given.model, noise)
 
     def steps(self, theta: FloatArray, box: Box) -> tuple[FloatArray, FloatArray]:
         """Weights and fit in turn, near one place: stretch of the errors, and the fit."""
@@ -211,7 +211,7 @@ class RobustFits:
         for _ in range(MAX_STEPS):
             before = stretch
             stretch = self._stretch(self.likelihood.residuals(theta)[:, 0])[0]
-            theta = np.array(refine(self.weighted(stretch), theta, box, 0.0).theta)
+            theta = np.array(refine(self.stretched(stretch), theta, box, 0.0).theta)
             if np.abs(np.log(stretch / before)).max() < CONVERGED:
                 break
         return stretch, theta

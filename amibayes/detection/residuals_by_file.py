@@ -8,6 +8,7 @@ import numpy as np
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.covariance import Covariance
+from amibayes.likelihood.chi2 import chi2_of_part
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.residuals import files_of
 from amibayes.support.arguments import checks_arguments
@@ -57,5 +58,5 @@ def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
 def _reduced(covariance: Covariance, difference: FloatArray, at: np.ndarray, share: float) -> float:
     if not len(at):
         return float("nan")
-    part = covariance.select(at)
-    return float((part.whiten(difference[at]) ** 2).sum() / (share * part.rank))
+    chi2, rank = chi2_of_part(covariance, at, difference)
+    return chi2 / (share * rank)

@@ -29,11 +29,11 @@ def channel_correlation(result: SearchResult) -> tuple[float, int]:
     n_pairs : int
         Pairs of data it rests on; by chance it scatters by 1/√n_pairs.
     """
-    data = result.likelihood.observables
-    # Turned to single channels: what the noise model knows of their correlation is taken out
-    # by the whitening, what is left shows between neighbours.
-    white = result.likelihood.noise.aligned(result.likelihood.residuals(result.theta))
-    residuals = symmetric_whitening(data).residuals(white)[:, 0]
+    data, noise = result.likelihood.observables, result.likelihood.noise
+    # What the noise model knows of the correlation of channels is taken out by the whitening:
+    # what is left shows between neighbours.
+    white = result.likelihood.residuals(result.theta)
+    residuals = symmetric_whitening(data, noise.covariance).residuals(white)[:, 0]
     vis2, closure = _neighbours(data.vis2), _neighbours(data.closure_phase) + data.n_vis2
     first, second = residuals[np.concatenate([vis2, closure], axis=1)]
     norm = float(np.sqrt((first @ first) * (second @ second)))

@@ -70,10 +70,6 @@ class NoiseModel(Protocol):
         """How whitened data are turned; None where channels of an exposure share nothing."""
         ...
 
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
-        ...
-
     @property
     def log_norm(self) -> float:
         """Logarithm of the likelihood of data without residuals, with the one covariance."""
@@ -151,10 +147,6 @@ class GaussianNoise:
     scatter: csr_array | None = None
     rows: ChannelRows | None = None
     floor: bool = False
-
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
-        return white if self.rows is None else np.asarray(self.rows.rotation.T @ white)
 
     @property
     def n_independent(self) -> int:
@@ -306,10 +298,6 @@ class FittedNoise:
     def rows(self) -> ChannelRows | None:
         """Those of the fit."""
         return self.fit.rows
-
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """As the fit does it."""
-        return self.fit.aligned(white)
 
     @property
     def n_independent(self) -> int:

@@ -58,6 +58,7 @@ from amibayes.detection.treatments import FreeScale, Ratio, drawn_scale
 from amibayes.detection.verdict import change_by_companion, fit_probability, verdict
 from amibayes.detection.whiteness import channel_correlation
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import noise_of
 from amibayes.likelihood.student import StudentNoise, symmetric_whitening
 from amibayes.models.binary import BinaryModel
 
@@ -115,7 +116,7 @@ def test_statistics(result: SearchResult, num_regression) -> None:
     one = estimated.observables.unflagged()
     whole = Likelihood(replace(one, freedom=Freedom(30.0, 29.0)))
     base = likelihood.observables
-    student = StudentNoise(likelihood.noise, base.covariance, symmetric_whitening(base))
+    student = StudentNoise(likelihood.noise, noise_of(base), symmetric_whitening(base))
     disc = Likelihood(simulated(niriss(), TRUTH, np.random.default_rng(2)), DISC)
     exposures = _drifting()
     lasting = exposure_noise(exposures, none)

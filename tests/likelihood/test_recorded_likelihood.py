@@ -273,7 +273,7 @@ def test_robust_residuals(num_regression) -> None:
                 f"terms {scope}": [(t.share, t.log_det) for t in student_terms(data)],
             }
         )
-    robust = Robustness(base, data, weights, standard[:, 0])
+    robust = Robustness(base, data, data.covariance, weights, standard[:, 0])
     numbers |= numbers_of(
         share=symmetric.share,
         standard=standard,

@@ -178,7 +178,7 @@ def weighted_fit(stated, theta, box):
     """The robust fit near one place, and its averaged likelihood."""
     work = RobustFits(stated, FIELD, free_scale=True)
     stretch, found = work.steps(theta, box)
-    profile = work.weighted(stretch)
+    profile = work.stretched(stretch)
     left = stated.difference(found)[:, 0]
     terms = tuple(with_nodes(t, [left]) for t in student_terms(stated.observables))
     return found, profile.with_noise(AveragedNoise(profile.noise, terms))
