@@ -92,7 +92,7 @@ def search_robust(
         likelihood = correlated
         work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
         found = work.converge(likelihood.residuals(first.theta)[:, 0])
-    result, weights, residuals, scale = found
+    result, weights, residuals, scale = work.settled(found)
     base = work.stretched(scale)
     robustness = Robustness(
         base.observables, likelihood.observables, likelihood.noise.covariance, weights, residuals
@@ -187,9 +187,7 @@ class RobustFits:
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):
             result = search(self.stretched(stretch), self.field)
-            grid = result.grid
-            box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
-            stretch, _ = self.steps(result.theta, box)
+            stretch, _ = self.steps(result.theta, self._box(result))
             here = np.array([result.companion.east_mas, result.companion.north_mas])
             moved, place = np.hypot(*(here - place)), here
             if moved < CONVERGED * resolution_mas(self.likelihood):
@@ -197,6 +195,40 @@ class RobustFits:
         result = search(self.stretched(stretch), self.field)
         _, weights, residuals, scale = self._stretch(self.likelihood.residuals(result.theta)[:, 0])
         return result, weights, residuals, scale
+
+    def settled(self, found: Found) -> Found:
+        """The most likely solution, and how much less likely others are, each with its own weights.
+
+        Weights that were found beside one solution take from all others what speaks for them.
+        """
+        fits, log = self._of_modes(found[0])
+        for _ in range(MAX_SEARCHES):
+            best = int(log.argmax())
+            if best == 0:
+                break
+            other = self.converge(self.likelihood.residuals(fits[best])[:, 0])
+            if self.log_prob(other[0].theta) <= log[0]:
+                break
+            found = other
+            fits, log = self._of_modes(found[0])
+        result = found[0]
+        gain = result.modes[0].delta_chi2 + np.minimum(2.0 * (log - log[0]), 0.0)
+        modes = [replace(m, delta_chi2=float(g)) for m, g in zip(result.modes, gain, strict=True)]
+        aliases = [
+            new for old, new in zip(result.modes, modes, strict=True) if old in result.aliases
+        ]
+        modes.sort(key=lambda m: -m.delta_chi2)
+        return replace(result, modes=tuple(modes), aliases=tuple(aliases)), *found[1:]
+
+    def _of_modes(self, result: SearchResult) -> tuple[list[FloatArray], FloatArray]:
+        """Fits near every solution with weights of their own, and their log-likelihoods."""
+        box = self._box(result)
+        fits = [result.theta, *(self.steps(np.array(m.theta), box)[1] for m in result.modes[1:])]
+        return fits, np.array([self.log_prob(theta) for theta in fits])
+
+    def _box(self, result: SearchResult) -> Box:
+        grid = result.grid
+        return Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
 
     def stretched(self, stretch: FloatArray) -> Likelihood:
         """The Gaussian likelihood of stretched errors (n_data,)."""

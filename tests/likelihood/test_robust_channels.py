@@ -7,6 +7,7 @@ import pytest
 from channel_sets import pionier, share, with_draw
 from helpers import niriss, simulated
 from scipy import stats
+from scipy.optimize import minimize
 
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.robust import RobustFits, search_robust, shared_noise, with_shared
@@ -143,3 +144,25 @@ def test_symmetric_whitening_of_channels_keeps_chi2_and_names_the_data(rng) -> N
     assert np.abs(z.std(axis=1) - 1.0).max() < 5 / np.sqrt(2 * 3000)
     pushed = frame.residuals(covariance.whiten(np.diag(np.sqrt(covariance.variance))))
     np.testing.assert_array_equal(np.abs(pushed).argmax(axis=0), np.arange(covariance.size))
+
+
+def test_the_solution_that_stands_is_the_most_likely_with_weights_of_its_own() -> None:
+    """Six of 120 data are pushed by 8 errors: weights of another place hide the better one.
+
+    What other places lose is that of the t likelihood, maximised there by a simplex.
+    """
+    rng, sheet = np.random.default_rng(24), simulated(pionier(2), [5.0, -3.0, 0.008], None)
+    noise = sheet.covariance.draw(rng, 1)[:, 0]
+    at = rng.choice(len(noise), 6, replace=False)
+    noise[at] += 8.0 * np.sqrt(sheet.covariance.variance[at]) * rng.choice([-1.0, 1.0], 6)
+    likelihood = Likelihood(with_draw(sheet, noise))
+    work = RobustFits(likelihood, (3.0, 20.0), free_scale=True)
+    first = work.converge(likelihood.residuals([5.0, -3.0, 0.0])[:, 0])
+    found = work.settled(first)[0]
+    best = work.log_prob(found.theta)
+    assert best > work.log_prob(first[0].theta) + 0.5
+    for mode in found.modes[1:4]:
+        fit = minimize(lambda t: -work.log_prob(t), mode.theta, method="Nelder-Mead")
+        loss = found.modes[0].delta_chi2 - mode.delta_chi2
+        assert loss == pytest.approx(2.0 * (best + fit.fun), abs=0.1)
+        assert loss > 0.0
