@@ -137,6 +137,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     first = search(likelihood, field, check=False)
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
+        likelihood, first = _with_disc_of_star(likelihood, first)
     first = _with_its_disc(likelihood, first, options)
     if options.separation_mas is None:
         first, wider = _in_wider_field(likelihood, first, options)
@@ -252,6 +253,27 @@ def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihoo
     return (likelihood, free) if found.chi2_binary > least else (point, found)
 
 
+def _with_disc_of_star(
+    likelihood: Likelihood, point: SearchResult
+) -> tuple[Likelihood, SearchResult]:
+    """Take a disc of the star in where closure phases alone show one, beside a sure companion.
+
+    They tell nothing of a star alone, but how far it is resolved decides how much a companion
+    turns them: that of two bright, resolved stars would be rejected.
+    """
+    if likelihood.observables.n_vis2 or point.delta_chi2 < SURELY_NOT_NOISE:
+        return likelihood, point
+    disc = likelihood.with_model(replace(likelihood.model, diameter_mas="free"))
+    found = search(disc, (point.grid.inner_mas, point.grid.outer_mas), check=False)
+    sure = _surely_better(likelihood.n_independent, point.chi2_binary, found.chi2_binary)
+    return (disc, found) if sure else (likelihood, point)
+
+
+def _surely_better(n: int, point: float, disc: float) -> bool:
+    """Whether a disc lowers χ² for certain, with the stated errors and with their scale free."""
+    return bool(min(point - disc, n * np.log(point / disc)) > SURELY_A_DISC)
+
+
 LIKELY_DISC_MAS = 4.0
 """Five of six stars are smaller by the prior, half-Cauchy with 1 mas."""
 
@@ -271,9 +293,8 @@ def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
     point = refine(likelihood, result.theta, box, 0.0)
     larger = refine(disc, with_disc(disc, np.array(point.theta), box), box, 0.0)
     fits = (likelihood, point), (disc, larger)
-    chi2 = [float(model.chi2(np.array(fit.theta))[0]) for model, fit in fits]
-    scaled = likelihood.n_independent * np.log(chi2[0] / chi2[1])
-    return bool(min(chi2[0] - chi2[1], scaled) > SURELY_A_DISC)
+    chi2 = (float(model.chi2(np.array(fit.theta))[0]) for model, fit in fits)
+    return _surely_better(likelihood.n_independent, *chi2)
 
 
 def _search_for_disc(
