@@ -364,15 +364,15 @@ def _treatment(
     whitening: SymmetricWhitening | None,
 ) -> tuple[TemplateBank, ErrorTreatment]:
     """What is known of the errors, and the bank that searches in few numbers where it can."""
+    least = 1.0 if likelihood.noise.floor else 0.0
     if whitening is not None:
-        return bank, StudentScores(whitening)
+        return bank, StudentScores(whitening, least)
     null = rotation_null(likelihood.noise, bank.project(observed))
     if null is not None:
         return bank, Rotations(null)
     if stated_errors:
         return bank, KnownErrors()
     groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.rows)
-    least = 1.0 if likelihood.noise.floor else 0.0
     reduced = bank.reduced(groups.label)
     if reduced.reduction is not None:
         groups = replace(groups, label=reduced.reduction.label, count=groups.degrees / groups.share)

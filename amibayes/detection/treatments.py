@@ -17,7 +17,7 @@ from scipy import special, stats
 from amibayes.companion_search.scan import NO_SCATTER, GroupWeights, ScaleGroups, weighted_gain
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.noise_terms import MAX_INFLATION, PRIOR_STATED_ERRORS_CORRECT
-from amibayes.likelihood.student import SymmetricWhitening, scores
+from amibayes.likelihood.student import SymmetricWhitening, normal_moments, scores
 from amibayes.units import FloatArray, IntArray
 
 
@@ -306,20 +306,30 @@ class StudentScores(ErrorTreatment):
     Parameters
     ----------
     whitening : SymmetricWhitening
+    least : float
+        Least scale, in units of the errors: 1 where these hold a floor of systematic errors.
     """
 
     whitening: SymmetricWhitening
+    least: float = 0.0
 
     def _scores(self, bank: TemplateBank, white: FloatArray) -> FloatArray:
-        return scores(self.whitening, bank.project(white))
+        return scores(self.whitening, bank.project(white), self.least)
+
+    def _total(self, bank: TemplateBank, chi2: FloatArray) -> FloatArray:
+        """Sum of squares of the scores, not below what normal residuals of the least scale give."""
+        one = normal_moments().score_variance
+        return np.maximum(chi2, self.least**2 * one * (bank.n_data - bank.n_nuisance))
 
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets; see `ErrorTreatment`."""
-        return KnownErrors().search(bank, self._scores(bank, white))
+        found = KnownErrors().search(bank, self._scores(bank, white))
+        return replace(found, chi2=self._total(bank, found.chi2))
 
     def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere; see `ErrorTreatment`."""
-        return KnownErrors().field(bank, self._scores(bank, white[:, None])[:, 0])
+        gain, chi2 = KnownErrors().field(bank, self._scores(bank, white[:, None])[:, 0])
+        return gain, float(self._total(bank, np.array(chi2)))
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""

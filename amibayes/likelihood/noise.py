@@ -110,10 +110,6 @@ class NoiseModel(Protocol):
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         ...
 
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, n) as a significance test counts them."""
-        ...
-
     def without_companion(self) -> NoiseModel:
         """The noise that a test of no companion may use: nothing in it rests on one."""
         ...
@@ -200,10 +196,6 @@ class GaussianNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """Half of Δχ²."""
         return np.asarray(0.5 * delta_chi2)
-
-    def scores(self, white: FloatArray) -> FloatArray:
-        """The whitened data themselves."""
-        return white
 
     def without_companion(self) -> GaussianNoise:
         """The same."""
@@ -350,10 +342,6 @@ class FittedNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         return self.fit.log_loss(delta_chi2)
-
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, n) as a significance test counts them."""
-        return self.fit.scores(white)
 
     def without_companion(self) -> NoiseModel:
         """That of the fit."""

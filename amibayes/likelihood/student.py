@@ -57,6 +57,11 @@ class NormalMoments:
     power: float
     efficiency: float
 
+    @property
+    def score_variance(self) -> float:
+        """Mean of (ψν/(ν + 1))²: of the scores, whose slope at 0 is 1."""
+        return self.curvature / self.power * (DEGREES / (DEGREES + 1.0)) ** 2
+
 
 @cache
 def normal_moments(degrees: float = DEGREES) -> NormalMoments:
@@ -128,10 +133,6 @@ class StudentNoise(FittedNoise):
     base: NoiseModel
     symmetric: SymmetricWhitening
 
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Bounded scores of data (n_independent, n), whitened by ``base``."""
-        return scores(self.symmetric, white)
-
     def without_companion(self) -> StudentNoise:
         """All data at full weight: no companion may be tested by weights found with one."""
         return StudentNoise(self.base, self.base, self.symmetric)
@@ -159,14 +160,15 @@ def scales(frame: SymmetricWhitening, standard: FloatArray, n_fitted: float = 0.
     return np.asarray(scale)
 
 
-def scores(frame: SymmetricWhitening, white: FloatArray) -> FloatArray:
+def scores(frame: SymmetricWhitening, white: FloatArray, least: float = 0.0) -> FloatArray:
     """Whitened data (rank, n) whose residuals are bounded: what a robust search looks at.
 
     The slope of the t likelihood of the fit without a companion, by the data; its products
-    with the templates are Rao's score statistics. Divided by the scale of each data set.
+    with the templates are Rao's score statistics. Divided by the scale of each data set, which
+    is ``least`` or more.
     """
     standard = frame.residuals(white)
-    standard = standard / scales(frame, standard)
+    standard = standard / np.maximum(scales(frame, standard), least)
     return frame.gather(weights_of(standard) * standard)
 
 

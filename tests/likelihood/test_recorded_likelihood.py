@@ -117,7 +117,6 @@ def of_noise(likelihood: Likelihood, theta: np.ndarray) -> dict[str, Any]:
         "log_loss": noise.log_loss(gains),
         "norm": noise.log_norm,
         "n": noise.n_independent,
-        "scores": np.sort((noise.scores(white) ** 2).sum(axis=0)),
         "variance": noise.covariance.variance,
         "errors": likelihood.errors(theta),
         "gradient": likelihood.log_prob_and_gradient(sets),
