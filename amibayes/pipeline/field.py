@@ -15,6 +15,8 @@ from amibayes.companion_search.field import (
     look_outside,
     notices_disc,
     on_inner_edge,
+    on_outer_edge,
+    outermost,
     refuse_no_length,
     resolution_mas,
     wider_fields,
@@ -140,7 +142,8 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     first = _with_its_disc(likelihood, first, options)
     if options.separation_mas is None:
         first, wider = _in_wider_field(likelihood, first, options)
-        warnings = wider or warnings
+        first, past = _past_the_edge(likelihood, first, options)
+        warnings = past or wider or warnings
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings), observables)
@@ -209,6 +212,30 @@ def _in_wider_field(
                 f"one fits, and a companion at {place:.1f} mas does far better"
             ]
     return first, []
+
+
+def _past_the_edge(
+    likelihood: Likelihood, first: SearchResult, options: SearchOptions
+) -> tuple[SearchResult, list[str]]:
+    """The search in a field a little wider, with a warning, where the fit ended on the edge."""
+    grid = first.grid
+    edge = min(PAST_EDGE * grid.outer_mas, outermost(likelihood))
+    wide = edge > grid.outer_mas + grid.step_mas
+    if not wide or first.delta_chi2 < SURELY_NOT_NOISE or not on_outer_edge(first):
+        return first, []
+    found = search(likelihood, (grid.inner_mas, edge), check=False)
+    found = _with_its_disc(likelihood, found, options)
+    if found.chi2_binary > first.chi2_binary:
+        return first, []
+    place = found.companion.separation_mas
+    return found, [
+        f"the field was widened to {grid.inner_mas:.3g}:{edge:.4g} mas: in the default one the fit "
+        f"ended on the edge, and a companion at {place:.1f} mas does better"
+    ]
+
+
+PAST_EDGE = 1.25
+"""Outer edge of such a field, in units of that of the first."""
 
 
 def _score(result: SearchResult, options: SearchOptions) -> float:
