@@ -279,6 +279,15 @@ def on_inner_edge(result: SearchResult) -> bool:
     return result.delta_chi2 > SURELY_NOT_NOISE and result.companion.separation_mas < edge
 
 
+def on_outer_edge(result: SearchResult) -> bool:
+    """Whether the fit ended at the outer edge of the field: it is better still outside."""
+    left = result.grid.outer_mas - result.companion.separation_mas
+    return left < AT_EDGE * resolution_mas(result.likelihood)
+
+
+AT_EDGE = 1e-3
+"""Distance from an edge, in units of λ/B_max, of a fit that ended there: far below any error."""
+
 NEARER = 0.3
 """Inner edge of the first of these fields, in units of that of the search: λ/7B, below which
 contrast and separation of any companion are one number."""

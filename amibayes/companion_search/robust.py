@@ -77,15 +77,8 @@ def search_robust(
     data = likelihood.observables
     require(combination_of(likelihood, residuals="student"), data.source)
     work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
-    plain = search(likelihood, separation_mas)
-    alone = single_likelihood(likelihood)
-    starts = [
-        likelihood.residuals(plain.theta)[:, 0],
-        alone.residuals(plain.single_theta)[:, 0],
-    ]
-    tried = [work.converge(white) for white in starts]
-    found = max(tried, key=lambda t: work.log_prob(t[0].theta))
-    first, _, _, _ = found
+    found = work.first()
+    first = found[0]
     shared = shared_noise(first.likelihood, first.theta, prior or NoisePrior(), per_file=per_file)
     correlated = with_shared(likelihood.expecting(first.theta), shared)
     if correlated.noise.rows is not None:
@@ -181,6 +174,13 @@ class RobustFits:
         nodes = [t.best(difference[:, 0]) if self.free_scale else 0.0 for t in self.terms]
         each = zip(self.terms, nodes, strict=True)
         return float(sum(t.log_likelihoods(difference, np.array([n]))[0, 0] for t, n in each))
+
+    def first(self) -> Found:
+        """The more likely one of those that start from the best fit and from no companion."""
+        plain, alone = search(self.likelihood, self.field), single_likelihood(self.likelihood)
+        fits = (self.likelihood, plain.theta), (alone, plain.single_theta)
+        tried = [self.converge(model.residuals(theta)[:, 0]) for model, theta in fits]
+        return max(tried, key=lambda t: self.log_prob(t[0].theta))
 
     def converge(self, white: FloatArray) -> Found:
         """Search, and again with new weights until the place holds."""

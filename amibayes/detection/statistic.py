@@ -19,12 +19,12 @@ from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.exposure_noise import ExposureNoise, exposure_noise
 from amibayes.detection.null_draws import noise_of_rows, null_draws
+from amibayes.detection.ratio import Ratio
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.treatments import (
     ErrorTreatment,
     FreeScale,
     KnownErrors,
-    Ratio,
     Searched,
     StudentScores,
 )

@@ -174,6 +174,20 @@ def star_alone(
     return noisy, theta
 
 
+def at_the_edge(found: Verdict, result: SearchResult) -> Verdict:
+    """The verdict where the fit of the companion ended at the outer edge of all that is searched.
+
+    It fits best where the data know nothing of a companion, and whatever they hold is no
+    companion inside.
+    """
+    rho = result.companion.separation_mas
+    because = (
+        f"the best companion is on the outer edge of the field, {rho:.4g} mas, and better outside: "
+        "look for hot pixels and other faults, or give a field (--separation)"
+    )
+    return Verdict("model rejected", because, found.p_model)
+
+
 def without_companion(
     found: Verdict, other: Alternative, result: SearchResult, *, compared: bool = False
 ) -> Verdict:

@@ -160,16 +160,19 @@ def scales(frame: SymmetricWhitening, standard: FloatArray, n_fitted: float = 0.
     return np.asarray(scale)
 
 
-def scores(frame: SymmetricWhitening, white: FloatArray, least: float = 0.0) -> FloatArray:
+def scores(
+    frame: SymmetricWhitening, white: FloatArray, least: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Whitened data (rank, n) whose residuals are bounded: what a robust search looks at.
 
     The slope of the t likelihood of the fit without a companion, by the data; its products
-    with the templates are Rao's score statistics. Divided by the scale of each data set, which
-    is ``least`` or more.
+    with the templates are Rao's score statistics. Divided by the scale of each data set (n,),
+    which is ``least`` or more, and comes with them.
     """
     standard = frame.residuals(white)
-    standard = standard / np.maximum(scales(frame, standard), least)
-    return frame.gather(weights_of(standard) * standard)
+    scale = np.maximum(scales(frame, standard), least)
+    standard = standard / scale
+    return frame.gather(weights_of(standard) * standard), scale
 
 
 def reweighted(observables: Observables, stretch: FloatArray) -> Observables:

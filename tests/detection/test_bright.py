@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -29,8 +31,20 @@ def test_an_equal_binary_is_detected(place: tuple[float, float], rng) -> None:
     else:
         assert found.bright == found.probability < 1e-6
         assert found.threshold() == drawn.threshold()
-    # With noise beside the stated errors the companion does not explain the data.
-    assert beside_bright(drawn, result, ExtraNoise(vis2=0.01)) is drawn
+
+
+def test_noise_beside_the_errors_is_no_reason_to_deny_an_equal_binary(rng) -> None:
+    """Errors that are a little too small, while the companion explains nearly all of the data."""
+    result = search(Likelihood(simulated(niriss(), (6.8, -129.8, 0.9), rng)), FIELD)
+    drawn = significance(statistic_of(result), DRAWS, rng)
+    blind = replace(drawn, probability=0.5, interval=(0.48, 0.52), tail=None)
+    added = ExtraNoise(vis2=0.001)
+    assert blind.detected is False
+    assert beside_bright(blind, result, added).detected
+    # A twentieth of the squared residuals, that noise is taken for, is another matter.
+    worse = replace(result, chi2_binary=0.05 * result.chi2_single)
+    assert beside_bright(blind, worse, added) is blind
+    assert beside_bright(blind, worse, ExtraNoise()).detected
 
 
 def test_noise_of_any_size_never_looks_like_a_bright_companion(rng) -> None:

@@ -36,8 +36,8 @@ from amibayes.detection.verdict import (
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
-from amibayes.pipeline.field import noise_prior, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.units import MAS, offset
 
 Visibility = Callable[[np.ndarray, np.ndarray], np.ndarray]

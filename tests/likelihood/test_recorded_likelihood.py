@@ -280,7 +280,7 @@ def test_robust_residuals(num_regression) -> None:
         weights=weights,
         variance=base.covariance.variance,
         chi2=Likelihood(base).chi2(THETA),
-        scores=(scores(symmetric, likelihood.residuals(THETA)) ** 2).sum(),
+        scores=(scores(symmetric, likelihood.residuals(THETA))[0] ** 2).sum(),
         moments=normal_moments(),
         outliers=robust.outliers,
     )

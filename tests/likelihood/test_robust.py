@@ -149,7 +149,7 @@ def test_statistic_does_not_depend_on_the_scale_and_bounds_one_datum(rng) -> Non
     first = test.evaluate(white)
     again = test.evaluate(7.0 * white)
     np.testing.assert_allclose(again, first, rtol=1e-4)
-    bounded = scores(frame, np.where(np.arange(bank.n_data)[:, None] == 2, 1e3, white))
+    bounded, _ = scores(frame, np.where(np.arange(bank.n_data)[:, None] == 2, 1e3, white))
     assert np.abs(bounded).max() < 3.0
 
 
@@ -172,7 +172,7 @@ def test_residuals_below_a_floor_of_the_errors_count_by_the_floor(rng) -> None:
     expected = -n * np.log1p(-share)
     np.testing.assert_allclose(small, expected, rtol=0.01, atol=0.01 * expected.max())
     # Larger ones than the floor count by their own scatter.
-    np.testing.assert_allclose(held.evaluate(3.0 * white), free.evaluate(white), rtol=1e-3)
+    np.testing.assert_allclose(held.evaluate(5.0 * white), free.evaluate(white), rtol=1e-3)
 
 
 def efficiency_and_coverage(share, n, seed):

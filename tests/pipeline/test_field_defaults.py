@@ -12,8 +12,8 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.pipeline.field import model_of, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, model_of
 from amibayes.units import MAS
 
 STATIONS = np.array([[0.0, 0.0], [30.0, 10.0], [-20.0, 45.0], [60.0, -30.0]])
