@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import NIRISS_HOLES, simulated
+from interferometer import observed
 
 from amibayes.companion_search.field import default_separation, on_outer_edge
 from amibayes.companion_search.search import search
@@ -16,6 +17,7 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
 from amibayes.pipeline.field import FieldSearch, search_field
 from amibayes.pipeline.options import SearchOptions
+from amibayes.units import MAS
 
 OPTIONS = SearchOptions(null_draws=4000)
 
@@ -51,3 +53,22 @@ def test_the_default_field_is_widened_where_the_fit_ends_on_its_edge() -> None:
     companion = found.result.companion
     assert abs(companion.separation_mas - truth) < 3.0 * companion.separation_error_mas
     assert any("ended on the edge" in w for w in found.warnings)
+
+
+def test_an_alias_outside_that_fits_as_well_is_warned_of_however_sure_a_companion_is(rng) -> None:
+    """The holes of NIRISS repeat the sky at 866 mas: of 790 mas one inside fits.
+
+    Δχ² is some ten thousand, that of the places a few.
+    """
+    sheet = point_source(
+        NIRISS_HOLES, [4.8e-6], 0.3e-6, vis2_error=0.005, closure_error_rad=np.radians(0.3)
+    )
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (548.8 * u + 568.3 * v))
+        return (1.0 + 0.05 * fringe) / 1.05
+
+    found = search_field(observed(sheet, binary, rng), SearchOptions())
+    assert found.result.delta_chi2 > 3000.0
+    assert found.result.companion.separation_mas < found.result.grid.outer_mas
+    assert any("outside the field" in warning for warning in found.warnings)
