@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -191,6 +192,11 @@ class Stack:
         return np.asarray((left @ right).swapaxes(1, 2))
 
 
+LARGE = 16
+"""Data of a block from which on products of full matrices are faster than those of sparse ones: the
+35 triangles of seven holes take half of the time, the 120 of ten holes a fifth."""
+
+
 class BlockCovariance:
     """Independent groups of correlated entries; one block makes it dense.
 
@@ -275,9 +281,35 @@ class BlockCovariance:
             columns.append(np.broadcast_to(s.index[:, None], s.matrix.shape).ravel())
         return np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
 
+    @property
+    def has_large_blocks(self) -> bool:
+        """Whether a block is large enough to be whitened as a full matrix."""
+        return any(s.shape[0] >= LARGE for s in self.stacks)
+
+    @cached_property
+    def _parts(self) -> list[tuple[slice, IntArray | None, Any]]:
+        """Rows of whitened data, the data of blocks, and a matrix; small blocks are left sparse."""
+        first = 0
+        parts: list[tuple[slice, IntArray | None, Any]] = []
+        for stack in self.stacks:
+            (g, m), r = stack.index.shape, stack.shape[1]
+            rows = slice(first, first + g * r)
+            if m < LARGE:
+                parts.append((rows, None, self.whitening[rows]))
+            else:
+                parts.append((rows, stack.index, stack.factors()[0]))
+            first = rows.stop
+        return parts
+
     def whiten(self, x: FloatArray) -> FloatArray:
         """Independent, unit-variance combinations, (rank, …)."""
-        return np.asarray(self.whitening @ x)
+        if x.ndim < 2 or not self.has_large_blocks:
+            return np.asarray(self.whitening @ x)
+        out = np.empty((self.rank, x.shape[1]))
+        for rows, index, matrix in self._parts:
+            product = matrix @ (x if index is None else x[index])
+            out[rows] = product.reshape(-1, x.shape[1])
+        return out
 
     def solve(self, x: FloatArray) -> FloatArray:
         """(Pseudo-)inverse of the covariance times x, (size, …)."""

@@ -122,10 +122,14 @@ class ChannelCovariance:
         return self.base.rank
 
     @cached_property
+    def _turn(self) -> csr_array:
+        """What is done to data that the base has whitened, (rank, rank)."""
+        return csr_array(diags_array(1.0 / self.rows.sigma) @ self.rows.rotation)
+
+    @cached_property
     def whitening(self) -> csr_array:
         """The sparse matrix W, (rank, size), with W C Wᵀ = 1."""
-        scaled = diags_array(1.0 / self.rows.sigma) @ self.rows.rotation
-        return csr_array(scaled @ self.base.whitening)
+        return csr_array(self._turn @ self.base.whitening)
 
     @cached_property
     def _unwhitening(self) -> csr_array:
@@ -143,6 +147,8 @@ class ChannelCovariance:
 
     def whiten(self, x: FloatArray) -> FloatArray:
         """Independent, unit-variance combinations, (rank, …)."""
+        if self.base.has_large_blocks:
+            return np.asarray(self._turn @ self.base.whiten(x))
         return np.asarray(self.whitening @ x)
 
     def solve(self, x: FloatArray) -> FloatArray:
