@@ -662,3 +662,14 @@ def test_images_without_dates_have_none(niriss: Instrument) -> None:
     images = with_photons(binary_images(niriss, jittered(3), (0.0, 0.0), 0.0), 17)
     undated = replace(cube_of(images, niriss), mjd=None)
     assert not np.any(extract(undated).vis2.mjd)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_units_of_the_images_do_not_matter(niriss: Instrument, method: str) -> None:
+    images = with_photons(binary_images(niriss, jittered(3), (120.0, 160.0), 0.02), 4)
+    one = cube_of(images, niriss)
+    other = replace(one, images=1e-12 * images, error=1e-12 * one.error)
+    first, second = (extract(cube, method) for cube in (one, other))  # type: ignore[arg-type]
+    sigma = np.sqrt(first.covariance.variance)
+    assert np.abs((second.data - first.data) / sigma).max() < 1e-4
+    np.testing.assert_allclose(second.covariance.variance, first.covariance.variance, rtol=1e-4)

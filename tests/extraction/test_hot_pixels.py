@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from amibayes.cube import Cube
 from amibayes.cube.source import InMemoryCube
+from amibayes.extraction.cleaning import FAINT, _misfitting
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
@@ -55,3 +58,27 @@ def test_light_far_off_the_axis_is_no_hot_pixel(contrast: float, step: tuple[flo
     """Its envelope is not the star's: the fit leaves tens of percent of the peak."""
     made = make_operator(InMemoryCube(cube(stars(contrast, step))), ExtractOptions())
     assert made.reference.good.all()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "expected"),
+    [((0.8, 0.0), []), ((1.3, 0.8), [0]), ((3.0, 1.3), [0]), ((2.5, -1.4), [0, 1])],
+)
+def test_a_misfit_in_the_dark_is_hot_by_a_share_of_the_peak(
+    sizes: tuple[float, float], expected: list[int]
+) -> None:
+    """In units of the least: those are found that differ by half of the worst one or more."""
+    model = np.zeros((24, 24))
+    model[3, 3] = 50.0
+    places = [(18, 6), (12, 19)]
+    image = model.copy()
+    for place, size in zip(places, sizes, strict=True):
+        image[place] += size * FAINT * 50.0
+    fit = SimpleNamespace(
+        design=model.reshape(-1, 1),
+        inverse=np.zeros((1, model.size)),
+        solve=lambda _: np.ones((1, 1)),
+    )
+    good = np.ones(model.shape, dtype=bool)
+    found = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
+    assert np.argwhere(found).tolist() == sorted([list(places[k]) for k in expected])

@@ -22,7 +22,7 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
 from amibayes.oifits.correlations import shared_baseline_sign
-from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME
+from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME, scale_of
 from amibayes.oifits.stated import _integrations
 
 DEGREE = np.pi / 180
@@ -668,3 +668,19 @@ def test_rows_without_a_date_have_that_of_their_table(tmp_path: Path) -> None:
     by_row = np.unique(np.stack([found.vis2.row, found.vis2.mjd], axis=1), axis=0)[:, 1]
     np.testing.assert_allclose(by_row, mjd, rtol=0.0, atol=1e-8)
     assert "MJD missing; taken from DATE-OBS and TIME" in " ".join(found.notes)
+
+
+PER_RADIAN = {
+    1.0: "lambda wavelength wavelengths rad-1 rad^-1 1/rad cycles/rad cycle/rad",
+    1e3: "klambda kilolambda 1e3lambda",
+    1e6: "mlambda megalambda 1e6lambda",
+    1e9: "glambda gigalambda 1e9lambda",
+}
+
+
+def test_frequencies_are_numbers_of_wavelengths() -> None:
+    for factor, names in PER_RADIAN.items():
+        for name in names.split():
+            assert scale_of(f" {name.title()} ", FREQUENCY, "lambda") == (factor, True)
+    assert scale_of("", FREQUENCY, "klambda") == (1e3, True)
+    assert scale_of("furlong", FREQUENCY, "klambda") == (1e3, False)

@@ -9,12 +9,13 @@ import emcee
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from scipy.integrate import cumulative_simpson
 
 from amibayes.companion_search.search import search
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.ensemble import sample
-from amibayes.posterior.priors import Prior, default_prior
+from amibayes.posterior.priors import Prior, Range, default_prior
 
 FIELD = (50.0, 400.0)
 
@@ -148,3 +149,23 @@ def test_inference_data_without_arviz_says_what_to_install(found, monkeypatch) -
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(UsageError, match=r"pip install 'amibayes\[arviz\]'"):
         posterior.to_inference_data()
+
+
+RANGES = {
+    "uniform": (Range(-0.5, 2.0), lambda x: np.ones_like(x)),
+    "half-Cauchy": (Range(0.3, 4.0, 0.7), lambda x: 1.0 / (1.0 + (x / 0.7) ** 2)),
+    "logarithmic": (Range(0.2, 9.0, logarithmic=True), lambda x: 1.0 / x),
+}
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_laws_of_ranges_are_integrals_of_their_densities(name: str) -> None:
+    law, shape = RANGES[name]
+    x = np.linspace(law.low, law.high, 20_001)
+    total = cumulative_simpson(shape(x), x=x, initial=0.0)
+    np.testing.assert_allclose(law.cdf(x), total / total[-1], atol=1e-8)
+    np.testing.assert_allclose(law.log_density(x), np.log(shape(x) / total[-1]), atol=1e-8)
+    np.testing.assert_allclose(law.quantile(law.cdf(x)), x, rtol=1e-9)
+    beyond = np.array([law.low - 0.1, law.high + 0.1])
+    np.testing.assert_array_equal(law.cdf(beyond), [0.0, 1.0])
+    assert np.isneginf(law.log_density(beyond)).all()
