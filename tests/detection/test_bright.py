@@ -7,7 +7,12 @@ import pytest
 from helpers import niriss, simulated
 
 from amibayes.companion_search.search import search
-from amibayes.detection.false_alarm import beside_bright, bright_probability, significance
+from amibayes.detection.false_alarm import (
+    Significance,
+    beside_bright,
+    bright_probability,
+    significance,
+)
 from amibayes.detection.statistic import statistic_of
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
@@ -42,3 +47,22 @@ def test_noise_of_any_size_never_looks_like_a_bright_companion(rng) -> None:
         result = search(Likelihood(data), FIELD)
         bound = bright_probability(result, statistic_of(result))
         assert bound is None or bound > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("bound", "p", "stated"),
+    [(None, 0.3, None), (0.2, 0.3, None), (0.15, 0.3, None), (0.1, 0.3, 0.2), (0.0, 0.3, 1e-10)],
+)
+def test_the_smaller_of_two_probabilities_counts_twice(
+    bound: float | None, p: float, stated: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tested = Significance(1.0, np.arange(10_000.0), p, (0.2, 0.4), None, 0.0013)
+    monkeypatch.setattr("amibayes.detection.false_alarm.bright_probability", lambda *_: bound)
+    found = beside_bright(tested, None, ExtraNoise())  # type: ignore[arg-type]
+    for noise in (ExtraNoise(vis2=0.01), ExtraNoise(closure_phase_rad=0.01)):
+        assert beside_bright(tested, None, noise) is tested  # type: ignore[arg-type]
+    if stated is None:
+        assert found is tested
+    else:
+        assert (found.probability, found.bright) == (stated, stated)
+        assert found.interval == (0.0, stated)

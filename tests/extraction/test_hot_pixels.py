@@ -9,7 +9,7 @@ import pytest
 
 from amibayes.cube import Cube
 from amibayes.cube.source import InMemoryCube
-from amibayes.extraction.cleaning import FAINT, _misfitting
+from amibayes.extraction.cleaning import FAINT, _hot, _misfitting
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
@@ -82,3 +82,21 @@ def test_a_misfit_in_the_dark_is_hot_by_a_share_of_the_peak(
     good = np.ones(model.shape, dtype=bool)
     found = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
     assert np.argwhere(found).tolist() == sorted([list(places[k]) for k in expected])
+
+
+@pytest.mark.parametrize("place", [(0, 0), (0, 9), (11, 4), (5, 6), (19, 19)])
+@pytest.mark.parametrize("size", [9.0, -9.0])
+def test_a_pixel_unlike_its_neighbours_is_hot_or_dead_at_edges_too(
+    place: tuple[int, int], size: float
+) -> None:
+    """And beside bad pixels, of any value; what differs by less is neither."""
+    rng = np.random.default_rng(4)
+    image = rng.uniform(-1.0, 1.0, (20, 20))
+    good = np.ones(image.shape, dtype=bool)
+    good[11, 5] = good[12, 4] = good[5, 5] = False
+    image[~good] = [1e6, -1e6, 1e6]
+    assert not _hot(image, good).any()
+    image[place] = size
+    assert np.argwhere(_hot(image, good)).tolist() == [list(place)]
+    image[place] = size / 3.5
+    assert not _hot(image, good).any()

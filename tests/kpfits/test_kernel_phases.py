@@ -17,6 +17,7 @@ import amibayes as ab
 from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.companion_search.grid import make_grid
+from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
@@ -200,6 +201,7 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
         tmp_path / "a.fits", PUPIL, value, np.tile(covariance(), (2, 1, 1)), angles
     )
     data = kernel_observables(path)
+    assert data.notes == ("frames in 2 orientations, each averaged by itself",)
     write_kpfits(tmp_path / "b.fits", data)
     again = kernel_observables(tmp_path / "b.fits")
     theta = np.array([[EAST, NORTH, CONTRAST]])
@@ -474,3 +476,11 @@ def test_one_angle_serves_all_frames_and_several_must_be_as_many(tmp_path: Path)
         wrong = kernel_file(tmp_path / "b.fits", frames=3, DETPA=np.array(angles))
         with pytest.raises(ab.DataError, match=f"{len(angles)} position angles for 3 frames"):
             open_kpfits(wrong)
+
+
+def test_kernel_phases_are_told_from_triangles_and_have_no_period(tmp_path: Path) -> None:
+    stations = np.array([[0, 1, 2], [3, 3, 3], [1, 1, 2], [2, 1, 1], [1, 2, 1]])
+    np.testing.assert_array_equal(stands_alone(stations), [False, True, False, False, False])
+    value = np.linspace(-9.0, 9.0, len(PUPIL.kernel))
+    likelihood = Likelihood(kernel_observables(kernel_file(tmp_path / "a.fits", value)))
+    np.testing.assert_allclose(likelihood.wrapped(value[:, None].copy())[:, 0], value)

@@ -369,8 +369,12 @@ def test_vis2_errors_divided_twice(n: int, tmp_path: Path) -> None:
         assert audit(tmp_path / "b.fits").findings == ()
 
 
-def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
-    """Target 0.9 ± 0.001 over calibrator 0.8 ± 0.004, propagated rightly and exchanged."""
+@pytest.mark.parametrize("factor", [0.05, 1.0, 20.0])
+def test_exchanged_errors(factor: float, rng: np.random.Generator, tmp_path: Path) -> None:
+    """Target 0.9 ± 0.001 over calibrator 0.8 ± 0.004, propagated rightly and exchanged.
+
+    A factor that all errors of amplitudes share, and what 1 % of rounding leaves, say nothing.
+    """
     target, calibrator = rng.uniform(0.5, 1.0, 21), rng.uniform(0.5, 1.0, 21)
     e_t, e_c = 0.001, 0.004
 
@@ -382,7 +386,8 @@ def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
         hdus["OI_VIS2"].data["VIS2DATA"] = value
         hdus["OI_VIS2"].data["VIS2ERR"] = exchanged if wrong else right
         hdus["OI_VIS"].data["VISAMP"] = np.sqrt(value)
-        hdus["OI_VIS"].data["VISAMPERR"] = right / (2 * np.sqrt(value))
+        rounded = factor * rng.uniform(0.995, 1.005, 21)
+        hdus["OI_VIS"].data["VISAMPERR"] = rounded * right / (2 * np.sqrt(value))
 
     for wrong in (True, False):
         path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")

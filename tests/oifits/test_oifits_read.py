@@ -21,9 +21,12 @@ from oi_builders import HandMade, table
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
+from amibayes.oifits.columns import _in_metres
 from amibayes.oifits.correlations import shared_baseline_sign
 from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME, scale_of
+from amibayes.oifits.setups import wavelength_table
 from amibayes.oifits.stated import _integrations
+from amibayes.oifits.uv_stations import _corners
 
 DEGREE = np.pi / 180
 
@@ -684,3 +687,75 @@ def test_frequencies_are_numbers_of_wavelengths() -> None:
             assert scale_of(f" {name.title()} ", FREQUENCY, "lambda") == (factor, True)
     assert scale_of("", FREQUENCY, "klambda") == (1e3, True)
     assert scale_of("furlong", FREQUENCY, "klambda") == (1e3, False)
+
+
+@pytest.mark.parametrize(
+    ("unit", "u", "metres"),
+    [("", 9e4, 9e4), ("m", 9e4, 9e4), ("km", 90.0, 9e4), ("furlong", 9e4, 9e4),
+     ("", 1.3e5, 0.52), ("m", 1.3e5, 0.52), ("MLAMBDA", 0.13, 0.52), ("rad-1", 9e4, 0.36)],
+)  # fmt: skip
+def test_baselines_of_a_hundred_kilometres_are_numbers_of_wavelengths(
+    unit: str, u: float, metres: float
+) -> None:
+    """Of light of 4 µm; one row that is wrong says nothing of the unit."""
+    values = np.array([u, -u, u, 1e12 * u, np.nan])
+    table = SimpleNamespace(units={"UCOORD": unit}, label="OI_VIS2")
+    found, note = _in_metres(SimpleNamespace(path=""), table, "UCOORD", values, np.array([4e-6]))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found[:3], [metres, -metres, metres])
+    assert ("in wavelengths" in note) == (metres < 1.0)
+    assert ("read as m" in note) == (unit == "furlong")
+    if metres < 1.0:
+        with pytest.raises(DataError, match="there are 2 channels"):
+            _in_metres(
+                SimpleNamespace(path=""),
+                table,
+                "UCOORD",
+                values,
+                np.array([4e-6, 5e-6]),  # type: ignore[arg-type]
+            )
+
+
+def test_triangles_of_one_shape_get_their_places_one_after_the_other() -> None:
+    """Three places on a line of telescopes; one of another shape has stations of its own."""
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [4.0, 0.0], [0.0, 7.0], [1.0, 7.0],
+                       [3.0, 7.0]])  # fmt: skip
+    step = np.array([[1.0, 0.0], [2.0, 0.0], [-3.0, 0.0]])
+    other = np.array([[5.0, 1.0], [0.0, 2.0], [-5.0, -3.0]])
+    stations = 10 + np.arange(7)
+    found, total = _corners(np.array([step, step, other, step]), [places], [stations], 1e-3, 20)
+    assert found.tolist() == [[10, 11, 12], [14, 15, 16], [20, 21, 22], [10, 11, 12]]
+    assert total == 23
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "found"),
+    [
+        ("I", ("I",), 0),
+        ("i  ", ("J", "I"), 1),
+        (None, ("J",), 0),
+        (None, ("J", "I"), None),
+        ("K", ("J",), None),
+        ("I", ("I", "I"), 0),
+    ],
+)
+def test_wavelengths_are_those_of_the_instrument_that_is_named(
+    asked: str | None, there: tuple[str, ...], found: int | None
+) -> None:
+    """A table that names none has those of the file, if there is one set of them."""
+
+    class Table(SimpleNamespace):
+        label, extver = "OI_VIS2", 1
+
+        def keyword(self, _: str) -> str | None:
+            return self.name
+
+        def __len__(self) -> int:
+            return 3
+
+    tables = [Table(name=name) for name in there]
+    oifits = SimpleNamespace(named=lambda _: tables, path="")
+    if found is None:
+        with pytest.raises(DataError, match="no OI_WAVELENGTH has that INSNAME"):
+            wavelength_table(oifits, Table(name=asked), 3)  # type: ignore[arg-type]
+    else:
+        assert wavelength_table(oifits, Table(name=asked), 3) is tables[found]  # type: ignore[arg-type]
