@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -66,3 +69,39 @@ def test_the_smaller_of_two_probabilities_counts_twice(
     else:
         assert (found.probability, found.bright) == (stated, stated)
         assert found.interval == (0.0, stated)
+
+
+@pytest.mark.parametrize(
+    ("upper", "draws", "detected", "words"),
+    [
+        (1e-4, 10_000, True, "True"),
+        (2e-3, 10_000, False, "False"),
+        (1e-4, 100, None, "cannot be told below 0.0013 with so few draws"),
+    ],
+)
+def test_what_is_shown_of_a_probability(
+    upper: float, draws: int, detected: bool | None, words: str
+) -> None:
+    null = np.arange(float(draws))
+    tested = Significance(draws - 3.0, null, 1e-5, (0.0, upper), None, 0.0013)
+    assert tested.detected is detected
+    assert (tested.n_draws, tested.n_above) == (draws, 3)
+    assert tested.parametric == pytest.approx(4.0 / (draws + 1.0))
+    shown = dict(tested.rows())
+    assert shown["detected"] == words
+    assert shown["null draws"] == f"{draws}, 3 of them as large"
+    assert shown["extrapolated"] == "no"
+    assert shown["statistic"] == f"{draws - 3.0:.4g}"
+    assert "Pareto" in dict(replace(tested, tail=object()).rows())["extrapolated"]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("p", "stated"), [(None, 0.01), (0.005, 0.01), (0.01, 0.01), (0.2, 0.2)])
+def test_the_larger_probability_of_two_checks_is_stated(p: float | None, stated: float) -> None:
+    tested = Significance(1.0, np.arange(100.0), 0.01, (0.0, 0.02), None, 0.0013)
+    check = SimpleNamespace(
+        probability=p, interval=None if p is None else (p / 2, 2 * p), tail=None
+    )
+    found = tested.beside(check)  # type: ignore[arg-type]
+    assert found.probability == stated
+    assert found.randomised is check
+    assert found.interval == ((0.0, 0.02) if stated == 0.01 else (0.1, 0.4))

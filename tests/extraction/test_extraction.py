@@ -673,3 +673,14 @@ def test_units_of_the_images_do_not_matter(niriss: Instrument, method: str) -> N
     sigma = np.sqrt(first.covariance.variance)
     assert np.abs((second.data - first.data) / sigma).max() < 1e-4
     np.testing.assert_allclose(second.covariance.variance, first.covariance.variance, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("scale", "turn"), [(0.975, 0.0), (1.025, 0.0), (1.0, 1.5), (1.0, -1.5)])
+def test_a_header_that_is_far_off_is_not_put_right(
+    niriss: Instrument, scale: float, turn: float
+) -> None:
+    """Beyond 2 % and 0.02 rad it is no small error: another mask or detector."""
+    mask = niriss.mask.rotated(np.radians(turn))
+    true = replace(niriss, pixel_scale_rad=scale * niriss.pixel_scale_rad, mask=mask)
+    geometry, _ = geometry_of(cube_of(binary_images(true, jittered(3), (0.0, 0.0), 0.0), niriss))
+    assert (geometry.scale, geometry.rotation_rad) == (1.0, 0.0)

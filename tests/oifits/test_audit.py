@@ -394,7 +394,10 @@ def test_exchanged_errors(factor: float, rng: np.random.Generator, tmp_path: Pat
         assert ("exchanged-errors" in codes(path)) == wrong
 
 
-def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: Path) -> None:
+@pytest.mark.parametrize("flagged", [False, True])
+def test_phase_errors_that_were_not_divided(
+    rng: np.random.Generator, tmp_path: Path, *, flagged: bool
+) -> None:
     """Noise alike along and across the bispectrum of N = 69 integrations."""
     amplitude = rng.uniform(0.2, 0.9, 35)
     estimates = rng.chisquare(68, (2, 35)) / 68
@@ -404,6 +407,10 @@ def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: 
         data = hdus["OI_T3"].data
         data["T3AMP"], data["T3AMPERR"] = amplitude, along
         data["T3PHIERR"] = np.degrees(across / (1 if wrong else amplitude))
+        if flagged:  # says nothing, whatever it holds
+            data["FLAG"][:20] = True
+            data["T3PHIERR"][:20] *= 50.0 if wrong else amplitude[:20]
+            data["T3AMP"][20], data["T3AMPERR"][21], data["T3PHIERR"][22] = 0.0, 0.0, 0.0
 
     for wrong in (True, False):
         path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import emcee
@@ -169,3 +170,22 @@ def test_laws_of_ranges_are_integrals_of_their_densities(name: str) -> None:
     beyond = np.array([law.low - 0.1, law.high + 0.1])
     np.testing.assert_array_equal(law.cdf(beyond), [0.0, 1.0])
     assert np.isneginf(law.log_density(beyond)).all()
+
+
+def test_a_prior_is_described_by_all_that_it_has() -> None:
+    plain = Prior(50.0, 400.0, 1e-4, 0.5)
+    assert plain.description == "uniform in area, log-uniform in contrast"
+    other = replace(plain, position_form="separation", contrast_form="uniform")
+    assert other.description == "uniform in separation and angle, uniform in contrast"
+    more = replace(
+        plain,
+        n_contrasts=3,
+        fastest_mas_yr=20.0,
+        nuisance=((0.0, 4.0), (0.0, 1.0)),
+        half_cauchy=(0.7, 0.0),
+    )
+    assert more.description == (
+        "uniform in area, log-uniform in contrast (3 bands, independently), uniform in rate, "
+        "half-Cauchy of 0.7 mas in the star's diameter"
+    )
+    assert [r.scale for r in more.ranges] == [0.7, 0.0]
