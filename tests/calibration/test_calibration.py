@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from scipy.stats import kstest
 
 from amibayes.calibration import Calibration, calibrate
 from amibayes.calibration.calibrate import _covariate
+from amibayes.calibration.diameters import _band_of
 from amibayes.calibration.hierarchical import predictive
 from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.scatter_likelihood import population_of
@@ -844,3 +846,16 @@ def test_charge_levels_are_taken_from_the_target_in_units_of_the_largest() -> No
         with pytest.raises(DataError, match=fault):
             _covariate(wrong, three, [0, 1, 2], method)  # type: ignore[arg-type]
     assert _covariate(None, three, [0, 1, 2], "weighted") is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("micron", "band"),
+    [(0.48, "uddb"), (1.4, "uddj"), (1.46, "uddh"), (2.7, "uddk"), (2.8, "uddl"), (4.8, "uddm")],
+)
+def test_diameters_are_those_of_the_nearest_band(micron: float, band: str) -> None:
+    """By the ratio of wavelengths, of the columns that the catalogue has."""
+    setups = [SimpleNamespace(wavelength_m=1e-6 * micron * np.array([0.99, 1.0, 1.01]))]
+    names = ("uddb", "uddj", "uddh", "uddk", "uddl", "uddm", "diameter_mas")
+    sizes = {name: [1.0] for name in names}
+    assert _band_of(SimpleNamespace(setups=setups), sizes) == band  # type: ignore[arg-type]
+    assert _band_of(SimpleNamespace(setups=setups), {"uddv": [1.0]}) == "uddv"  # type: ignore[arg-type]

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits, write_oifits
 from amibayes.oifits.audit import audit, errors_in, repair
 from amibayes.oifits.audit.repair import REMEDIES
+from amibayes.oifits.audit.structure import array_centre
 
 DEGREE = np.pi / 180
 
@@ -658,3 +660,24 @@ def test_errors_are_told_before_warnings(rng: np.random.Generator, tmp_path: Pat
     n = severities.count("error")
     assert n > 0
     assert severities[:n] == ["error"] * n
+
+
+@pytest.mark.parametrize(
+    ("frame", "km", "wrong"),
+    [
+        ("GEOCENTRIC", 6290.0, True),
+        ("GEOCENTRIC", 6357.0, False),
+        ("GEOCENTRIC", 6384.0, False),
+        ("GEOCENTRIC", 6510.0, True),
+        ("SKY", 0.0, False),
+    ],
+)
+def test_the_centre_of_an_array_is_on_the_earth(frame: str, km: float, *, wrong: bool) -> None:
+    """Poles, equator and mountains are; a hundred kilometres above them nothing observes."""
+    centre = 1e3 * km * np.array([0.48, -0.6, 0.64])
+    keywords = {"FRAME": frame, **dict(zip(("ARRAYX", "ARRAYY", "ARRAYZ"), centre, strict=True))}
+    table = SimpleNamespace(keyword=keywords.get, label="OI_ARRAY", header=keywords)
+    found = list(array_centre(SimpleNamespace(named=lambda _: [table])))  # type: ignore[arg-type]
+    assert len(found) == wrong
+    for finding in found:
+        assert f"{km:.0f} km" in finding.what
