@@ -26,6 +26,7 @@ from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import FringeModel, fringe_fit
 from amibayes.extraction.preparation import make_operator
+from amibayes.extraction.summary import described
 from amibayes.extraction.table import integrations, series
 from amibayes.extraction.view import View
 from amibayes.instrument import Instrument, load_instrument
@@ -684,3 +685,17 @@ def test_a_header_that_is_far_off_is_not_put_right(
     true = replace(niriss, pixel_scale_rad=scale * niriss.pixel_scale_rad, mask=mask)
     geometry, _ = geometry_of(cube_of(binary_images(true, jittered(3), (0.0, 0.0), 0.0), niriss))
     assert (geometry.scale, geometry.rotation_rad) == (1.0, 0.0)
+
+
+def test_errors_in_the_summary_are_medians_of_those_of_the_average(niriss: Instrument) -> None:
+    images = with_photons(binary_images(niriss, jittered(6), (120.0, 160.0), 0.02), 4)
+    found = extract_all(cube_of(images, niriss))[0]
+    told, n = described(found), 21
+    for name, covariance in (("", found.covariance.matrix), ("_physical", found.physical)):
+        sigma = np.sqrt(np.diag(covariance) / found.frames.used.sum())
+        assert told[f"sigma_vis2{name}"] == pytest.approx(np.median(sigma[:n]))
+        degrees = np.degrees(np.median(sigma[n:]))
+        assert told[f"sigma_closure_phase{name}_deg"] == pytest.approx(degrees)
+    shift = found.frames.shift_px[found.frames.used]
+    assert told["jitter_px"] == pytest.approx(np.sqrt(np.mean(shift.std(axis=0) ** 2)))
+    assert told["flux"] == pytest.approx(found.frames.flux.mean())

@@ -23,6 +23,7 @@ from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
 from amibayes.oifits.columns import _in_metres
 from amibayes.oifits.correlations import shared_baseline_sign
+from amibayes.oifits.rows import times_of
 from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME, scale_of
 from amibayes.oifits.setups import wavelength_table
 from amibayes.oifits.stated import _integrations
@@ -759,3 +760,45 @@ def test_wavelengths_are_those_of_the_instrument_that_is_named(
             wavelength_table(oifits, Table(name=asked), 3)  # type: ignore[arg-type]
     else:
         assert wavelength_table(oifits, Table(name=asked), 3) is tables[found]  # type: ignore[arg-type]
+
+
+DAY = 57000.0
+"""2014-12-09."""
+
+
+@pytest.mark.parametrize(
+    ("mjd", "seconds", "unit", "date", "expected", "words"),
+    [
+        ([DAY + 0.25, DAY + 0.5], [0.0, 60.0], "s", "2014-12-09", [0.25, 0.5], ""),
+        ([DAY, DAY], [0.0, 864.0], "s", "2014-12-09", [0.0, 0.01], "MJD is a date"),
+        ([DAY, DAY], [2.0, 2.5], "s", "", [2.0 / 86400, 2.5 / 86400], "MJD is a date"),
+        ([DAY, DAY], [0.0, 14.4], "min", "", [0.0, 0.01], "MJD is a date"),
+        ([DAY, DAY], [864.0, 864.0], "s", "2014-12-09", [0.0, 0.0], ""),
+        ([DAY, DAY + 0.5], [0.0, 864.0], "s", "2014-12-09", [0.0, 0.5], ""),
+        ([0.0, DAY + 0.5], [864.0, 1.0], "s", "2014-12-09", [0.01, 0.5], "MJD missing"),
+        ([np.nan, DAY + 0.5], [864.0, 1.0], "s", "2014-12-09", [0.01, 0.5], "MJD missing"),
+        (None, [864.0, 1728.0], "s", "2014-12-09", [0.01, 0.02], "MJD missing"),
+        (None, [864.0, 1728.0], "s", "", [0.01 - DAY, 0.02 - DAY], "no date"),
+        ([0.0, DAY + 0.5], [864.0, 1.0], "s", "", [0.01 - DAY, 0.5], "no date"),
+    ],
+)
+def test_dates_are_of_mjd_or_of_the_clock_and_the_day(
+    mjd: list[float] | None,
+    seconds: list[float],
+    unit: str,
+    date: str,
+    expected: list[float],
+    words: str,
+) -> None:
+    """Days from `DAY`; without any date rows keep their order."""
+
+    class Rows(SimpleNamespace):
+        def __len__(self) -> int:
+            return 2
+
+    columns = {"TIME": np.array(seconds)} | ({} if mjd is None else {"MJD": np.array(mjd)})
+    rows = Rows(columns=columns, units={"TIME": unit}, label="OI_T3", keyword=lambda _: date)
+    found, note = times_of(rows)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found - DAY, expected, atol=1e-9)
+    assert words in note
+    assert bool(note) == bool(words)
