@@ -190,11 +190,14 @@ def test_reference_files_are_cut_to_the_subarray(
     primary = fits.PrimaryHDU()
     if part:
         primary.header.update(corner)
-    hdus = fits.HDUList([primary, fits.ImageHDU(expected if part else detector, name="COEFFS")])
+    held = expected if part else detector
+    images = [fits.ImageHDU(held, name="COEFFS"), fits.ImageHDU(held[1], name="DQ")]
+    hdus = fits.HDUList([primary, *images])
     buffer = io.BytesIO()
     hdus.writeto(buffer)
     with fits.open(io.BytesIO(buffer.getvalue())) as opened:
         found = _part(opened, "COEFFS", corner, (ny, nx))
         np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(_part(opened, "DQ", corner, (ny, nx)), expected[1])
         # Beyond the detector there is nothing.
         assert part or _part(opened, "COEFFS", corner | {"SUBSTRT1": 9}, (ny, nx)) is None

@@ -215,13 +215,13 @@ def test_integrations_are_laid_end_to_end_and_chosen() -> None:
 
 
 def test_an_integration_of_another_flux_is_no_outlier_and_its_hot_pixel_is() -> None:
-    """Six times the flux; the hot pixel, of a thousand times, does not decide what it is."""
+    """Nine times the flux; the hot pixel, of a thousand times, does not decide what it is."""
     shape = (8, 8)
     reference = Reference(
         np.ones(shape), np.ones(shape), np.ones(shape, dtype=bool), None, 0,  # type: ignore[arg-type]
         np.ones((1, *shape)), has_errors=False, source="",
     )  # fmt: skip
-    images = np.array([1.0, 6.9, 6.9, 6.9])[:, None, None] * np.ones(shape)
+    images = np.array([1.0, 9.0, 9.0, 9.0])[:, None, None] * np.ones(shape)
     images[2, 3, 4] = 7000.0
     images[3, 3, 4] = -7000.0
     bad = np.zeros(images.shape, dtype=bool)
