@@ -25,7 +25,8 @@ from amibayes.extraction import METHODS, ExtractOptions, extract, extract_all
 from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import FringeModel, fringe_fit
-from amibayes.extraction.preparation import make_operator
+from amibayes.extraction.noise import NoiseModel, noise_model
+from amibayes.extraction.preparation import _fit_of_median, make_operator
 from amibayes.extraction.summary import described
 from amibayes.extraction.table import integrations, series
 from amibayes.extraction.view import View
@@ -699,3 +700,28 @@ def test_errors_in_the_summary_are_medians_of_those_of_the_average(niriss: Instr
     shift = found.frames.shift_px[found.frames.used]
     assert told["jitter_px"] == pytest.approx(np.sqrt(np.mean(shift.std(axis=0) ** 2)))
     assert told["flux"] == pytest.approx(found.frames.flux.mean())
+
+
+@pytest.mark.parametrize(
+    ("errors", "n", "measured"),
+    [(True, 2, False), (True, 4, False), (False, 2, True), (False, 3, False)],
+)
+def test_few_images_without_errors_tell_their_noise_by_what_the_fit_leaves(
+    niriss: Instrument, monkeypatch: pytest.MonkeyPatch, *, errors: bool, n: int, measured: bool
+) -> None:
+    images = with_photons(binary_images(niriss, jittered(n), (120.0, 160.0), 0.02), 4)
+    one = cube_of(images, niriss)
+    operator = make_operator(
+        InMemoryCube(one if errors else replace(one, error=None)), ExtractOptions()
+    )
+    reference, view = operator.reference, operator.view
+    even = fringe_fit(FringeModel.of(view.basis()), np.ones(view.shape), reference.good[view.part])
+    asked: list[bool] = []
+
+    def counted(*given: FloatArray) -> NoiseModel:
+        asked.append(True)
+        return noise_model(*given)
+
+    monkeypatch.setattr("amibayes.extraction.preparation.noise_model", counted)
+    _fit_of_median(view, even, reference)
+    assert bool(asked) == measured
