@@ -484,3 +484,12 @@ def test_kernel_phases_are_told_from_triangles_and_have_no_period(tmp_path: Path
     value = np.linspace(-9.0, 9.0, len(PUPIL.kernel))
     likelihood = Likelihood(kernel_observables(kernel_file(tmp_path / "a.fits", value)))
     np.testing.assert_allclose(likelihood.wrapped(value[:, None].copy())[:, 0], value)
+
+
+def test_the_star_is_named_by_the_first_keyword_that_does(tmp_path: Path) -> None:
+    path, names = kernel_file(tmp_path / "a.fits"), []
+    for changes in ({}, {"TARGPROP": " ", "OBJECT": "b "}, {"TARGNAME": "c"}, {"TARGET": "d"}):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].header.update(changes)
+        names.append(open_kpfits(path).target)
+    assert names == ["HD 1", "b", "c", "c"]
