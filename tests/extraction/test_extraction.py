@@ -26,7 +26,7 @@ from amibayes.extraction.cleaning import median_and_scatter
 from amibayes.extraction.geometry import Geometry, geometry_slopes, solve_geometry
 from amibayes.extraction.image_plane import FringeModel, fringe_fit
 from amibayes.extraction.noise import NoiseModel, noise_model
-from amibayes.extraction.preparation import _fit_of_median, make_operator
+from amibayes.extraction.preparation import _fit_of_median, _noise_and_misfit, make_operator
 from amibayes.extraction.summary import described
 from amibayes.extraction.table import integrations, series
 from amibayes.extraction.view import View
@@ -725,3 +725,39 @@ def test_few_images_without_errors_tell_their_noise_by_what_the_fit_leaves(
     monkeypatch.setattr("amibayes.extraction.preparation.noise_model", counted)
     _fit_of_median(view, even, reference)
     assert bool(asked) == measured
+
+
+def test_noise_by_residuals_allows_for_the_columns_of_the_fit(
+    niriss: Instrument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of white noise, to 0.4 %: the fit of 6400 pixels follows 44 parts of it, 0.7 %, and the
+    pointing six integrations of 150, 4 %."""
+    image = binary_images(niriss, jittered(1), (0.0, 0.0), 0.0)[0]
+    noise = np.random.default_rng(7).standard_normal((150, *image.shape))
+    images = image + 100.0 * noise
+    cube = replace(cube_of(images[:4], niriss), error=None)
+    operator = make_operator(InMemoryCube(cube), ExtractOptions())
+    reference = replace(operator.reference, sample=images)
+    view = operator.view
+    good = reference.good[view.part]
+    even = fringe_fit(FringeModel.of(view.basis()), np.ones(view.shape), good)
+    asked: list[FloatArray] = []
+
+    def kept(mean: FloatArray, measured: FloatArray, used: FloatArray) -> NoiseModel:
+        asked.append(measured[used])
+        return noise_model(mean, measured, used)
+
+    monkeypatch.setattr("amibayes.extraction.preparation.noise_model", kept)
+    _noise_and_misfit(view, even, reference)
+    assert asked[0].mean() == pytest.approx(1e4, rel=0.004)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_images_without_any_noise_are_extracted(niriss: Instrument, method: str) -> None:
+    """Three times the same one: simulators make such cubes."""
+    image = binary_images(niriss, jittered(1), (0.0, 0.0), 0.0)
+    cube = replace(cube_of(np.repeat(image, 3, axis=0), niriss), error=None)
+    found = extract(cube, method)  # type: ignore[arg-type]
+    assert np.isfinite(found.covariance.variance).all()
+    assert np.abs(found.vis2.value - 1.0).max() < 0.01
+    assert np.abs(found.closure_phase.value).max() < 1e-3
