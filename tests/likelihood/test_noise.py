@@ -15,10 +15,11 @@ from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.detection.treatments import Ratio
+from amibayes.likelihood.channel_noise import Correlation
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import linear_response
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.noise_fit import _Fit, fit_noise
 from amibayes.models.binary import LinearResponse
 
 FIELD = (50.0, 400.0)
@@ -184,3 +185,25 @@ def test_response_to_a_companion_of_lopsided_light_is_the_derivative(zero: str) 
     template[found.even.rows] += found.even.matrix @ wave.real - found.offset
     template[found.odd.rows] -= found.odd.matrix @ wave.imag
     np.testing.assert_allclose(template, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [
+        (Correlation(), False),
+        (Correlation(error=0.1), True),
+        (Correlation(value=0.2), True),
+        (Correlation(lasting=(0.0, 0.3)), True),
+    ],
+)
+def test_shares_of_channels_are_told_where_they_are_measured(
+    share: Correlation, monkeypatch: pytest.MonkeyPatch, *, told: bool
+) -> None:
+    """Also none at all, with its error; of one kind of observable or both."""
+    likelihood = Likelihood(niriss())
+    theta = np.array([150.0, -80.0, 0.01])
+    for other in (share, Correlation()):
+        shares = iter([share, other])
+        monkeypatch.setattr(_Fit, "of_kind", lambda *_, s=shares: (0.0, next(s)))
+        found = fit_noise(likelihood, theta).channels
+        assert [(c.vis2, c.closure_phase) for c in found] == [(share, other)] * told
