@@ -25,7 +25,7 @@ from amibayes.oifits.columns import _in_metres
 from amibayes.oifits.correlations import shared_baseline_sign
 from amibayes.oifits.rows import times_of
 from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME, scale_of
-from amibayes.oifits.setups import wavelength_table
+from amibayes.oifits.setups import array_table, wavelength_table
 from amibayes.oifits.stated import _integrations
 from amibayes.oifits.uv_stations import _corners
 
@@ -803,3 +803,26 @@ def test_dates_are_of_mjd_or_of_the_clock_and_the_day(
     np.testing.assert_allclose(found - DAY, expected, atol=1e-9)
     assert words in note
     assert bool(note) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "found"),
+    [("", ("X",), 0), ("", ("X", "Y"), None), ("", (), None), ("y ", ("X", "Y"), 1),
+     ("Z", ("X",), None)],
+)  # fmt: skip
+def test_an_array_is_the_one_that_is_named_or_the_only_one(
+    asked: str, there: tuple[str, ...], found: int | None
+) -> None:
+    arrays = [SimpleNamespace(keyword=lambda _, n=name: n) for name in there]
+    oifits = SimpleNamespace(named=lambda _: arrays)
+    array = array_table(oifits, SimpleNamespace(keyword=lambda _: asked))  # type: ignore[arg-type]
+    assert array is (None if found is None else arrays[found])
+
+
+def test_a_file_that_names_no_target_has_one(made: HandMade, tmp_path: Path) -> None:
+    del made.tables["OI_TARGET"]
+    for name in ("OI_VIS2", "OI_T3"):
+        del made.tables[name]["TARGET_ID"]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert {s.target for s in data.setups} == {"target 1"}
+    assert data.n_vis2 == 18
