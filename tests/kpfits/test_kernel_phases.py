@@ -22,7 +22,7 @@ from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
 from amibayes.kpfits.audit import _scatter, audit_kpfits
-from amibayes.kpfits.file import open_kpfits
+from amibayes.kpfits.file import _wavelengths, open_kpfits
 from amibayes.kpfits.write import write_observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.rings import make_rings
@@ -493,3 +493,12 @@ def test_the_star_is_named_by_the_first_keyword_that_does(tmp_path: Path) -> Non
             hdus[0].header.update(changes)
         names.append(open_kpfits(path).target)
     assert names == ["HD 1", "b", "c", "c"]
+
+
+@pytest.mark.parametrize("wrong", [4.8, 4800.0, 0.0, 9e-8, np.nan, np.inf])
+def test_one_wavelength_that_is_not_in_metres_refuses_all(wrong: float) -> None:
+    for wavelengths in ([wrong], [4.8e-6, wrong], [wrong, 4.8e-6]):
+        with pytest.raises(ab.DataError, match="is not in metres"):
+            _wavelengths({"CWAVEL": np.array(wavelengths)}, {}, "a")
+    found, band = _wavelengths({"CWAVEL": np.array([1.1e-7, 0.9])}, {}, "a")
+    assert (found.tolist(), band.tolist()) == ([1.1e-7, 0.9], [0.0, 0.0])
