@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.io import fits
+from helpers import niriss
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oi_builders import diagonal, random_observables
@@ -19,6 +20,7 @@ from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, RunError, UsageError
 from amibayes.oifits import read_oifits, write_oifits
+from amibayes.oifits.layout import grids_of
 
 DEGREE = np.pi / 180
 
@@ -443,3 +445,20 @@ def test_entries_of_two_tables_of_one_file_stay_apart(
     first, second = np.split(read_oifits(tmp_path / "b.fits").vis2.value, 2)
     np.testing.assert_allclose(second, first + 1.0)
     np.testing.assert_allclose(np.sort(first), np.sort(data.vis2.value))
+
+
+def test_rows_without_a_date_have_the_same_in_every_channel() -> None:
+    """That no channel knows the date is no difference; stations and dates that differ are."""
+    data = niriss(channels=3)
+    unknown = [
+        replace(m, mjd=np.full(len(m), np.nan), integration_s=np.full(len(m), np.nan))
+        for m in (data.vis2, data.closure_phase)
+    ]
+    grids = grids_of(replace(data, vis2=unknown[0], closure_phase=unknown[1]))
+    assert [len(g.first) for g in grids] == [21, 35]
+    for name, fault in (("mjd", 60000.5), ("u_m", 3.0), ("stations", 5)):
+        values = getattr(data.vis2, name).copy()
+        values[1] = fault
+        wrong = replace(data, vis2=replace(data.vis2, **{name: values}))
+        with pytest.raises(ValueError, match=f"{name} differs between the channels"):
+            grids_of(wrong)
