@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from amibayes.cube import read_cube
-from amibayes.cube.header import pixel_scale_of, wcs_matrix
+from amibayes.cube.header import integration_time_of, pixel_scale_of, wcs_matrix
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
 from amibayes.units import MAS
@@ -179,3 +179,19 @@ def test_pixel_scales_are_of_a_size_that_pixels_have(
         found = pixel_scale_of(header, "a", comments)
         assert found is not None
         assert np.degrees(found) * 3.6e6 == pytest.approx(mas)
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        ({"EFFINTTM": 1.5, "TGROUP": 0.5, "NGROUPS": 7}, 1.5),
+        ({"TGROUP": 0.5, "TFRAME": 0.1, "NGROUPS": 7}, 3.5),
+        ({"TFRAME": 0.1, "NGROUPS": 7}, 0.7),
+        ({"TGROUP": 0.5}, None),
+        ({"NGROUPS": 7}, None),
+        ({}, None),
+    ],
+)
+def test_time_of_an_integration(header: dict[str, float], seconds: float | None) -> None:
+    found = integration_time_of(header, "a")
+    assert found == (None if seconds is None else pytest.approx(seconds))
