@@ -9,7 +9,7 @@ import pytest
 
 from amibayes.cube import Cube
 from amibayes.cube.source import InMemoryCube
-from amibayes.extraction.cleaning import FAINT, _hot, _misfitting
+from amibayes.extraction.cleaning import FAINT, LIGHT, _hot, _misfitting
 from amibayes.extraction.extract import extract_all
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
@@ -82,6 +82,26 @@ def test_a_misfit_in_the_dark_is_hot_by_a_share_of_the_peak(
     good = np.ones(model.shape, dtype=bool)
     found = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
     assert np.argwhere(found).tolist() == sorted([list(places[k]) for k in expected])
+
+
+@pytest.mark.parametrize(("size", "found"), [(0.8, 0), (1.3, 1)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_misfit_beside_modelled_light_is_hot_by_a_share_of_it(
+    size: float, found: int, sign: float
+) -> None:
+    """Whatever its sign, and up to two pixels away."""
+    model = np.zeros((24, 24))
+    model[12, 12], model[3, 3] = sign * 50.0, 60.0
+    image = model.copy()
+    image[14, 11] += size * LIGHT * 50.0
+    fit = SimpleNamespace(
+        design=model.reshape(-1, 1),
+        inverse=np.zeros((1, model.size)),
+        solve=lambda _: np.ones((1, 1)),
+    )
+    good = np.ones(model.shape, dtype=bool)
+    hot = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
+    assert np.argwhere(hot).tolist() == [[14, 11]] * found
 
 
 @pytest.mark.parametrize("place", [(0, 0), (0, 9), (11, 4), (5, 6), (19, 19)])
