@@ -4,7 +4,7 @@ A new public name is one line here, and one in ``docs/reference/api.md``.
 """
 
 from .calibration import Calibration as Calibration, calibrate as calibrate
-from .detection.residuals_by_file import file_residuals as file_residuals
+from .detection.residuals import file_residuals as file_residuals
 from .companion_search.result import Companion as Companion, SearchResult as SearchResult
 from .companion_search.search import search as search
 from .companion_search.second_companion import (

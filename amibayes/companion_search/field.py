@@ -26,9 +26,6 @@ SURELY_NOT_NOISE = 30.0
 PERHAPS_NOT_NOISE = 20.0
 """Δχ² from which a companion may be stated."""
 
-SURELY_ONE_PLACE = 1000.0
-"""Δχ² with which another place that fits to within 9 predicts the same data to 1 %: an alias."""
-
 MAX_LOOKED_AT = 40_000
 """Positions of the look around the field."""
 
@@ -97,15 +94,16 @@ def look_inside(result: SearchResult) -> float | None:
 def look_outside(result: SearchResult) -> float | None:
     """Find where farther out than the field a companion would fit as well.
 
-    As far as the channels allow, within `MAX_LOOKED_AT` and `MAX_WORK`. An alias of
-    what was found is left out: it fits as well by the geometry alone.
+    As far as the channels allow, within `MAX_LOOKED_AT` and `MAX_WORK`. An alias of what was
+    found is left out: it fits as well by the geometry alone. One of several thousand in Δχ² is
+    told from it by the width of the channels, and may be where the companion is.
 
     Returns
     -------
     float or None
         Its separation in mas; None where nothing outside is as good.
     """
-    if not PERHAPS_NOT_NOISE <= result.delta_chi2 <= SURELY_ONE_PLACE:
+    if result.delta_chi2 < PERHAPS_NOT_NOISE:
         return None
     likelihood, outer = result.likelihood, result.grid.outer_mas
     fringe = resolution_mas(likelihood)
@@ -278,6 +276,15 @@ def on_inner_edge(result: SearchResult) -> bool:
     edge = result.grid.inner_mas + 0.25 * result.grid.step_mas
     return result.delta_chi2 > SURELY_NOT_NOISE and result.companion.separation_mas < edge
 
+
+def on_outer_edge(result: SearchResult) -> bool:
+    """Whether the fit ended at the outer edge of the field: it is better still outside."""
+    left = result.grid.outer_mas - result.companion.separation_mas
+    return left < AT_EDGE * resolution_mas(result.likelihood)
+
+
+AT_EDGE = 1e-3
+"""Distance from an edge, in units of λ/B_max, of a fit that ended there: far below any error."""
 
 NEARER = 0.3
 """Inner edge of the first of these fields, in units of that of the search: λ/7B, below which

@@ -6,13 +6,60 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import Mode
 from amibayes.companion_search.seeds import MODE_LIMIT
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.parameters import Box
 from amibayes.units import FloatArray
 
 AS_GOOD = 1.0
 """Δχ² within which one of two positions does not fit better: one standard deviation."""
+
+
+NEARLY_EQUAL = 0.5
+"""Contrast from which on the fainter star may be the brighter one, within errors of the data that
+a companion is found in: it costs a fit, whose χ² then decides."""
+
+
+def with_exchanged(
+    likelihood: Likelihood, modes: Sequence[Mode], box: Box, deviance_single: float
+) -> list[Mode]:
+    """Modes, and those in which the brightest companion and the star have changed places.
+
+    A contrast is 1 at most: of two stars that are equal within the errors the one that is taken
+    for the companion may be either, and the positions are opposite.
+    """
+    parameters = likelihood.parameters
+    bright = [m for m in modes if parameters.companions == 1 and _contrast(m) > NEARLY_EQUAL]
+    fits = [
+        refine(likelihood, _exchanged(likelihood, np.array(m.theta)), box, deviance_single)
+        for m in bright[:1]
+    ]
+    return [*modes, *fits]
+
+
+def _contrast(mode: Mode) -> float:
+    return mode.companion.contrast
+
+
+def _exchanged(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Parameters of the same two stars with the other one at the origin, as bright at most."""
+    parameters = likelihood.parameters
+    moved = theta.copy()
+    for columns in (parameters.place(), parameters.rates):
+        moved[columns] = -theta[columns]
+    low, high = np.array(parameters.bounds(parameters.contrasts)).T
+    # In one of several bands it may be 0.
+    ratio = 1.0 / np.maximum(theta[parameters.contrasts], 1e-3)
+    moved[parameters.contrasts] = np.clip(ratio, low, high)
+    if "contrast_slope" in parameters.names:
+        moved[parameters.index("contrast_slope")] *= -1.0
+    sizes = ["diameter_mas", "companion_diameter_mas"]
+    if all(name in parameters.names for name in sizes):
+        first, second = (parameters.index(name) for name in sizes)
+        moved[[first, second]] = theta[[second, first]]
+    return moved
 
 
 def distinct_modes(modes: Sequence[Mode], fringe_mas: float) -> tuple[Mode, ...]:

@@ -149,9 +149,9 @@ class Mode:
         )
 
 
-def is_opposite(mode: Mode, place: FloatArray) -> bool:
+def is_opposite(mode: Mode, place: FloatArray, within_mas: float = 1e-2) -> bool:
     """Whether a mode is the mirror image of a place, mas."""
-    return bool(np.hypot(*np.add(mode.place, place)) < 1e-2)
+    return bool(np.hypot(*np.add(mode.place, place)) < within_mas)
 
 
 SKY = ("north_mas", "east_mas")

@@ -1,7 +1,7 @@
 """A search with Student-t residuals: data that fit nothing lose their weight, step by step.
 
 What channels of an exposure share is fitted to the residuals of a first search, outliers at
-little weight; the search that counts has it in the covariance, as if the file had stated it.
+little weight; the search that counts has it in its noise, in units of the stretched errors.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
-from amibayes.data.observables import Observables
-from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.channel_noise import noise_with_channels, noise_with_rows
 from amibayes.likelihood.combinations import combination_of, require
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, NoisePrior, mean_of_files
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -78,27 +77,22 @@ def search_robust(
     data = likelihood.observables
     require(combination_of(likelihood, residuals="student"), data.source)
     work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
-    plain = search(likelihood, separation_mas)
-    alone = single_likelihood(likelihood)
-    starts = [
-        likelihood.residuals(plain.theta)[:, 0],
-        alone.residuals(plain.single_theta)[:, 0],
-    ]
-    tried = [work.converge(white) for white in starts]
-    found = max(tried, key=lambda t: work.log_prob(t[0].theta))
-    first, _, _, _ = found
+    found = work.first()
+    first = found[0]
     shared = shared_noise(first.likelihood, first.theta, prior or NoisePrior(), per_file=per_file)
     correlated = with_shared(likelihood.expecting(first.theta), shared)
-    if correlated.observables.covariance is not data.covariance:
+    if correlated.noise.rows is not None:
         likelihood = correlated
         work = RobustFits(likelihood, separation_mas, free_scale, per_file=per_file)
         found = work.converge(likelihood.residuals(first.theta)[:, 0])
-    result, weights, residuals, scale = found
-    stated = likelihood.observables
-    base = reweighted(stated, scale)
-    robustness = Robustness(base, stated, weights, residuals)
-    student = StudentNoise(result.likelihood.noise, base.covariance, symmetric_whitening(base))
-    noise = _as_noise(stated, scale, shared, per_file=per_file)
+    result, weights, residuals, scale = work.settled(found)
+    base = work.stretched(scale)
+    robustness = Robustness(
+        base.observables, likelihood.observables, likelihood.noise.covariance, weights, residuals
+    )
+    symmetric = symmetric_whitening(base.observables, base.noise.covariance)
+    student = StudentNoise(result.likelihood.noise, base.noise, symmetric)
+    noise = _as_noise(likelihood, scale, shared, per_file=per_file)
     likelihood = result.likelihood.with_noise(student)
     return replace(result, likelihood=likelihood, robustness=robustness), noise
 
@@ -119,24 +113,20 @@ def shared_noise(
 
 
 def with_shared(likelihood: Likelihood, noise: ExtraNoise) -> Likelihood:
-    """The likelihood of data whose covariance holds what channels share, and floors."""
+    """The likelihood with noise of which channels share some, and floors."""
     data = likelihood.observables
-    covariance = noise_with_channels(data, noise.channels, noise.floors).covariance
-    if covariance is data.covariance:
-        return likelihood
-    blocks = covariance.select(np.arange(covariance.size))
-    return Likelihood(replace(data, covariance=blocks), likelihood.model)
+    return likelihood.with_noise(noise_with_channels(data, noise.channels, noise.floors))
 
 
 def _as_noise(
-    stated: Observables, scale: FloatArray, shared: ExtraNoise, *, per_file: bool
+    stated: Likelihood, scale: FloatArray, shared: ExtraNoise, *, per_file: bool
 ) -> ExtraNoise:
     """Fitted scales (n_data,), in quadrature to the typical error of each kind (and file).
 
     Beside what channels share.
     """
-    data = stated.unflagged()
-    added = data.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
+    data = stated.observables
+    added = stated.noise.covariance.variance * np.maximum(scale**2 - 1.0, 0.0)
 
     def of(which: BoolArray) -> float:
         return float(np.sqrt(np.median(added[which]))) if which.any() else 0.0
@@ -156,7 +146,7 @@ class RobustFits:
     Parameters
     ----------
     likelihood : Likelihood
-        With the stated errors.
+        With the stated errors, and what channels share.
     separation_mas : (inner, outer), optional
     free_scale, per_file : bool
     """
@@ -169,11 +159,11 @@ class RobustFits:
         *,
         per_file: bool = False,
     ) -> None:
-        data = likelihood.observables
+        data, covariance = likelihood.observables, likelihood.noise.covariance
         self.likelihood, self.field = likelihood, separation_mas
-        self.symmetric = symmetric_whitening(data)
+        self.symmetric = symmetric_whitening(data, covariance)
         self.free_scale = free_scale
-        self.terms: list[StudentTerm] = student_terms(data, per_file=per_file)
+        self.terms: list[StudentTerm] = student_terms(data, covariance, per_file=per_file)
         parts = groups_of(data, per_file=per_file)
         kinds = self.symmetric.groups
         self.groups = [here & kind for _, here in parts for kind in kinds if (here & kind).any()]
@@ -185,25 +175,67 @@ class RobustFits:
         each = zip(self.terms, nodes, strict=True)
         return float(sum(t.log_likelihoods(difference, np.array([n]))[0, 0] for t, n in each))
 
+    def first(self) -> Found:
+        """The more likely one of those that start from the best fit and from no companion."""
+        plain, alone = search(self.likelihood, self.field), single_likelihood(self.likelihood)
+        fits = (self.likelihood, plain.theta), (alone, plain.single_theta)
+        tried = [self.converge(model.residuals(theta)[:, 0]) for model, theta in fits]
+        return max(tried, key=lambda t: self.log_prob(t[0].theta))
+
     def converge(self, white: FloatArray) -> Found:
         """Search, and again with new weights until the place holds."""
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):
-            result = search(self.weighted(stretch), self.field)
-            grid = result.grid
-            box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
-            stretch, _ = self.steps(result.theta, box)
+            result = search(self.stretched(stretch), self.field)
+            stretch, _ = self.steps(result.theta, self._box(result))
             here = np.array([result.companion.east_mas, result.companion.north_mas])
             moved, place = np.hypot(*(here - place)), here
             if moved < CONVERGED * resolution_mas(self.likelihood):
                 break
-        result = search(self.weighted(stretch), self.field)
+        result = search(self.stretched(stretch), self.field)
         _, weights, residuals, scale = self._stretch(self.likelihood.residuals(result.theta)[:, 0])
         return result, weights, residuals, scale
 
-    def weighted(self, stretch: FloatArray) -> Likelihood:
+    def settled(self, found: Found) -> Found:
+        """The most likely solution, and how much less likely others are, each with its own weights.
+
+        Weights that were found beside one solution take from all others what speaks for them.
+        """
+        fits, log = self._of_modes(found[0])
+        for _ in range(MAX_SEARCHES):
+            best = int(log.argmax())
+            if best == 0:
+                break
+            other = self.converge(self.likelihood.residuals(fits[best])[:, 0])
+            if self.log_prob(other[0].theta) <= log[0]:
+                break
+            found = other
+            fits, log = self._of_modes(found[0])
+        result = found[0]
+        gain = result.modes[0].delta_chi2 + np.minimum(2.0 * (log - log[0]), 0.0)
+        modes = [replace(m, delta_chi2=float(g)) for m, g in zip(result.modes, gain, strict=True)]
+        aliases = [
+            new for old, new in zip(result.modes, modes, strict=True) if old in result.aliases
+        ]
+        modes.sort(key=lambda m: -m.delta_chi2)
+        return replace(result, modes=tuple(modes), aliases=tuple(aliases)), *found[1:]
+
+    def _of_modes(self, result: SearchResult) -> tuple[list[FloatArray], FloatArray]:
+        """Fits near every solution with weights of their own, and their log-likelihoods."""
+        box = self._box(result)
+        fits = [result.theta, *(self.steps(np.array(m.theta), box)[1] for m in result.modes[1:])]
+        return fits, np.array([self.log_prob(theta) for theta in fits])
+
+    def _box(self, result: SearchResult) -> Box:
+        grid = result.grid
+        return Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
+
+    def stretched(self, stretch: FloatArray) -> Likelihood:
         """The Gaussian likelihood of stretched errors (n_data,)."""
-        return Likelihood(reweighted(self.likelihood.observables, stretch), self.likelihood.model)
+        given = self.likelihood
+        data = reweighted(given.observables, stretch)
+        noise = noise_with_rows(data, given.noise.rows, floor=given.noise.floor)
+        return Likelihood(data, given.model, noise)
 
     def steps(self, theta: FloatArray, box: Box) -> tuple[FloatArray, FloatArray]:
         """Weights and fit in turn, near one place: stretch of the errors, and the fit."""
@@ -211,7 +243,7 @@ class RobustFits:
         for _ in range(MAX_STEPS):
             before = stretch
             stretch = self._stretch(self.likelihood.residuals(theta)[:, 0])[0]
-            theta = np.array(refine(self.weighted(stretch), theta, box, 0.0).theta)
+            theta = np.array(refine(self.stretched(stretch), theta, box, 0.0).theta)
             if np.abs(np.log(stretch / before)).max() < CONVERGED:
                 break
         return stretch, theta

@@ -10,7 +10,12 @@ import numpy as np
 
 from amibayes.companion_search.field import default_separation, resolution_mas
 from amibayes.companion_search.grid import Grid, make_grid, rates_per_axis
-from amibayes.companion_search.modes import distinct_modes, innermost_first
+from amibayes.companion_search.modes import (
+    NEARLY_EQUAL,
+    distinct_modes,
+    innermost_first,
+    with_exchanged,
+)
 from amibayes.companion_search.optimise import fit_single, global_check
 from amibayes.companion_search.result import RIVAL, Mode, SearchResult, companions_of, is_opposite
 from amibayes.companion_search.scan import ScanResult
@@ -98,7 +103,7 @@ def search(
     found = _fits(likelihood, coarse, grid, survey, single, box, deviance_single, known)
     # Where no peak is worth a fit, the global optimiser's is the one solution.
     checked = None if found else _checked(likelihood, coarse, grid, box, single, deviance_single)
-    every = distinct_modes(found if checked is None else [checked], box.fringe_mas)
+    every = _all_modes(likelihood, found if checked is None else [checked], box, deviance_single)
     modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
     result = SearchResult(
         likelihood=likelihood,
@@ -128,7 +133,7 @@ def with_global_check(result: SearchResult) -> SearchResult:
     deviance = float(likelihood.deviance(np.array(result.chi2_single)))
     found = _checked(likelihood, coarse, grid, box, single, deviance)
     best = max(mode.delta_chi2 for mode in result.modes)
-    every = distinct_modes([*result.modes, found], box.fringe_mas)
+    every = _all_modes(likelihood, [*result.modes, found], box, deviance)
     modes, aliases = innermost_first(likelihood, every, single, box.fringe_mas)
     solutions = _solutions(likelihood, modes, aliases)
     if found.delta_chi2 > best + BETTER:
@@ -138,6 +143,15 @@ def with_global_check(result: SearchResult) -> SearchResult:
         )
         solutions["warnings"] = (told, *solutions["warnings"])
     return replace(result, global_check=found, **solutions)
+
+
+def _all_modes(
+    likelihood: Likelihood, found: Sequence[Mode], box: Box, deviance_single: float
+) -> tuple[Mode, ...]:
+    """Those fits that differ, and what they are with the two stars exchanged."""
+    modes = distinct_modes(found, box.fringe_mas)
+    every = with_exchanged(likelihood, modes, box, deviance_single)
+    return distinct_modes(every, box.fringe_mas)
 
 
 def _checked(
@@ -169,7 +183,7 @@ def _solutions(
         "chi2_binary": float(likelihood.chi2(theta)[0]),
         "modes": modes,
         "aliases": aliases,
-        "warnings": _warnings(modes, aliases),
+        "warnings": _warnings(likelihood, modes, aliases),
     }
 
 
@@ -283,19 +297,30 @@ def _is_new(likelihood: Likelihood, nuisance: FloatArray, tried: list[FloatArray
     return True
 
 
-def _warnings(modes: Sequence[Mode], aliases: Sequence[Mode]) -> tuple[str, ...]:
-    warnings = []
-    if aliases and modes[0].delta_chi2 > RIVAL:
-        here = np.array(modes[0].place)
-        opposite = [m for m in aliases if is_opposite(m, here)]
-        repeated = [m for m in aliases if m not in opposite]
-        far = [f"{m.companion.separation_mas:.0f}" for m in repeated]
-        if opposite:
+def _warnings(
+    likelihood: Likelihood, modes: Sequence[Mode], aliases: Sequence[Mode]
+) -> tuple[str, ...]:
+    if modes[0].delta_chi2 <= RIVAL:
+        return ()
+    warnings, here = [], np.array(modes[0].place)
+    # The fit of stars that have changed places is not quite at the opposite place.
+    equal = modes[0].contrast > NEARLY_EQUAL
+    within = 0.25 * resolution_mas(likelihood) if equal else 1e-2
+    opposite = [m for m in modes[1:] if is_opposite(m, here, within)]
+    if not likelihood.observables.n_closure_phases:
+        if any(m in aliases for m in opposite):
             warnings.append("without closure phases a position cannot be told from its opposite")
-        if far:
-            ends = 0.5 * min(np.hypot(*np.subtract(m.place, here)) for m in repeated)
-            warnings.append(
-                f"beyond {ends:.0f} mas the sky repeats itself for these baselines: "
-                f"{', '.join(far)} mas would fit as well; the innermost is reported"
-            )
+    elif equal and any(m.delta_chi2 > modes[0].delta_chi2 - RIVAL for m in opposite):
+        warnings.append(
+            "the two stars are equally bright within the errors: the position may be the opposite "
+            "one, 180 deg away, as either may be the companion"
+        )
+    repeated = [m for m in aliases if m not in opposite]
+    if repeated:
+        ends = 0.5 * min(np.hypot(*np.subtract(m.place, here)) for m in repeated)
+        far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in repeated)
+        warnings.append(
+            f"beyond {ends:.0f} mas the sky repeats itself for these baselines: {far} mas would "
+            "fit as well; the innermost is reported"
+        )
     return tuple(warnings)

@@ -178,6 +178,7 @@ def noise_averaged(
             profile.noise,
             result.robustness.stated,
             fits,
+            covariance=result.robustness.covariance,
             free_scale=extra_noise,
             per_file=per_file,
         )

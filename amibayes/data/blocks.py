@@ -183,6 +183,13 @@ class Stack:
         right = np.broadcast_to(basis.swapaxes(1, 2), (len(lower), *basis.shape[:0:-1]))
         return np.linalg.solve(lower, right), basis @ lower
 
+    def symmetric(self) -> FloatArray:
+        """(AᵀA)^{-1/2} Aᵀ of every block, (g, r, m), A its standardised colouring."""
+        _, colouring = self.factors()
+        errors = np.sqrt(np.einsum("gmm->gm", self.matrix))
+        left, _, right = np.linalg.svd(colouring / errors[:, :, None], full_matrices=False)
+        return np.asarray((left @ right).swapaxes(1, 2))
+
 
 class BlockCovariance:
     """Independent groups of correlated entries; one block makes it dense.
@@ -275,6 +282,11 @@ class BlockCovariance:
     def solve(self, x: FloatArray) -> FloatArray:
         """(Pseudo-)inverse of the covariance times x, (size, …)."""
         return np.asarray(self._unwhitening @ (self.whitening @ x))
+
+    @cached_property
+    def symmetric(self) -> csr_array:
+        """Rows (size, rank) of the symmetric whitening; see `Covariance.symmetric`."""
+        return csr_array(self.laid_out([s.symmetric() for s in self.stacks]).T)
 
     def logdet(self) -> float:
         """Logarithm of the determinant of the covariance of the independent combinations."""

@@ -62,7 +62,16 @@ class Covariance(Protocol):
         """The full matrix, (size, size)."""
         ...
 
-    def select(self, keep: IntArray) -> BlockCovariance:
+    @property
+    def symmetric(self) -> csr_array:
+        """Sparse matrix (size, rank) of which S x has a row for every entry of whitened data x.
+
+        SᵀS = 1. A row stands for its entry as closely as can be (Kessy, Lewin & Strimmer 2018,
+        ZCA-cor; of correlated channels, that of their whitened data).
+        """
+        ...
+
+    def select(self, keep: IntArray) -> Covariance:
         """Covariance of the entries ``keep``, in that order."""
         ...
 

@@ -84,8 +84,6 @@ def consistency(
     own_rng = np.random.default_rng(spawn(rng, 1)[0])
     whole, theta = result.likelihood, result.theta
     data = whole.observables
-    if result.robustness is not None:
-        noise = None  # it is in the covariance
     files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
     found = []
     every: list[tuple[Split, dict[str, BoolArray]]] = [

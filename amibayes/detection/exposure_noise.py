@@ -21,7 +21,7 @@ from scipy.special import ndtri
 from amibayes.companion_search.reduction import Roots
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.data.systematics import MIN_EXPOSURES
-from amibayes.likelihood.channel_noise import ChannelCovariance
+from amibayes.likelihood.channel_noise import noise_with_rows
 from amibayes.likelihood.channel_rows import (
     ChannelLayout,
     ChannelRows,
@@ -116,14 +116,12 @@ def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise 
     sizes = _sizes(rows, layout, DRAWN_OF_FLOORS if many else DRAWN)
     if not (series or np.ptp(sizes, axis=0).any()):
         return None
-    alone = GaussianNoise(ChannelCovariance(data.covariance, rows), rows=rows, floor=floor)
-    star = single_likelihood(likelihood.with_noise(alone))
+    star = single_likelihood(likelihood.with_noise(noise_with_rows(data, rows, floor=floor)))
     both = np.column_stack([star.residuals(single)[:, 0], star.jacobian(single)])
     of_kinds = [[one for one in series if one.vis2 == kind] for kind in (True, False)]
     vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
     turned, roots = _turned(rows, sizes, series, vis2, closure)
-    covariance = ChannelCovariance(data.covariance, turned)
-    return ExposureNoise(vis2, closure, GaussianNoise(covariance, rows=turned, floor=floor), roots)
+    return ExposureNoise(vis2, closure, noise_with_rows(data, turned, floor=floor), roots)
 
 
 def _sizes(rows: ChannelRows, layout: ChannelLayout, n: int) -> FloatArray:

@@ -240,6 +240,11 @@ EXPLAINED, IN_ALL_GROUPS = 0.9, 0.6
 """Least share of the squared residuals of the star alone that the companion explains: in units of
 the errors, and with each group of data scaled to unit scatter (some may hold little but noise)."""
 
+EXPLAINED_BESIDE_NOISE = 0.99
+"""The same share of all data where noise was added to the stated errors. With the noise the best
+fit leaves what its errors are: then 1 % of the residuals of the star alone, a tenth in amplitude,
+which the model does not explain and noise is taken for."""
+
 PLACES, CONTRASTS, NUISANCE = 16, 32, 8
 """Models that are counted: places at each position of the bank (a quarter of its step apart),
 contrasts, and values of each other parameter."""
@@ -260,14 +265,17 @@ def beside_bright(tested: Significance, result: SearchResult, noise: ExtraNoise)
     tested : Significance
     result : SearchResult
     noise : ExtraNoise
-        What was added to the stated errors. Where anything was, the companion does not explain
-        the residuals, and ``tested`` is given back.
+        What was added to the stated errors. Where anything was, the companion has to explain
+        more of the residuals, `EXPLAINED_BESIDE_NOISE`; else ``tested`` is given back.
 
     Notes
     -----
     Both probabilities are asked, so that the smaller one counts twice.
     """
-    if tested.detected is not False or noise.vis2 > 0.0 or noise.closure_phase_rad > 0.0:
+    if tested.detected is not False:
+        return tested
+    added = noise.vis2 > 0.0 or noise.closure_phase_rad > 0.0
+    if added and result.chi2_binary > (1.0 - EXPLAINED_BESIDE_NOISE) * result.chi2_single:
         return tested
     bound = bright_probability(result, tested.test)
     if bound is None or 2.0 * bound >= tested.probability:

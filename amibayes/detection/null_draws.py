@@ -13,7 +13,8 @@ import numpy as np
 
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.exposure_noise import ExposureNoise
-from amibayes.detection.treatments import ErrorTreatment, Ratio
+from amibayes.detection.ratio import Ratio
+from amibayes.detection.treatments import ErrorTreatment
 from amibayes.parallel import Executor, Journal, Progress, SerialExecutor, run_job, slices, spawn
 from amibayes.support.shared_results import shared
 from amibayes.units import FloatArray

@@ -19,12 +19,12 @@ from amibayes.companion_search.scan import scale_groups
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.detection.exposure_noise import ExposureNoise, exposure_noise
 from amibayes.detection.null_draws import noise_of_rows, null_draws
+from amibayes.detection.ratio import Ratio
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.treatments import (
     ErrorTreatment,
     FreeScale,
     KnownErrors,
-    Ratio,
     Searched,
     StudentScores,
 )
@@ -364,15 +364,15 @@ def _treatment(
     whitening: SymmetricWhitening | None,
 ) -> tuple[TemplateBank, ErrorTreatment]:
     """What is known of the errors, and the bank that searches in few numbers where it can."""
+    least = 1.0 if likelihood.noise.floor else 0.0
     if whitening is not None:
-        return bank, StudentScores(whitening)
+        return bank, StudentScores(whitening, least)
     null = rotation_null(likelihood.noise, bank.project(observed))
     if null is not None:
         return bank, Rotations(null)
     if stated_errors:
         return bank, KnownErrors()
     groups = scale_groups(likelihood.observables, bank.n_nuisance, likelihood.noise.rows)
-    least = 1.0 if likelihood.noise.floor else 0.0
     reduced = bank.reduced(groups.label)
     if reduced.reduction is not None:
         groups = replace(groups, label=reduced.reduction.label, count=groups.degrees / groups.share)

@@ -92,7 +92,7 @@ def verdict(
         Whether that structure is more than what the calibration of the instrument may leave: see
         `within_calibration`. Structure that is not does not speak against the model.
     shape : float
-        Of `fit_probability`: `SHAPE` where noise was fitted.
+        Of `parts_of_fit`: `SHAPE` where noise was fitted.
     compared : bool
         Whether models of the sky are compared too.
     alone : (Likelihood, (n_nuisance,) float array), optional
@@ -105,8 +105,8 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    parts = _parts(result.likelihood, result.theta, result.ndof, shape)
-    fit = _smallest(parts)
+    parts = parts_of_fit(result.likelihood, result.theta, result.ndof, shape)
+    fit = joint_probability(parts)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     for split in apart:
@@ -174,6 +174,20 @@ def star_alone(
     return noisy, theta
 
 
+def at_the_edge(found: Verdict, result: SearchResult) -> Verdict:
+    """The verdict where the fit of the companion ended at the outer edge of all that is searched.
+
+    It fits best where the data know nothing of a companion, and whatever they hold is no
+    companion inside.
+    """
+    rho = result.companion.separation_mas
+    because = (
+        f"the best companion is on the outer edge of the field, {rho:.4g} mas, and better outside: "
+        "look for hot pixels and other faults, or give a field (--separation)"
+    )
+    return Verdict("model rejected", because, found.p_model)
+
+
 def without_companion(
     found: Verdict, other: Alternative, result: SearchResult, *, compared: bool = False
 ) -> Verdict:
@@ -199,21 +213,8 @@ SHAPE = 0.1
 noise differs between baselines and channels. It matters from some hundred data on."""
 
 
-def fit_probability(result: SearchResult, shape: float = 0.0) -> float:
-    """Probability of a χ² as large as that of the best fit, with the noise that was fitted.
-
-    A ``shape`` is the standard deviation of ln χ² by noise of another shape: the probability is
-    the mean over it.
-
-    Noise is fitted to each kind of observable of each file where its χ² asks for it: their
-    probabilities count, the smallest times their number. That of all data together would refuse
-    a model for misfits that noise within its prior explains, but that no part asks for.
-    """
-    return _smallest(_parts(result.likelihood, result.theta, result.ndof, shape))
-
-
 @dataclass(frozen=True)
-class _Part:
+class FitOfPart:
     """χ² of one kind of observable of one file, its degrees of freedom and probability."""
 
     kind: str
@@ -223,13 +224,24 @@ class _Part:
     p: float
 
 
-def _smallest(parts: Sequence[_Part]) -> float:
-    """The smallest probability of several, times their number."""
+def joint_probability(parts: Sequence[FitOfPart]) -> float:
+    """Probability of a χ² as large as that of a fit: the smallest of parts, times their number.
+
+    Noise is fitted to each kind of observable of each file where its χ² asks for it. That of all
+    data together would refuse a model for misfits that noise within its prior explains, but that
+    no part asks for.
+    """
     return min(1.0, len(parts) * min(part.p for part in parts))
 
 
-def _parts(likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float) -> list[_Part]:
-    """Kinds of observables of files, as a best fit leaves them."""
+def parts_of_fit(
+    likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float = 0.0
+) -> list[FitOfPart]:
+    """Kinds of observables of files, as a best fit leaves them, with the noise that was fitted.
+
+    A ``shape`` is the standard deviation of ln χ² by noise of another shape: probabilities are
+    means over it.
+    """
     difference = likelihood.difference(np.atleast_2d(theta))[:, 0]
     covariance, share = likelihood.noise.covariance, ndof / likelihood.n_independent
     nodes, weights = np.polynomial.hermite_e.hermegauss(41)
@@ -242,14 +254,14 @@ def _parts(likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float) -
                 continue
             chi2, rank = chi2_of_part(covariance, at, difference)
             each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
-            found.append(_Part(kind, file.source, chi2, share * rank, float(weights @ each)))
+            found.append(FitOfPart(kind, file.source, chi2, share * rank, float(weights @ each)))
     return found
 
 
 def _misfit_alone(likelihood: Likelihood, theta: FloatArray, shape: float, alpha: float) -> str:
     """Say how a star alone does not fit; empty where it does."""
-    parts = _parts(likelihood, theta, likelihood.n_independent - len(theta), shape)
-    if _smallest(parts) >= alpha:
+    parts = parts_of_fit(likelihood, theta, likelihood.n_independent - len(theta), shape)
+    if joint_probability(parts) >= alpha:
         return ""
     return f"a star alone does not fit: {_misfit(parts, _worst(parts, likelihood.degrees))}"
 
@@ -297,7 +309,9 @@ def _apart(split: Consistency) -> str:
     )
 
 
-def _rejected(parts: Sequence[_Part], degrees: float, fit: float, structure: Significance) -> str:
+def _rejected(
+    parts: Sequence[FitOfPart], degrees: float, fit: float, structure: Significance
+) -> str:
     if fit <= structure.probability:
         return _misfit(parts, _worst(parts, degrees), "the best companion and ")
     return (
@@ -306,17 +320,17 @@ def _rejected(parts: Sequence[_Part], degrees: float, fit: float, structure: Sig
     )
 
 
-def _worst(parts: Sequence[_Part], degrees: float) -> _Part:
+def _worst(parts: Sequence[FitOfPart], degrees: float) -> FitOfPart:
     """The part that fits worst."""
 
-    def chance(part: _Part) -> tuple[float, float]:
+    def chance(part: FitOfPart) -> tuple[float, float]:
         """By χ² as it is; probabilities may be 0."""
         return chi2_survival(part.chi2, part.dof, degrees), -part.chi2 / part.dof
 
     return min(parts, key=chance)
 
 
-def _misfit(parts: Sequence[_Part], worst: _Part, beside: str = "") -> str:
+def _misfit(parts: Sequence[FitOfPart], worst: FitOfPart, beside: str = "") -> str:
     where = f" in {worst.source}" if len({part.source for part in parts}) > 1 else ""
     return (
         f"χ² of {NAMES[worst.kind]}{where} is {worst.chi2:.4g} for {worst.dof:.0f} degrees of "

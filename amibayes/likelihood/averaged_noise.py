@@ -96,7 +96,7 @@ class AveragedNoise(FittedNoise):
         """
         out = np.full(pairs.shape, -np.inf)
         # One residual to a row: rows of pairs are then taken without strides.
-        white = [[np.array((t.whitening @ x).T, order="C") for x in (a, b)] for t in self.terms]
+        white = [[np.array(t.white(x).T, order="C") for x in (a, b)] for t in self.terms]
         for k in np.flatnonzero(pairs.any(axis=0)):
             which = pairs[:, k]
             parts = [

@@ -30,10 +30,11 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.blocks import Block, BlockCovariance, orthonormal
+from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
-from amibayes.likelihood.chi2 import restricted_loss
+from amibayes.likelihood.chi2 import restricted_loss, touched
 from amibayes.likelihood.exposure_rows import series_of, turned_rows
 from amibayes.likelihood.noise import GaussianNoise, NoiseModel, noise_of
 from amibayes.units import FloatArray, IntArray
@@ -161,8 +162,18 @@ class ChannelCovariance:
         colour = csr_array(self._colouring)
         return np.asarray((colour @ colour.T).toarray())
 
-    def select(self, keep: IntArray) -> BlockCovariance:
+    @property
+    def symmetric(self) -> csr_array:
+        """Rows (size, rank) of the symmetric whitening; see `Covariance.symmetric`."""
+        return csr_array(self.base.symmetric @ self.rows.rotation.T)
+
+    def select(self, keep: IntArray) -> Covariance:
         """Covariance of the entries ``keep``, in that order."""
+        inside, beyond = touched(self.base, keep)
+        links = abs(self.rows.rotation[inside]) @ (~inside).astype(float)
+        if (np.diff(keep) > 0).all() and not ((inside & beyond).any() or links.any()):
+            # They share no noise with others: what is turned for all is turned for them alone.
+            return ChannelCovariance(self.base.select(keep), self.rows.part(inside))
         colour = csr_array(csr_array(self._colouring)[keep])
         shared = csr_array(abs(colour) @ abs(colour).T)
         count, label = connected_components(shared, directed=False)
@@ -220,8 +231,14 @@ def noise_with_channels(
     lasting = any(sum(c.lasting) > 0.0 for s in shares for c in (s.vis2, s.closure_phase))
     if not (layout.any or floors or lasting):
         return noise_of(data)
-    rows = noise_rows(data, layout, shares, floors)
-    return GaussianNoise(ChannelCovariance(data.covariance, rows), rows=rows, floor=bool(floors))
+    return noise_with_rows(data, noise_rows(data, layout, shares, floors), floor=bool(floors))
+
+
+def noise_with_rows(data: Observables, rows: ChannelRows | None, *, floor: bool) -> GaussianNoise:
+    """The noise of unflagged data that are turned to known rows; ``floor`` as `GaussianNoise`'s."""
+    stated = data.covariance
+    covariance = stated if rows is None else ChannelCovariance(stated, rows)
+    return GaussianNoise(covariance, rows=rows, floor=floor)
 
 
 def noise_rows(

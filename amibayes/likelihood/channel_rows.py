@@ -168,6 +168,16 @@ class ChannelRows:
     floor: FloatArray
     apart: ChannelRows | None = None
 
+    def part(self, inside: BoolArray) -> ChannelRows:
+        """Those of some of the whitened data (rank,), which share nothing with the others."""
+        return ChannelRows(
+            csr_array(self.rotation[inside][:, inside]),
+            self.sigma[inside],
+            self.level[inside],
+            self.floor[inside],
+            None if self.apart is None else self.apart.part(inside),
+        )
+
 
 OFFSET, SLOPE = 1, 2
 

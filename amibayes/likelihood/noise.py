@@ -70,10 +70,6 @@ class NoiseModel(Protocol):
         """How whitened data are turned; None where channels of an exposure share nothing."""
         ...
 
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
-        ...
-
     @property
     def log_norm(self) -> float:
         """Logarithm of the likelihood of data without residuals, with the one covariance."""
@@ -114,10 +110,6 @@ class NoiseModel(Protocol):
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         ...
 
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, n) as a significance test counts them."""
-        ...
-
     def without_companion(self) -> NoiseModel:
         """The noise that a test of no companion may use: nothing in it rests on one."""
         ...
@@ -151,10 +143,6 @@ class GaussianNoise:
     scatter: csr_array | None = None
     rows: ChannelRows | None = None
     floor: bool = False
-
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, …) turned to rows that stand for single channels."""
-        return white if self.rows is None else np.asarray(self.rows.rotation.T @ white)
 
     @property
     def n_independent(self) -> int:
@@ -208,10 +196,6 @@ class GaussianNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """Half of Δχ²."""
         return np.asarray(0.5 * delta_chi2)
-
-    def scores(self, white: FloatArray) -> FloatArray:
-        """The whitened data themselves."""
-        return white
 
     def without_companion(self) -> GaussianNoise:
         """The same."""
@@ -307,10 +291,6 @@ class FittedNoise:
         """Those of the fit."""
         return self.fit.rows
 
-    def aligned(self, white: FloatArray) -> FloatArray:
-        """As the fit does it."""
-        return self.fit.aligned(white)
-
     @property
     def n_independent(self) -> int:
         """Number of independent data."""
@@ -362,10 +342,6 @@ class FittedNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         return self.fit.log_loss(delta_chi2)
-
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Whitened data (n_independent, n) as a significance test counts them."""
-        return self.fit.scores(white)
 
     def without_companion(self) -> NoiseModel:
         """That of the fit."""

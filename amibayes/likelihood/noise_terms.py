@@ -75,9 +75,13 @@ class NoiseTerm:
         """Number of independent data."""
         return len(self.share)
 
+    def white(self, difference: FloatArray) -> FloatArray:
+        """Whitened data minus model (rank, n) of those that are not, (n_data, n)."""
+        return np.asarray(self.whitening @ difference)
+
     def log_likelihoods(self, difference: FloatArray, node: FloatArray) -> FloatArray:
         """ln L (n_nodes, n) of data minus model (n_data, n) for amounts of noise (n_nodes,)."""
-        return self.log_likelihoods_of_white(np.asarray(self.whitening @ difference), node)
+        return self.log_likelihoods_of_white(self.white(difference), node)
 
     def log_likelihoods_of_white(self, white: FloatArray, node: FloatArray) -> FloatArray:
         """The same of whitened data minus model (rank, n)."""
@@ -89,7 +93,7 @@ class NoiseTerm:
 
     def log_parts(self, difference: FloatArray) -> FloatArray:
         """Logarithm of likelihood times prior at the nodes, (n_nodes, n)."""
-        return self.log_parts_of_white(np.asarray(self.whitening @ difference))
+        return self.log_parts_of_white(self.white(difference))
 
     def log_parts_of_white(self, white: FloatArray) -> FloatArray:
         """The same of whitened data minus model (rank, n)."""

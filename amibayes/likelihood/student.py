@@ -11,19 +11,18 @@ at which normal residuals give intervals of the right size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from amibayes.data.blocks import Stack
 from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import AveragedNoise, differences_of
 from amibayes.likelihood.chi2 import LOG_TWO_PI
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.noise import FittedNoise, GaussianNoise, NoiseModel
+from amibayes.likelihood.noise import FittedNoise, NoiseModel
 from amibayes.likelihood.noise_terms import NoiseTerm, kinds_of, with_nodes
 from amibayes.likelihood.residuals import groups_of
 from amibayes.units import BoolArray, FloatArray
@@ -57,6 +56,11 @@ class NormalMoments:
     weight: float
     power: float
     efficiency: float
+
+    @property
+    def score_variance(self) -> float:
+        """Mean of (ψν/(ν + 1))²: of the scores, whose slope at 0 is 1."""
+        return self.curvature / self.power * (DEGREES / (DEGREES + 1.0)) ** 2
 
 
 @cache
@@ -103,20 +107,13 @@ class SymmetricWhitening:
         return np.asarray(self.rows.T @ (standard * np.sqrt(self.share)[:, None]))
 
 
-def symmetric_whitening(observables: Observables) -> SymmetricWhitening:
-    """Make the directions of unflagged data."""
-    covariance = observables.covariance
-    vis2 = np.arange(covariance.size) < observables.n_vis2
-    frame = csr_array(covariance.laid_out([_symmetric(s) for s in covariance.stacks]).T)
-    return SymmetricWhitening(frame, np.asarray((frame**2).sum(axis=1)).ravel(), vis2)
-
-
-def _symmetric(stack: Stack) -> FloatArray:
-    """(AᵀA)^{-1/2} Aᵀ of every block, (g, r, m), A its standardised colouring."""
-    _, colouring = stack.factors()
-    errors = np.sqrt(np.einsum("gmm->gm", stack.matrix))
-    left, _, right = np.linalg.svd(colouring / errors[:, :, None], full_matrices=False)
-    return np.asarray((left @ right).swapaxes(1, 2))
+def symmetric_whitening(
+    data: Observables, covariance: Covariance | None = None
+) -> SymmetricWhitening:
+    """Make the directions of unflagged data, of the covariance that they state or of another."""
+    rows = (covariance or data.covariance).symmetric
+    vis2 = np.arange(rows.shape[0]) < data.n_vis2
+    return SymmetricWhitening(rows, np.asarray((rows**2).sum(axis=1)).ravel(), vis2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,22 +124,18 @@ class StudentNoise(FittedNoise):
     ----------
     fit : NoiseModel
         Gaussian; the errors of data that fit nothing are stretched.
-    base : Covariance
+    base : NoiseModel
         Without the weights, which were found with a companion.
     symmetric : SymmetricWhitening
         Of ``base``.
     """
 
-    base: Covariance
+    base: NoiseModel
     symmetric: SymmetricWhitening
-
-    def scores(self, white: FloatArray) -> FloatArray:
-        """Bounded scores of data (n_independent, n), whitened by ``base``."""
-        return scores(self.symmetric, white)
 
     def without_companion(self) -> StudentNoise:
         """All data at full weight: no companion may be tested by weights found with one."""
-        return StudentNoise(GaussianNoise(self.base), self.base, self.symmetric)
+        return StudentNoise(self.base, self.base, self.symmetric)
 
 
 def weights_of(standard: FloatArray) -> FloatArray:
@@ -167,15 +160,19 @@ def scales(frame: SymmetricWhitening, standard: FloatArray, n_fitted: float = 0.
     return np.asarray(scale)
 
 
-def scores(frame: SymmetricWhitening, white: FloatArray) -> FloatArray:
+def scores(
+    frame: SymmetricWhitening, white: FloatArray, least: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Whitened data (rank, n) whose residuals are bounded: what a robust search looks at.
 
     The slope of the t likelihood of the fit without a companion, by the data; its products
-    with the templates are Rao's score statistics. Divided by the scale of each data set.
+    with the templates are Rao's score statistics. Divided by the scale of each data set (n,),
+    which is ``least`` or more, and comes with them.
     """
     standard = frame.residuals(white)
-    standard = standard / scales(frame, standard)
-    return frame.gather(weights_of(standard) * standard)
+    scale = np.maximum(scales(frame, standard), least)
+    standard = standard / scale
+    return frame.gather(weights_of(standard) * standard), scale
 
 
 def reweighted(observables: Observables, stretch: FloatArray) -> Observables:
@@ -220,6 +217,8 @@ class Robustness:
         The data with their errors stretched by the fitted scale of each kind, and no weights.
     stated : Observables
         The data with the stated errors.
+    covariance : Covariance
+        Of these, with what their channels share.
     weights : (n_data,) float array
         Share of its weight that every datum keeps.
     residuals : (n_data,) float array
@@ -228,6 +227,7 @@ class Robustness:
 
     base: Observables
     stated: Observables
+    covariance: Covariance
     weights: FloatArray
     residuals: FloatArray
 
@@ -259,9 +259,15 @@ class Robustness:
 class StudentTerm(NoiseTerm):
     """Data with t distributed residuals that share one unknown scale of their errors.
 
-    ``whitening`` gives every datum's residual in its stated error, ``share`` the independent
-    data that it stands for.
+    ``rows`` (n_data, rank) give every datum's residual in its stated error, of whitened data,
+    and ``share`` the independent data that it stands for.
     """
+
+    rows: csr_array = field(kw_only=True)
+
+    def white(self, difference: FloatArray) -> FloatArray:
+        """Residuals (n_data, n) of data minus model, in the stated errors."""
+        return np.asarray(self.rows @ super().white(difference))
 
     @property
     def n_independent(self) -> int:
@@ -269,7 +275,7 @@ class StudentTerm(NoiseTerm):
         return round(float(self.share.sum()))
 
     def log_likelihoods_of_white(self, white: FloatArray, node: FloatArray) -> FloatArray:
-        """ln L (n_nodes, n) of residuals in their stated errors (rank, n) for scales exp(node)."""
+        """ln L (n_nodes, n) of residuals in their stated errors (n_data, n), scales exp(node)."""
         moments, square = normal_moments(), white**2
         power = 0.5 * moments.power * (DEGREES + 1.0)
         slopes = [self.share @ np.log1p(square / (DEGREES * np.exp(2.0 * u))) for u in node]
@@ -277,22 +283,29 @@ class StudentTerm(NoiseTerm):
         return np.asarray(-power * np.array(slopes) - norm[:, None] - 0.5 * self.log_det)
 
 
-def student_terms(stated: Observables, *, per_file: bool = False) -> list[StudentTerm]:
+def student_terms(
+    stated: Observables, covariance: Covariance | None = None, *, per_file: bool = False
+) -> list[StudentTerm]:
     """One term for each kind of observable (and file), or one where the data correlate kinds.
 
     Every datum has a residual of its own, whatever correlates it with others, so that files
     which share calibrators have scales of their own all the same.
     """
     data = stated.unflagged()
-    symmetric = symmetric_whitening(data)
-    white = data.covariance.whitening
+    covariance = covariance or data.covariance
+    symmetric = symmetric_whitening(data, covariance)
     terms = []
     for source, here in groups_of(data, per_file=per_file):
         for kind, which, typical in kinds_of(data, here):
             share = symmetric.share[which]
-            rows = diags_array(1.0 / np.sqrt(share)) @ symmetric.rows[which] @ white
-            log_det = data.covariance.select(np.flatnonzero(which)).logdet()
-            terms.append(StudentTerm(kind, csr_array(rows), share, typical, log_det, source=source))
+            rows = csr_array(diags_array(1.0 / np.sqrt(share)) @ symmetric.rows[which])
+            used = rows.count_nonzero(axis=0) > 0
+            log_det = covariance.select(np.flatnonzero(which)).logdet()
+            term = StudentTerm(
+                kind, covariance.whitening[used], share, typical, log_det,
+                source=source, rows=rows[:, used],
+            )  # fmt: skip
+            terms.append(term)
     return terms
 
 
@@ -301,6 +314,7 @@ def averaged_student_noise(
     stated: Observables,
     fits: Sequence[tuple[Likelihood, FloatArray]],
     *,
+    covariance: Covariance | None = None,
     free_scale: bool = True,
     per_file: bool = False,
 ) -> AveragedNoise:
@@ -314,12 +328,14 @@ def averaged_student_noise(
         With the stated errors.
     fits : sequence of (Likelihood, (n_dim,) float array)
         As in `amibayes.likelihood.averaged_noise.averaged_noise`.
+    covariance : Covariance, optional
+        Of the stated errors and what channels share; by default, what the data state.
     free_scale : bool
         Whether the scale of the errors is unknown; else it is the stated one.
     per_file : bool
         Whether every file has a scale of its own.
     """
-    terms: list[NoiseTerm] = list(student_terms(stated, per_file=per_file))
+    terms: list[NoiseTerm] = list(student_terms(stated, covariance, per_file=per_file))
     if free_scale:
         differences = differences_of(fits)
         terms = [with_nodes(t, differences) for t in terms]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from amibayes.calibration.transfer import Diameter
+from amibayes.companion_search.field import on_outer_edge
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import alternative
@@ -19,21 +20,22 @@ from amibayes.detection.false_alarm import (
     significance,
 )
 from amibayes.detection.randomised import Randomised, randomised
+from amibayes.detection.residuals import correlated
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.detection.verdict import (
     SHAPE,
     Verdict,
+    at_the_edge,
     star_alone,
     verdict,
     within_calibration,
     without_companion,
 )
-from amibayes.detection.whiteness import correlated
 from amibayes.errors import DataError
 from amibayes.parallel import Executor, Journal, Progress, spawn
-from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import FieldSearch, search_field
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.support.options import NULL_DRAWS
 
 MAX_RANDOMISED = 5000
@@ -196,6 +198,8 @@ def verdict_of(
     )  # fmt: skip
     if said.statement == "companion" and (other := alternative(result)) is not None:
         said = without_companion(said, other, result, compared=compared)
+    if said.statement == "companion" and options.separation_mas is None and on_outer_edge(result):
+        said = at_the_edge(said, result)
     if said.statement == "no companion" and (seen := _seen_in_one_night(stated, options, rng)):
         said = Verdict("inconsistent data", seen, said.p_model)
     return said, splits

@@ -15,33 +15,31 @@ from amibayes.companion_search.field import (
     look_outside,
     notices_disc,
     on_inner_edge,
+    on_outer_edge,
+    outermost,
     refuse_no_length,
     resolution_mas,
     wider_fields,
 )
-from amibayes.companion_search.optimise import SHAPE_START, fit_single, refine, with_disc
+from amibayes.companion_search.optimise import SHAPE_START, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
 from amibayes.companion_search.search import search, with_global_check
 from amibayes.companion_search.seeds import MAX_COARSE_DATA
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
-from amibayes.data.systematics import systematics_of
 from amibayes.detection.outlying_rows import (
     OutlyingRow,
     may_be_left_out,
     outlying_rows,
     without_rows,
 )
-from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.joint import joint_likelihood
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
-from amibayes.models.bands import reference_wavelength
-from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
-from amibayes.pipeline.options import SearchOptions
-from amibayes.units import MAS
+from amibayes.pipeline.options import SearchOptions, model_of, noise_prior
 
 DISC_CONTRAST = 0.03
 """Contrast below which a disc is not tried unasked: as large as the star's it would have a surface
@@ -137,10 +135,12 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     first = search(likelihood, field, check=False)
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
+        likelihood, first = _with_disc_of_star(likelihood, first)
     first = _with_its_disc(likelihood, first, options)
     if options.separation_mas is None:
         first, wider = _in_wider_field(likelihood, first, options)
-        warnings = wider or warnings
+        first, past = _past_the_edge(likelihood, first, options)
+        warnings = past or wider or warnings
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings), observables)
@@ -211,6 +211,30 @@ def _in_wider_field(
     return first, []
 
 
+def _past_the_edge(
+    likelihood: Likelihood, first: SearchResult, options: SearchOptions
+) -> tuple[SearchResult, list[str]]:
+    """The search in a field a little wider, with a warning, where the fit ended on the edge."""
+    grid = first.grid
+    edge = min(PAST_EDGE * grid.outer_mas, outermost(likelihood))
+    wide = edge > grid.outer_mas + grid.step_mas
+    if not wide or first.delta_chi2 < SURELY_NOT_NOISE or not on_outer_edge(first):
+        return first, []
+    found = search(likelihood, (grid.inner_mas, edge), check=False)
+    found = _with_its_disc(likelihood, found, options)
+    if found.chi2_binary > first.chi2_binary:
+        return first, []
+    place = found.companion.separation_mas
+    return found, [
+        f"the field was widened to {grid.inner_mas:.3g}:{edge:.4g} mas: in the default one the fit "
+        f"ended on the edge, and a companion at {place:.1f} mas does better"
+    ]
+
+
+PAST_EDGE = 1.25
+"""Outer edge of such a field, in units of that of the first."""
+
+
 def _score(result: SearchResult, options: SearchOptions) -> float:
     """−2 ln L of a search with stated errors, with the noise that its best fit leaves."""
     likelihood, apart = result.likelihood, options.file_noise is not False
@@ -252,6 +276,27 @@ def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihoo
     return (likelihood, free) if found.chi2_binary > least else (point, found)
 
 
+def _with_disc_of_star(
+    likelihood: Likelihood, point: SearchResult
+) -> tuple[Likelihood, SearchResult]:
+    """Take a disc of the star in where closure phases alone show one, beside a sure companion.
+
+    They tell nothing of a star alone, but how far it is resolved decides how much a companion
+    turns them: that of two bright, resolved stars would be rejected.
+    """
+    if likelihood.observables.n_vis2 or point.delta_chi2 < SURELY_NOT_NOISE:
+        return likelihood, point
+    disc = likelihood.with_model(replace(likelihood.model, diameter_mas="free"))
+    found = search(disc, (point.grid.inner_mas, point.grid.outer_mas), check=False)
+    sure = _surely_better(likelihood.n_independent, point.chi2_binary, found.chi2_binary)
+    return (disc, found) if sure else (likelihood, point)
+
+
+def _surely_better(n: int, point: float, disc: float) -> bool:
+    """Whether a disc lowers χ² for certain, with the stated errors and with their scale free."""
+    return bool(min(point - disc, n * np.log(point / disc)) > SURELY_A_DISC)
+
+
 LIKELY_DISC_MAS = 4.0
 """Five of six stars are smaller by the prior, half-Cauchy with 1 mas."""
 
@@ -271,9 +316,8 @@ def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
     point = refine(likelihood, result.theta, box, 0.0)
     larger = refine(disc, with_disc(disc, np.array(point.theta), box), box, 0.0)
     fits = (likelihood, point), (disc, larger)
-    chi2 = [float(model.chi2(np.array(fit.theta))[0]) for model, fit in fits]
-    scaled = likelihood.n_independent * np.log(chi2[0] / chi2[1])
-    return bool(min(chi2[0] - chi2[1], scaled) > SURELY_A_DISC)
+    chi2 = (float(model.chi2(np.array(fit.theta))[0]) for model, fit in fits)
+    return _surely_better(likelihood.n_independent, *chi2)
 
 
 def _search_for_disc(
@@ -306,13 +350,6 @@ def _searched(first: SearchResult, options: SearchOptions) -> tuple[SearchResult
     return with_global_check(first), ExtraNoise()
 
 
-def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
-    """Prior of extra noise; of width 0 where the stated errors count as right."""
-    vis2, degrees = options.noise_prior if options.extra_noise else (0.0, 0.0)
-    floors = systematics_of(observables, options.systematics)
-    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise, floors)
-
-
 def _beyond(result: SearchResult) -> list[str]:
     """Warn where a field that was asked for seems to leave the companion out."""
     found, grid = [], result.grid
@@ -322,48 +359,10 @@ def _beyond(result: SearchResult) -> list[str]:
             "star, a companion fits as well or better, and this may be an alias of it"
         )
     rho = result.companion.separation_mas
-    on_outer_edge = rho > grid.outer_mas - 0.25 * grid.step_mas
-    if on_inner_edge(result) or (on_outer_edge and result.delta_chi2 > SURELY_NOT_NOISE):
+    at_the_edge = rho > grid.outer_mas - 0.25 * grid.step_mas
+    if on_inner_edge(result) or (at_the_edge and result.delta_chi2 > SURELY_NOT_NOISE):
         found.append(
             f"the best fit lies at {rho:.4g} mas, on the edge of the field that was asked for: "
             "the companion may be outside it"
         )
     return found
-
-
-def past_first_null(likelihood: Likelihood) -> bool:
-    """Whether the star is so large that the longest baseline is past the null of its V².
-
-    There a uniform disc misses the height of the lobes, which limb darkening lowers, by more
-    than what a faint companion does; before the null a larger disc looks the same.
-    """
-    if not likelihood.observables.n_vis2:
-        return False
-    disc = likelihood.with_model(BinaryModel(1, "free"))
-    (diameter,), _ = fit_single(disc)
-    return bool(np.pi * diameter * MAS * likelihood.samples.frequency.max() > FIRST_NULL)
-
-
-FIRST_NULL = 3.83
-"""First zero of J₁."""
-
-
-def model_of(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
-    """Make the model of one companion that the options ask for."""
-    diameter, disc = options.diameter, options.companion_diameter
-    coloured = options.contrast_slope != 0.0
-    if diameter is None:
-        diameter = "free" if likelihood.observables.n_vis2 else 0.0
-    darkening = options.limb_darkening
-    if darkening is None:
-        darkening = "free" if diameter == "free" and past_first_null(likelihood) else 0.0
-    return BinaryModel(
-        1,
-        diameter,
-        options.background,
-        options.smearing,
-        limb_darkening=darkening,
-        companion_diameter_mas=0.0 if disc is None else disc,
-        contrast_slope=options.contrast_slope,
-        reference_wavelength_m=reference_wavelength(likelihood.observables) if coloured else 0.0,
-    )

@@ -15,8 +15,8 @@ from amibayes.comparison.limits import LimitsBeside, limits_beside, searchable
 from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.chi2 import REJECTED
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.pipeline.field import FieldSearch, noise_prior
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import FieldSearch
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Run
 from amibayes.posterior.priors import Prior

@@ -9,8 +9,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from amibayes.companion_search.optimise import fit_single
 from amibayes.comparison.hypotheses import split_settings
+from amibayes.data.observables import Observables
+from amibayes.data.systematics import systematics_of
 from amibayes.extraction.reading import ImageOptions
+from amibayes.likelihood.extra_noise import NoisePrior
+from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.bands import reference_wavelength
+from amibayes.models.binary import BinaryModel
 from amibayes.posterior.priors import PriorSetting
 from amibayes.support.arguments import annulus, checks_arguments, in_range, one_of
 from amibayes.support.options import (
@@ -26,6 +33,7 @@ from amibayes.support.options import (
     ClosureCovariance,
     ContrastSharing,
 )
+from amibayes.units import MAS
 
 RANGES = {
     "diameter": (0.0, np.inf), "limb_darkening": (0.0, np.inf), "clip": (0.0, np.inf),
@@ -200,3 +208,48 @@ class SearchOptions:
     def to_json(self) -> dict[str, Any]:
         """All of them in JSON's types, as ``result.json`` keeps them."""
         return dict(json.loads(json.dumps(asdict(self), default=str)))
+
+
+def noise_prior(observables: Observables, options: SearchOptions) -> NoisePrior:
+    """Prior of extra noise; of width 0 where the stated errors count as right."""
+    vis2, degrees = options.noise_prior if options.extra_noise else (0.0, 0.0)
+    floors = systematics_of(observables, options.systematics)
+    return NoisePrior(vis2, float(np.radians(degrees)), options.channel_noise, floors)
+
+
+def past_first_null(likelihood: Likelihood) -> bool:
+    """Whether the star is so large that the longest baseline is past the null of its V².
+
+    There a uniform disc misses the height of the lobes, which limb darkening lowers, by more
+    than what a faint companion does; before the null a larger disc looks the same.
+    """
+    if not likelihood.observables.n_vis2:
+        return False
+    disc = likelihood.with_model(BinaryModel(1, "free"))
+    (diameter,), _ = fit_single(disc)
+    return bool(np.pi * diameter * MAS * likelihood.samples.frequency.max() > FIRST_NULL)
+
+
+FIRST_NULL = 3.83
+"""First zero of J₁."""
+
+
+def model_of(likelihood: Likelihood, options: SearchOptions) -> BinaryModel:
+    """Make the model of one companion that the options ask for."""
+    diameter, disc = options.diameter, options.companion_diameter
+    coloured = options.contrast_slope != 0.0
+    if diameter is None:
+        diameter = "free" if likelihood.observables.n_vis2 else 0.0
+    darkening = options.limb_darkening
+    if darkening is None:
+        darkening = "free" if diameter == "free" and past_first_null(likelihood) else 0.0
+    return BinaryModel(
+        1,
+        diameter,
+        options.background,
+        options.smearing,
+        limb_darkening=darkening,
+        companion_diameter_mas=0.0 if disc is None else disc,
+        contrast_slope=options.contrast_slope,
+        reference_wavelength_m=reference_wavelength(likelihood.observables) if coloured else 0.0,
+    )

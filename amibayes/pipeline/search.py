@@ -24,13 +24,13 @@ from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.parallel import Executor, Journals, Progress
 from amibayes.pipeline.false_alarm import false_alarm, second_false_alarm, verdict_of
-from amibayes.pipeline.field import FieldSearch, noise_prior, search_field
+from amibayes.pipeline.field import FieldSearch, search_field
 from amibayes.pipeline.models import (
     compare_stage,
     limits_stage,
     with_models,
 )
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.pipeline.prepare import Prepared, prepare
 from amibayes.pipeline.report_types import SearchReport
 from amibayes.pipeline.run import Announce, Run, silent

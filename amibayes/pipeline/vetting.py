@@ -26,8 +26,8 @@ from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import systematics_of
 from amibayes.detection.false_alarm import Significance, beside_bright, significance
+from amibayes.detection.ratio import Ratio
 from amibayes.detection.statistic import statistic_of
-from amibayes.detection.treatments import Ratio
 from amibayes.detection.verdict import change_by_companion, within_calibration
 from amibayes.errors import DataError
 from amibayes.likelihood.channel_noise import noise_with_channels

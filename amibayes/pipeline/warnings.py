@@ -12,8 +12,8 @@ from amibayes.companion_search.result import SearchResult
 from amibayes.data.observables import Observables
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
+from amibayes.detection.residuals import correlated
 from amibayes.detection.splits import Consistency
-from amibayes.detection.whiteness import correlated
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes
 from amibayes.posterior.ensemble import Posterior

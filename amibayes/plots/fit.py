@@ -13,7 +13,7 @@ from matplotlib.ticker import NullFormatter, NullLocator, ScalarFormatter
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.measurements import Measurements
-from amibayes.detection.residuals_by_file import FileResiduals
+from amibayes.detection.residuals import FileResiduals
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.plots.style import (
     BLACK,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.comparison.compare import ModelComparison
-from amibayes.detection.residuals_by_file import file_residuals
+from amibayes.detection.residuals import file_residuals
 from amibayes.parallel import Executor, SerialExecutor
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import SearchReport, Stages, calibrator_verdicts

@@ -100,8 +100,6 @@ def bootstrap(
         Where there are fewer than `MIN_EXPOSURES` exposures.
     """
     likelihood = result.likelihood
-    if result.robustness is not None:  # the covariance of its data holds all of that
-        noise = ExtraNoise()
     label = exposures_of(likelihood.observables)
     n_exposures = int(label.max()) + 1
     if n_exposures < MIN_EXPOSURES:

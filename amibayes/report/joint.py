@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from amibayes.companion_search.result import SearchResult
-from amibayes.detection.residuals_by_file import FileResiduals, file_residuals
+from amibayes.detection.residuals import FileResiduals, file_residuals
 from amibayes.likelihood.extra_noise import FileNoise
 from amibayes.likelihood.residuals import files_of
 from amibayes.models.bands import bands_of

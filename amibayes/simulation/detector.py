@@ -128,10 +128,6 @@ class Detector:
         """Number of reads of a ramp of ``n_groups``."""
         return n_groups + int(self.zero_read)
 
-    def ipc_kernel(self) -> FloatArray:
-        """(3, 3) kernel of the inter-pixel capacitance; its sum is one."""
-        return neighbour_kernel(self.interpixel_capacitance)
-
 
 LARGEST = {
     "flat_error": 0.3,
@@ -184,13 +180,6 @@ def detector_preset(name: str, changes: Mapping[str, Any] | None = None) -> Dete
         if key not in known:
             raise UsageError(f"a detector has no '{key}'")
     return replace(PRESETS[name], **(changes or {}))
-
-
-def neighbour_kernel(fraction: float) -> FloatArray:
-    """(3, 3) kernel that gives ``fraction`` to each of the four neighbours."""
-    kernel = np.array([[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]]) * fraction
-    kernel[1, 1] += 1.0
-    return kernel
 
 
 @dataclass(frozen=True, eq=False)

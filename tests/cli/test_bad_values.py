@@ -27,7 +27,7 @@ from amibayes.posterior.priors import Prior
 from amibayes.scene.file import read_image
 from amibayes.scene.sources import SkyImage
 from amibayes.scene.spectrum import Blackbody, Tabulated, read_spectrum
-from amibayes.simulation.detector import Detector, neighbour_kernel
+from amibayes.simulation.detector import Detector
 from amibayes.simulation.wavefront import WavefrontErrors
 from amibayes.support.toml import read_toml
 
@@ -172,14 +172,6 @@ def test_files_that_are_no_spectrum_and_no_image(tmp_path: Path) -> None:
     HandMade(np.random.default_rng(1)).write(tmp_path / "tables.fits")
     with pytest.raises(DataError, match="holds no image"):
         read_image(tmp_path / "tables.fits")
-
-
-def test_neighbours_get_their_share_and_nothing_is_lost() -> None:
-    kernel = neighbour_kernel(0.01)
-    assert kernel.sum() == pytest.approx(1.0, abs=1e-15)
-    assert kernel[1, 1] == pytest.approx(0.96)
-    assert kernel[0].tolist() == [0.0, 0.01, 0.0]
-    np.testing.assert_array_equal(Detector().ipc_kernel(), [[0, 0, 0], [0, 1, 0], [0, 0, 0]])
 
 
 def test_a_prior_says_what_it_is() -> None:

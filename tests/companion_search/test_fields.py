@@ -165,8 +165,7 @@ def test_a_look_inside_has_a_bounded_number_of_places(looked: SimpleNamespace) -
     [
         ({"delta_chi2": 19.9}, 1e3, 1e3, False),
         ({"delta_chi2": 20.0}, 1e3, 1e3, True),
-        ({"delta_chi2": 1000.0}, 1e3, 1e3, True),
-        ({"delta_chi2": 1000.1}, 1e3, 1e3, False),
+        ({"delta_chi2": 1e5}, 1e3, 1e3, True),
         ({}, 70.9, 1e3, False),  # 0.8 · 100 − 9
         ({}, 71.1, 1e3, True),
         ({}, 1e3, 90.9, False),  # the fit of 100, less 9

@@ -26,7 +26,7 @@ from amibayes.data.covariance import dense_covariance, diagonal_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables, join
 from amibayes.data.off_axis_response import OffAxisResponse
-from amibayes.detection.residuals_by_file import file_residuals
+from amibayes.detection.residuals import file_residuals
 from amibayes.detection.rotations import Rotations
 from amibayes.detection.statistic import make_statistic
 from amibayes.errors import DataError, UsageError

@@ -8,8 +8,8 @@ from helpers import niriss, simulated
 
 from amibayes.comparison.best_fits import NoiseSetting
 from amibayes.comparison.compare import Compared, compare_sky_models
-from amibayes.pipeline.field import noise_prior, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.posterior.nested import NestedSampler
 from amibayes.posterior.priors import default_prior
 from amibayes.posterior.sampler import draw_posterior, log_mean

@@ -37,8 +37,20 @@ def test_an_equal_binary_is_detected(place: tuple[float, float], rng) -> None:
     else:
         assert found.bright == found.probability < 1e-6
         assert found.threshold() == drawn.threshold()
-    # With noise beside the stated errors the companion does not explain the data.
-    assert beside_bright(drawn, result, ExtraNoise(vis2=0.01)) is drawn
+
+
+def test_noise_beside_the_errors_is_no_reason_to_deny_an_equal_binary(rng) -> None:
+    """Errors that are a little too small, while the companion explains nearly all of the data."""
+    result = search(Likelihood(simulated(niriss(), (6.8, -129.8, 0.9), rng)), FIELD)
+    drawn = significance(statistic_of(result), DRAWS, rng)
+    blind = replace(drawn, probability=0.5, interval=(0.48, 0.52), tail=None)
+    added = ExtraNoise(vis2=0.001)
+    assert blind.detected is False
+    assert beside_bright(blind, result, added).detected
+    # A twentieth of the squared residuals, that noise is taken for, is another matter.
+    worse = replace(result, chi2_binary=0.05 * result.chi2_single)
+    assert beside_bright(blind, worse, added) is blind
+    assert beside_bright(blind, worse, ExtraNoise()).detected
 
 
 def test_noise_of_any_size_never_looks_like_a_bright_companion(rng) -> None:
@@ -61,9 +73,13 @@ def test_the_smaller_of_two_probabilities_counts_twice(
 ) -> None:
     tested = Significance(1.0, np.arange(10_000.0), p, (0.2, 0.4), None, 0.0013)
     monkeypatch.setattr("amibayes.detection.false_alarm.bright_probability", lambda *_: bound)
-    found = beside_bright(tested, None, ExtraNoise())  # type: ignore[arg-type]
+    partly, nearly = (SimpleNamespace(chi2_single=1.0, chi2_binary=left) for left in (0.2, 0.001))
+    found = beside_bright(tested, partly, ExtraNoise())  # type: ignore[arg-type]
     for noise in (ExtraNoise(vis2=0.01), ExtraNoise(closure_phase_rad=0.01)):
-        assert beside_bright(tested, None, noise) is tested  # type: ignore[arg-type]
+        # Beside noise that was added the companion has to explain more.
+        assert beside_bright(tested, partly, noise) is tested  # type: ignore[arg-type]
+        beside = beside_bright(tested, nearly, noise)  # type: ignore[arg-type]
+        assert beside.probability == found.probability
     if stated is None:
         assert found is tested
     else:

@@ -44,7 +44,8 @@ from amibayes.detection.false_alarm import (
 )
 from amibayes.detection.outlying_rows import may_be_left_out, outlying_rows, without_rows
 from amibayes.detection.randomised import randomisation_of, randomised
-from amibayes.detection.residuals_by_file import file_residuals
+from amibayes.detection.ratio import Ratio
+from amibayes.detection.residuals import channel_correlation, file_residuals
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.detection.tails import (
@@ -54,10 +55,10 @@ from amibayes.detection.tails import (
     pareto_survival,
     tail_of,
 )
-from amibayes.detection.treatments import FreeScale, Ratio, drawn_scale
-from amibayes.detection.verdict import change_by_companion, fit_probability, verdict
-from amibayes.detection.whiteness import channel_correlation
+from amibayes.detection.treatments import FreeScale, drawn_scale
+from amibayes.detection.verdict import change_by_companion, joint_probability, parts_of_fit, verdict
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import noise_of
 from amibayes.likelihood.student import StudentNoise, symmetric_whitening
 from amibayes.models.binary import BinaryModel
 
@@ -115,7 +116,7 @@ def test_statistics(result: SearchResult, num_regression) -> None:
     one = estimated.observables.unflagged()
     whole = Likelihood(replace(one, freedom=Freedom(30.0, 29.0)))
     base = likelihood.observables
-    student = StudentNoise(likelihood.noise, base.covariance, symmetric_whitening(base))
+    student = StudentNoise(likelihood.noise, noise_of(base), symmetric_whitening(base))
     disc = Likelihood(simulated(niriss(), TRUTH, np.random.default_rng(2)), DISC)
     exposures = _drifting()
     lasting = exposure_noise(exposures, none)
@@ -233,7 +234,10 @@ def test_agreement_of_the_parts(result: SearchResult, num_regression) -> None:
         star=star,
         calibrators=calibrators,
         files=file_residuals(result),
-        probability=[fit_probability(result, s) for s in (0.0, 0.1)],
+        probability=[
+            joint_probability(parts_of_fit(result.likelihood, result.theta, result.ndof, s))
+            for s in (0.0, 0.1)
+        ],
         verdicts=[(names.index(v.statement), v.p_model) for v in verdicts],
         change=change_by_companion(result),
         white=channel_correlation(search(Likelihood(_channels()), (3.0, 6.0), check=False)),

@@ -14,8 +14,9 @@ from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.search import search
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
+from amibayes.detection.ratio import Ratio
 from amibayes.detection.statistic import BankStatistic, make_statistic, statistic_of
-from amibayes.detection.treatments import FreeScale, Ratio, drawn_scale
+from amibayes.detection.treatments import FreeScale, drawn_scale
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import symmetric_whitening
 from amibayes.limits.injection import recover

@@ -27,7 +27,8 @@ from amibayes.detection.verdict import (
     WITHIN,
     Verdict,
     change_by_companion,
-    fit_probability,
+    joint_probability,
+    parts_of_fit,
     star_alone,
     verdict,
     within_calibration,
@@ -35,8 +36,8 @@ from amibayes.detection.verdict import (
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
-from amibayes.pipeline.field import noise_prior, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.units import MAS, offset
 
 Visibility = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -265,16 +266,15 @@ def test_noise_of_another_shape_may_change_chi2_by_a_tenth(
 ) -> None:
     """4200 V²: a χ² too large by 10 % is 4.6 standard deviations, and no noise is known so well."""
     one = niriss().only(("vis2",))
-    small = search(Likelihood(one, BinaryModel()), (100.0, 120.0))
     data = join([one] * 200)
     z = np.random.default_rng(5).standard_normal(len(data.vis2))
     z *= np.sqrt(excess * len(z)) / np.linalg.norm(z)
     noisy = replace(data.vis2, value=1.0 + z * np.sqrt(data.covariance.variance))
     likelihood = Likelihood(replace(data, vis2=noisy), BinaryModel())
-    result = replace(small, likelihood=likelihood, theta=np.zeros(3), ndof=len(z))
-    assert low <= fit_probability(result, shape=SHAPE) <= high
+    fit = likelihood, np.zeros(3), len(z)
+    assert low <= joint_probability(parts_of_fit(*fit, shape=SHAPE)) <= high
     exact = chi2.sf(excess * len(z), len(z))
-    assert fit_probability(result) == pytest.approx(exact, rel=1e-6)
+    assert joint_probability(parts_of_fit(*fit)) == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.release

@@ -146,7 +146,7 @@ def profile_of(covariance, scope, bank, residuals, free, channels) -> Likelihood
     theta, shares = theta_of(stated), ExtraNoise(channels=shares_of(channels))
     if residuals == "student":
         work = RobustFits(with_shared(stated, shares), FIELD, free, per_file=per_file)
-        return work.weighted(work.steps(theta, Box(*FIELD, 188.0))[0])
+        return work.stretched(work.steps(theta, Box(*FIELD, 188.0))[0])
     noise = fit_noise(stated, theta, per_file=per_file) if free else shares
     return with_noise(stated, replace(noise, channels=shares.channels))
 
@@ -166,8 +166,10 @@ def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
     fits = [(profile, theta), (single_likelihood(profile), np.empty(0))]
     shares = shares_of(asked.channels)
     if asked.residuals == "student":
-        held = with_shared(stated, ExtraNoise(channels=shares)).observables
-        noise = averaged_student_noise(profile.noise, held, fits, per_file=per_file)
+        held = with_shared(stated, ExtraNoise(channels=shares)).noise.covariance
+        noise = averaged_student_noise(
+            profile.noise, stated.observables, fits, covariance=held, per_file=per_file
+        )
     else:
         noise = averaged_noise(
             profile.noise, stated.observables, fits, per_file=per_file, channels=shares

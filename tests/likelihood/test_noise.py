@@ -13,8 +13,8 @@ from scipy import stats
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import join
+from amibayes.detection.ratio import Ratio
 from amibayes.detection.statistic import make_statistic, statistic_of
-from amibayes.detection.treatments import Ratio
 from amibayes.likelihood.channel_noise import Correlation
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood

@@ -117,7 +117,6 @@ def of_noise(likelihood: Likelihood, theta: np.ndarray) -> dict[str, Any]:
         "log_loss": noise.log_loss(gains),
         "norm": noise.log_norm,
         "n": noise.n_independent,
-        "scores": np.sort((noise.scores(white) ** 2).sum(axis=0)),
         "variance": noise.covariance.variance,
         "errors": likelihood.errors(theta),
         "gradient": likelihood.log_prob_and_gradient(sets),
@@ -273,7 +272,7 @@ def test_robust_residuals(num_regression) -> None:
                 f"terms {scope}": [(t.share, t.log_det) for t in student_terms(data)],
             }
         )
-    robust = Robustness(base, data, weights, standard[:, 0])
+    robust = Robustness(base, data, data.covariance, weights, standard[:, 0])
     numbers |= numbers_of(
         share=symmetric.share,
         standard=standard,
@@ -281,7 +280,7 @@ def test_robust_residuals(num_regression) -> None:
         weights=weights,
         variance=base.covariance.variance,
         chi2=Likelihood(base).chi2(THETA),
-        scores=(scores(symmetric, likelihood.residuals(THETA)) ** 2).sum(),
+        scores=(scores(symmetric, likelihood.residuals(THETA))[0] ** 2).sum(),
         moments=normal_moments(),
         outliers=robust.outliers,
     )

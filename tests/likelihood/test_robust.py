@@ -18,10 +18,12 @@ from amibayes.companion_search.search import search
 from amibayes.data.covariance import dense_covariance
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.detection.statistic import make_statistic
+from amibayes.detection.treatments import KnownErrors
 from amibayes.errors import UsageError
 from amibayes.likelihood.averaged_noise import AveragedNoise, averaged_noise
 from amibayes.likelihood.extra_noise import add_noise
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise import noise_of
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.noise_terms import with_nodes
 from amibayes.likelihood.student import (
@@ -84,6 +86,7 @@ def test_moments_are_integrals_over_the_normal_distribution() -> None:
     assert found.curvature == pytest.approx(mean(lambda z: z * psi(z)), rel=1e-5)
     assert found.power == pytest.approx(found.curvature / scatter, rel=1e-5)
     assert found.efficiency == pytest.approx(0.926, abs=1e-3)
+    assert found.score_variance == pytest.approx(mean(lambda z: (0.8 * psi(z)) ** 2), rel=1e-5)
 
 
 def test_t_likelihood_of_independent_data_is_scipys(rng) -> None:
@@ -147,8 +150,30 @@ def test_statistic_does_not_depend_on_the_scale_and_bounds_one_datum(rng) -> Non
     first = test.evaluate(white)
     again = test.evaluate(7.0 * white)
     np.testing.assert_allclose(again, first, rtol=1e-4)
-    bounded = scores(frame, np.where(np.arange(bank.n_data)[:, None] == 2, 1e3, white))
+    bounded, _ = scores(frame, np.where(np.arange(bank.n_data)[:, None] == 2, 1e3, white))
     assert np.abs(bounded).max() < 3.0
+
+
+def test_residuals_below_a_floor_of_the_errors_count_by_the_floor(rng) -> None:
+    """They are as small by chance: what they hold is not measured in their own scatter."""
+    data = niriss()
+    grid, frame = make_grid(50.0, 400.0, 30.0), symmetric_whitening(data)
+    floored = Likelihood(data, noise=replace(noise_of(data), floor=True))
+    free, held = (
+        make_statistic(likelihood, grid, np.empty(0), whitening=frame)
+        for likelihood in (Likelihood(data), floored)
+    )
+    white = rng.standard_normal((free.bank.n_data, 400))
+    np.testing.assert_allclose(free.evaluate(0.1 * white), free.evaluate(white), rtol=1e-3)
+    # Small scores are the residuals themselves: n ln(1 − gain/χ²), its gain a thousandth.
+    small = held.evaluate(0.03 * white)
+    gain = KnownErrors().search(held.bank, held.bank.project(0.03 * white)).gain
+    n = held.bank.n_data - held.bank.n_nuisance
+    share = gain / (n * normal_moments().score_variance)
+    expected = -n * np.log1p(-share)
+    np.testing.assert_allclose(small, expected, rtol=0.01, atol=0.01 * expected.max())
+    # Larger ones than the floor count by their own scatter.
+    np.testing.assert_allclose(held.evaluate(5.0 * white), free.evaluate(white), rtol=1e-3)
 
 
 def efficiency_and_coverage(share, n, seed):
@@ -179,7 +204,7 @@ def weighted_fit(stated, theta, box):
     """The robust fit near one place, and its averaged likelihood."""
     work = RobustFits(stated, FIELD, free_scale=True)
     stretch, found = work.steps(theta, box)
-    profile = work.weighted(stretch)
+    profile = work.stretched(stretch)
     left = stated.difference(found)[:, 0]
     terms = tuple(with_nodes(t, [left]) for t in student_terms(stated.observables))
     return found, profile.with_noise(AveragedNoise(profile.noise, terms))

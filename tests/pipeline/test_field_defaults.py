@@ -12,8 +12,8 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
-from amibayes.pipeline.field import model_of, search_field
-from amibayes.pipeline.options import SearchOptions
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, model_of
 from amibayes.units import MAS
 
 STATIONS = np.array([[0.0, 0.0], [30.0, 10.0], [-20.0, 45.0], [60.0, -30.0]])
@@ -126,6 +126,28 @@ def test_a_bright_disc_outside_the_default_field_is_found(rng) -> None:
     companion = found.result.companion
     np.testing.assert_allclose([companion.east_mas, companion.north_mas], [3.0, -6.0], atol=0.05)
     assert companion.contrast == pytest.approx(0.5, abs=0.03)
+
+
+@pytest.mark.parametrize(("diameter", "resolved"), [(2.2, True), (0.3, False)])
+def test_closure_phases_alone_show_the_disc_of_a_star_beside_a_companion(
+    diameter, resolved, rng
+) -> None:
+    """λ/B is 3.1 mas: as points, two stars of 2.2 and 0.5 mas have another flux ratio."""
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (9.0 * u + 5.0 * v))
+        star, other = (darkened_disc(d, 0.0, u, v) for d in (diameter, 0.5))
+        return (star + 0.15 * fringe * other) / 1.15
+
+    data = observed(four_telescopes(6), binary, rng).only(["cp"])
+    result = search_field(data, SearchOptions()).result
+    assert ("diameter_mas" in result.likelihood.parameters.names) is resolved
+    companion = result.companion
+    assert abs(companion.contrast - 0.15) < 5.0 * companion.contrast_error
+    if resolved:
+        at = result.likelihood.parameters.names.index("diameter_mas")
+        error = np.sqrt(result.theta_covariance[at, at])
+        assert abs(result.theta[at] - diameter) < 5.0 * error < 1.0
 
 
 def test_baselines_without_length_are_refused_by_their_columns() -> None:

@@ -27,7 +27,7 @@ from amibayes.simulation.budget import (
     star_channels,
     sun_like,
 )
-from amibayes.simulation.detector import Detector, detector_preset, draw_maps, neighbour_kernel
+from amibayes.simulation.detector import Detector, detector_preset, draw_maps
 from amibayes.simulation.exposure import Exposure, draw_pointings
 from amibayes.simulation.observation import Observation, star_rate
 from amibayes.simulation.observe import prepare_exposure, simulate
@@ -123,8 +123,6 @@ def test_ramps_are_those_recorded(num_regression) -> None:
         linearised=linearised(charge, detector),
         coefficients=linearity_coefficients(detector, (3, 2)),
         neighbours=to_neighbours(rate, 0.01),
-        kernel=neighbour_kernel(0.02),
-        ipc=detector.ipc_kernel(),
         reads=[detector.n_reads(n) for n in (2, 5)],
         noise=detector.single_read_noise_e,
         weights=slope_weights(rate, 6, detector),

@@ -7,7 +7,7 @@ import pytest
 from helpers import niriss, simulated
 
 from amibayes.companion_search.search import search
-from amibayes.detection.whiteness import channel_correlation
+from amibayes.detection.residuals import channel_correlation
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.warnings import search_warnings
