@@ -103,8 +103,10 @@ WHOLE = (1, 10**6)
 
 
 def _sites(node: ast.AST, lines: tuple[int, int] = WHOLE) -> Iterator[_Site]:
+    if isinstance(node, ast.Raise | ast.JoinedStr) or _is_strict(node):
+        return
     for name, value in ast.iter_fields(node):
-        if name in PASSED_OVER or isinstance(node, ast.Raise | ast.JoinedStr):
+        if name in PASSED_OVER:
             continue
         for k, child in enumerate(value if isinstance(value, list) else [value]):
             if not isinstance(child, ast.AST) or _is_text(child):
@@ -130,6 +132,11 @@ def _span(node: ast.stmt, around: tuple[int, int]) -> tuple[int, int]:
     if around == WHOLE:
         return WHOLE
     return (node.lineno, max(node.lineno, body[0].lineno - 1)) if body else (node.lineno, last)
+
+
+def _is_strict(node: ast.AST) -> bool:
+    """The ``strict`` of `zip`, which matters only where the code is wrong already."""
+    return isinstance(node, ast.keyword) and node.arg == "strict"
 
 
 def _is_text(node: ast.AST) -> bool:

@@ -40,6 +40,9 @@ NUMERICAL = (
     *("imaging", "kpfits", "likelihood", "limits", "models", "oifits", "optics", "posterior"),
     *("ramps", "scene", "simulation", "survey"),
 )
+OTHERS = ("cli", "instrument", "parallel", "pipeline", "plots", "report", "support", "validation")
+"""Folders of tests that run these packages too."""
+
 BUDGET = 25.0
 """Seconds of a processor that the nearest tests of one change may take, unchanged."""
 
@@ -51,6 +54,10 @@ LIBRARIES = (
 
 PATIENCE = 3.0
 """A change that makes its tests this many times slower, and half a minute, counts as noticed."""
+
+
+NOTICED_BY = "noticed_by"
+"""A file of a copy of the checkout."""
 
 
 # As a plugin of pytest, under `coverage run`: which test runs which line, and how long it takes.
@@ -115,12 +122,12 @@ class Work:
 
 
 def make_map(work: Work) -> None:
-    """Run the default suite of the numerical packages' own folders under coverage."""
+    """Run the default suite under coverage, without what looks at the code and not at numbers."""
     folder = work.copied("0")
     command = [
         *(sys.executable, "-m", "coverage", "run", "--rcfile=/dev/null", "--source=amibayes"),
         *(f"--data-file={work.cover}", "-m", "pytest", "-q", "-p", "no:cacheprovider"),
-        *("-p", "mutation_check", *(f"tests/{name}" for name in NUMERICAL)),
+        *("-p", "mutation_check", *(f"tests/{name}" for name in NUMERICAL + OTHERS)),
     ]
     environment = _environment(folder) | {"TEST_SECONDS": str(work.seconds)}
     subprocess.run(command, cwd=folder, env=environment, check=False)
@@ -156,6 +163,17 @@ class Nearest:
         return [t for k, t in enumerate(order) if k == 0 or total[k] <= BUDGET]
 
 
+class Noticed:
+    """A plugin of pytest that writes which test fails, into a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.path.write_text(report.nodeid, encoding="utf-8")
+
+
 def passes(folder: Path, tests: list[str], seconds: float) -> bool:
     """Whether the tests pass in a copy of the checkout, in a time of a processor.
 
@@ -180,7 +198,8 @@ def _child(folder: Path, tests: list[str], limit: int) -> None:
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
         os.dup2(nowhere.fileno(), 2)
-        os._exit(int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests])))
+        options = ["-q", "-x", "-p", "no:cacheprovider"]
+        os._exit(int(pytest.main([*options, *tests], [Noticed(folder / NOTICED_BY)])))
 
 
 def _load_libraries() -> None:
@@ -195,10 +214,13 @@ def tried(
     folder = folders.get()
     target = folder / mutant.path
     original = target.read_text(encoding="utf-8")
-    start = time.monotonic()
+    start, by = time.monotonic(), ""
+    (folder / NOTICED_BY).unlink(missing_ok=True)
     try:
         target.write_text(mutated(original, mutant.number), encoding="utf-8")
         alive = not tests or passes(folder, tests, seconds)
+        if (folder / NOTICED_BY).is_file():
+            by = (folder / NOTICED_BY).read_text(encoding="utf-8")
     finally:
         target.write_text(original, encoding="utf-8")
         folders.put(folder)
@@ -206,7 +228,7 @@ def tried(
         {
             **{"key": _key(mutant), "kind": mutant.kind, "before": mutant.before},
             **{"after": mutant.after, "outcome": "survived" if alive else "killed"},
-            **{"tests": len(tests), "seconds": round(time.monotonic() - start, 1)},
+            **{"tests": len(tests), "seconds": round(time.monotonic() - start, 1), "by": by},
         }
     )
 

@@ -95,7 +95,7 @@ class RampFile:
         """Fit the slopes of the integrations from ``start`` up to ``stop``."""
         return self.read_with_time(start, stop)[0]
 
-    def read_with_time(self, start: int = 0, stop: int | None = None) -> tuple[Cube, FloatArray]:
+    def read_with_time(self, start: int, stop: int | None) -> tuple[Cube, FloatArray]:
         """As `read`, and the mean time (n, ny, nx) from the reset that each slope is of, s."""
         part = slice(start, self.n_integrations if stop is None else stop)
         if part.start >= part.stop:

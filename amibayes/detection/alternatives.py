@@ -44,6 +44,10 @@ OVAL_SIZES, OVAL_ANGLES, OVAL_AXES = 32, 12, np.log([0.5, 0.65, 0.8, 0.92])
 OVAL_FITS = 6
 """Sizes, angles and ratios of the axes that are tried, and fits that are finished."""
 
+DISC_FLUXES, DISC_SIZES, DISC_AXES = (0.03, 0.1, 0.3, 1.0), 8, (0.3, 0.6, 1.0)
+DISC_ANGLES = 6
+"""Fluxes, sizes, ratios of the axes and angles of light around the star that are tried."""
+
 EDGE = 1e-6
 """How far inside of its bounds a fit begins."""
 
@@ -90,7 +94,7 @@ def alternative(result: SearchResult) -> Alternative | None:
     star = _chromatic_star(likelihood, result)
     if star is not None and star.chi2 <= most:
         return star
-    others = (_extended_light(likelihood), _elongated_star(likelihood, result))
+    others = (_extended_light(likelihood, result), _elongated_star(likelihood, result))
     best = min(others, key=lambda other: other.chi2)
     return best if best.chi2 <= most else None
 
@@ -201,13 +205,29 @@ def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative
     return Alternative("elongated star", 2.0 * float(fit.cost) + max(more, 0), words)
 
 
-def _extended_light(likelihood: Likelihood) -> Alternative:
+def _disc_like_the_data(wide: Likelihood, result: SearchResult, disc: Extended) -> FloatArray:
+    """Best of some discs (n_dim,), around the star of the search, from which a fit begins.
+
+    Those that a fit of its own starts from may be ten times as bright as the star: the best of
+    them are of a minimum in which the star is a faint part of its disc.
+    """
+    names = [p.name for p in disc.parameters]
+    angles = np.linspace(0.0, 180.0, DISC_ANGLES, endpoint=False)
+    sizes = resolution_mas(wide) * np.geomspace(0.25, 4.0, DISC_SIZES)
+    shapes = np.array(list(product(DISC_FLUXES, sizes, DISC_AXES, angles)))
+    tried = np.empty((len(shapes), len(wide.parameters)))
+    for k, name in enumerate(wide.parameters.names):
+        tried[:, k] = shapes[:, names.index(name)] if name in names else result.nuisance(name)
+    return np.asarray(tried[wide.chi2(tried).argmin()])
+
+
+def _extended_light(likelihood: Likelihood, result: SearchResult) -> Alternative:
     """An inclined Gaussian disc around the star."""
     disc = Extended("gaussian", "halo", smearing=likelihood.model.smearing)
     around = (*likelihood.model.surroundings, disc)
     model = replace(likelihood.model, companions=0, surroundings=around)
     wide = likelihood.with_model(model)
-    theta, chi2 = fit_single(wide)
+    theta, chi2 = fit_single(wide, _disc_like_the_data(wide, result, disc))
     found = dict(zip(wide.parameters.names, theta, strict=True))
     size = found[f"halo_{disc.size}"]
     ratio = size / resolution_mas(likelihood)

@@ -164,7 +164,7 @@ class FreeScale(ErrorTreatment):
         groups: ScaleGroups,
         bank: TemplateBank,
         residuals: FloatArray,
-        least: float = 0.0,
+        least: float,
     ) -> Self:
         """Measure the scatter of the groups in whitened residuals (n_data,)."""
         variance = np.maximum(groups.variances(bank.project(residuals)[:, None])[:, 0], least)

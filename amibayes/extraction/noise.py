@@ -18,6 +18,9 @@ from amibayes.units import BoolArray, FloatArray, read_only
 
 _ROUNDS = 4
 
+ROUNDING = 1e-20
+"""Least variance, in units of the square of the brightest pixel: equal images have none."""
+
 RIDGE = 1e-13
 """Added to normal matrices of rows of unit length: no image has to have every kind of slope."""
 
@@ -64,17 +67,18 @@ def noise_model(mean: FloatArray, measured: FloatArray, good: BoolArray) -> Nois
     slope_y, slope_x = np.gradient(np.where(good, mean, 0.0))
     rows = np.stack([np.ones_like(signal), signal, slope_x**2, slope_y**2])[:, good]
     data = measured[good]
-    weight = np.full(len(data), 1.0 / max(float(np.median(data)), 1e-300))
+    least = max(ROUNDING * float(signal.max(initial=0.0)) ** 2, 1e-300)
+    weight = np.full(len(data), 1.0 / max(float(np.median(data)), least))
     found = np.zeros(4)
     for _ in range(_ROUNDS):
         found = _not_negative(rows * weight, data * weight)
         model = found @ rows
         # Every relative deviation counts alike; outliers count for little.
-        level = np.maximum(model, 1e-6 * max(float(model.max()), 1e-300))
+        level = np.maximum(model, max(1e-6 * float(model.max()), least))
         weight = 1.0 / level / np.maximum(1.0, np.abs(data - model) / (4.0 * level))
     constant, per_signal = float(found[0]), float(found[1])
     variance = constant + per_signal * np.maximum(mean, 0.0)
-    floor = max(1e-6 * float(variance.max()), 1e-300)
+    floor = max(1e-6 * float(variance.max()), least)
     return NoiseModel(np.maximum(variance, floor), constant, per_signal)
 
 

@@ -13,6 +13,7 @@ from amibayes.data.closure import kernel_basis
 from amibayes.kpfits.file import KernelFile, open_kpfits
 from amibayes.kpfits.observables import orientations
 from amibayes.oifits.audit.finding import Finding
+from amibayes.units import MAS
 
 STANDARD = ("APERTURE", "UV-PLANE", "KER-MAT", "BLM-MAT", "KP-DATA", "KP-SIGM", "CWAVEL", "DETPA")
 """HDUs that the format wants (Kammerer et al. 2023), whether or not they are needed here."""
@@ -172,7 +173,7 @@ def _window(file: KernelFile) -> Iterator[Finding]:
     if not isinstance(radius, int | float) or not isinstance(scale, int | float) or radius <= 0:
         return
     shortest = float(np.hypot(file.u_m, file.v_m).min())
-    edge = float(file.wavelength_m.max() / shortest / 4.84813681e-9)
+    edge = float(file.wavelength_m.max() / shortest / MAS)
     left = float(np.exp(-((edge / (radius * scale)) ** 4)))
     if left < EDGE:
         yield Finding(

@@ -109,14 +109,22 @@ def orientations(file: KernelFile) -> list[IntArray]:
             groups[-1].append(k)
         else:
             groups.append([k])
-    if len(groups) > 1 and angle[groups[0][0]] + 360.0 - angle[groups[-1][-1]] < 1e-6:
-        groups[0] += groups.pop()
+    if len(groups) > 1:
+        across_north = angle[groups[0][-1]] + 360.0 - angle[groups[-1][0]]
+        if across_north <= SAME_ORIENTATION_DEG:
+            groups[0] += groups.pop()
     return [np.sort(g) for g in groups]
+
+
+def _mean_angle(angle_deg: FloatArray) -> float:
+    """Mean of angles that are near each other, also across north."""
+    first = float(angle_deg[0])
+    return first + float(np.mean((angle_deg - first + 180.0) % 360.0 - 180.0))
 
 
 def _averaged(file: KernelFile, frames: IntArray, independent: bool) -> Observables:
     n, n_channels = len(file.matrix), len(file.wavelength_m)
-    setup = make_setup(file, float(np.mean(file.position_angle_deg[frames])))
+    setup = make_setup(file, _mean_angle(file.position_angle_deg[frames]))
     value = file.value[frames].mean(axis=0)
     basis = kernel_basis(file.matrix)
     found = [_covariance(file, frames, k, basis) for k in range(n_channels)]

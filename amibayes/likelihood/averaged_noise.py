@@ -245,7 +245,7 @@ def _together(covariance: Covariance, extra: csr_array) -> tuple[csr_array, Floa
     """
     if isinstance(covariance, ChannelCovariance):
         white = covariance.base.whitening
-        share = np.asarray((white @ extra).multiply(white).sum(axis=1)).ravel()
+        share = np.asarray((white @ extra).multiply(white).sum(axis=1))
         # A turned row is a mean of channels, and so is its share.
         return covariance.whitening, np.asarray(covariance.rows.rotation.power(2) @ share)
     white = covariance.whitening

@@ -9,7 +9,7 @@ from scipy import optimize, special
 
 from amibayes.units import FloatArray
 
-MAX_STEPS, CONVERGED = 100, 1e-10
+MAX_STEPS, CONVERGED, ROUNDING = 100, 1e-10, 1e-13
 
 
 TYPICAL = np.array([0.0, 6.0, 0.0, 0.0])
@@ -93,14 +93,24 @@ def fit_logistic(x: FloatArray, successes: FloatArray, trials: FloatArray) -> Lo
     precision = np.diag(LOOSENESS**-2.0)
     share = np.clip(successes.sum() / trials.sum(), 0.01, 0.99)
     beta = TYPICAL + np.array([special.logit(share), 0.0, 0.0, 0.0])
+
+    def log_posterior(beta: FloatArray) -> float:
+        logit, off = design @ beta, beta - TYPICAL
+        likelihood = successes @ logit - trials @ np.logaddexp(0.0, logit)
+        return float(likelihood - 0.5 * off @ precision @ off)
+
+    best = log_posterior(beta)
     for _ in range(MAX_STEPS):
         p = special.expit(design @ beta)
         information = (design.T * (trials * p * (1.0 - p))) @ design + precision
         gradient = design.T @ (successes - trials * p) - precision @ (beta - TYPICAL)
         step = np.linalg.solve(information, gradient)
-        # Far from the answer the curvature is that of another place.
-        step *= min(1.0, 3.0 / max(np.abs(step).max(), 1e-300))
-        beta = beta + step
+        # Far from the answer the curvature is that of another place: there is one maximum, and
+        # a step towards it that is short enough gains.
+        least = -ROUNDING * abs(best)
+        while (gain := log_posterior(beta + step) - best) < least:
+            step *= 0.5
+        beta, best = beta + step, best + gain
         if np.abs(step).max() < CONVERGED:
             break
     return Logistic(low, high, beta, np.linalg.inv(information))

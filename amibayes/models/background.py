@@ -21,7 +21,7 @@ class Background:
         In units of the primary's.
     """
 
-    flux: float | Literal["free"] = 0.0
+    flux: float | Literal["free"]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -25,9 +25,9 @@ MAX_SLOPE = 10.0
 
 
 def companion_parameters(
-    k: int = 1,
-    bands: tuple[str, ...] = (),
-    fastest_mas_yr: float = 0.0,
+    k: int,
+    bands: tuple[str, ...],
+    fastest_mas_yr: float,
     shapes: tuple[str, ...] = (),
 ) -> tuple[Parameter, ...]:
     """Parameters of companion ``k``: place, contrasts, rates, shapes.
@@ -268,7 +268,7 @@ def _one_and_square(x: FloatArray) -> FloatArray:
 
 
 def point_slope(
-    samples: UVPoints, east_mas: FloatArray, north_mas: FloatArray, smearing: bool = True
+    samples: UVPoints, east_mas: FloatArray, north_mas: FloatArray, smearing: bool
 ) -> tuple[ComplexArray, ComplexArray]:
     """Visibility of a point and its derivative by the phase angle, (n_samples, n) each."""
     angle = phase_angle(samples, east_mas, north_mas)

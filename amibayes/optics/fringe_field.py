@@ -78,7 +78,7 @@ class FringeField:
 
 
 def fringe_field(
-    instrument: Instrument, channels: Channels, n_pixels: int, *, rotation_rad: float = 0.0
+    instrument: Instrument, channels: Channels, n_pixels: int, *, rotation_rad: float
 ) -> FringeField:
     """Field that serves pixels up to ``n_pixels`` / 2 from the star on every side.
 

@@ -193,7 +193,7 @@ def read_image(path: Path) -> tuple[FloatArray, FloatArray | None]:
     try:
         with fits.open(path, memmap=False) as units:
             for unit in units:
-                if unit.data is not None and getattr(unit, "is_image", False):
+                if unit.data is not None and unit.is_image:
                     pixels = np.squeeze(np.asarray(unit.data, dtype=float))
                     return _two_axes(pixels, path), _header_scale(unit.header)
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from scipy.special import j1
 from scipy.stats import kstest
 
 from amibayes.calibration import Calibration, calibrate
+from amibayes.calibration.calibrate import _covariate
+from amibayes.calibration.diameters import _band_of
 from amibayes.calibration.hierarchical import predictive
 from amibayes.calibration.matching import keys_of, match
 from amibayes.calibration.scatter_likelihood import population_of
@@ -826,3 +829,33 @@ def test_methods_of_extraction_are_named_in_order() -> None:
     calibrator = join([extracted(name, k) for k, name in enumerate(names)])
     with pytest.raises(DataError, match=f"extracted by {', '.join(sorted(names))}, the target"):
         calibrate(extracted("fringes", 99), [calibrator])
+
+
+def test_charge_levels_are_taken_from_the_target_in_units_of_the_largest() -> None:
+    levels, three = (10.0, 10.0, 14.0, 7.0), [None] * 3
+    found = _covariate(levels, three, [0, 1, 2], "hierarchical")  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, [0.0, 1.0, -0.75])
+    found = _covariate((*levels, 99.0), [None] * 4, [2, 1, 0], "hierarchical")  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, [-0.75, 1.0, 0.0])
+    for wrong, method, fault in (
+        (levels[:3], "hierarchical", "3 charge levels for a target and 3 calibrators"),
+        ((1.0, 2.0, 3.0, np.nan), "hierarchical", "charge levels"),
+        ((1.0, 2.0, 2.0, 2.0), "hierarchical", "3 calibrators of different levels"),
+        (levels, "weighted", "for the hierarchical method"),
+    ):
+        with pytest.raises(DataError, match=fault):
+            _covariate(wrong, three, [0, 1, 2], method)  # type: ignore[arg-type]
+    assert _covariate(None, three, [0, 1, 2], "weighted") is None  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("micron", "band"),
+    [(0.48, "uddb"), (1.4, "uddj"), (1.46, "uddh"), (2.7, "uddk"), (2.8, "uddl"), (4.8, "uddm")],
+)
+def test_diameters_are_those_of_the_nearest_band(micron: float, band: str) -> None:
+    """By the ratio of wavelengths, of the columns that the catalogue has."""
+    setups = [SimpleNamespace(wavelength_m=1e-6 * micron * np.array([0.99, 1.0, 1.01]))]
+    names = ("uddb", "uddj", "uddh", "uddk", "uddl", "uddm", "diameter_mas")
+    sizes = {name: [1.0] for name in names}
+    assert _band_of(SimpleNamespace(setups=setups), sizes) == band  # type: ignore[arg-type]
+    assert _band_of(SimpleNamespace(setups=setups), {"uddv": [1.0]}) == "uddv"  # type: ignore[arg-type]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from drifting_visits import Drift, visits
@@ -151,3 +153,13 @@ def test_medians_of_covariances_that_are_none_are_mended() -> None:
     found = population_response(transfers, keys, np.arange(9.0), 4.2)
     assert np.linalg.eigvalsh(found.covariance.toarray())[0] > 0.0
     assert found.value == pytest.approx(0.8, abs=0.05)
+
+
+def test_members_see_what_most_of_a_library_see() -> None:
+    """A baseline that few see is none of theirs, whether they see it or not."""
+    seen = np.ones((6, 3), dtype=bool)
+    seen[:2, 1] = False
+    seen[:, 2] = np.arange(6) == 3
+    transfers = [SimpleNamespace(seen=one) for one in seen]
+    with pytest.raises(DataError, match=r"^4 calibrators of the library"):
+        population_response(transfers, None, np.zeros(6), 0.0)  # type: ignore[arg-type]

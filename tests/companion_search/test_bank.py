@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from epochs import F430M, F480M, epoch
 from helpers import niriss, simulated
 from scipy import stats
 
@@ -16,8 +17,10 @@ from amibayes.companion_search.scan import GroupWeights, ScaleGroups
 from amibayes.companion_search.seeds import bright_seeds
 from amibayes.companion_search.template_bank import MANY_ROWS, TemplateBank
 from amibayes.data.covariance import dense_covariance
+from amibayes.data.observables import join
 from amibayes.likelihood.chi2 import candid_n_sigma, log_chi2_survival
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.models.bands import bands_of
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 
@@ -215,3 +218,21 @@ def test_bright_seeds_cost_no_more_than_they_may(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("amibayes.companion_search.seeds.EXACT_WORK", work)
     bright_seeds(likelihood, np.empty(0), box)
     assert made[0] == pytest.approx(work, rel=0.05)
+
+
+def test_work_of_a_search_grows_with_positions_bands_and_rates() -> None:
+    """By which the number of null draws is chosen: one product a datum, position and template."""
+    data = join([epoch(F430M, 60000.0), epoch(F480M, 60100.0)])
+    grid = make_grid(50.0, 300.0, 25.0)
+
+    def bank(**options: object) -> TemplateBank:
+        likelihood = Likelihood(data, BinaryModel(**options))  # type: ignore[arg-type]
+        return TemplateBank(likelihood, grid, np.empty(0))
+
+    plain = bank()
+    assert plain.work == len(grid) * plain.n_rows
+    banded = bank(bands=tuple(b.name for b in bands_of(data)))
+    assert banded.work == 2 * len(grid) * banded.n_rows
+    moving = bank(fastest_mas_yr=50.0)
+    assert len(moving.rates_mas_yr) > 1
+    assert moving.work == len(moving.rates_mas_yr) * len(grid) * moving.n_rows

@@ -14,11 +14,13 @@ from scipy.special import j1
 from amibayes.companion_search import field
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.result import Companion, Mode
+from amibayes.companion_search.search import _refuse_huge
+from amibayes.companion_search.seeds import _without
 from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.data.off_axis_response import OffAxisResponse
 from amibayes.data.point_source import point_source
-from amibayes.errors import DataError
+from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
@@ -388,3 +390,25 @@ def test_what_cannot_be_averaged_is_looked_at_less_far() -> None:
     assert same is likelihood
     points = (n + field.WORK_PER_POSITION) * n / field.MAX_COARSE_DATA
     assert reach == pytest.approx(0.25 * fringe * np.sqrt(field.MAX_WORK / points / np.pi))
+
+
+@pytest.mark.parametrize("wrong", range(3))
+def test_fields_without_an_end_are_refused(wrong: int) -> None:
+    ends = [50.0, 400.0, 5.0]
+    _refuse_huge(*ends, "a")
+    for value in (np.inf, np.nan):
+        ends[wrong] = value
+        with pytest.raises(DataError, match="baselines of zero or infinite length"):
+            _refuse_huge(*ends, "a")
+    with pytest.raises(UsageError, match="positions between 50 and 4e\\+05 mas"):
+        _refuse_huge(50.0, 4e5, 5.0, "a")
+
+
+def test_parameters_without_companions_have_no_light() -> None:
+    likelihood = Likelihood(niriss(), BinaryModel(companions=2, diameter_mas="free"))
+    pair = np.array([[90.0, 10.0, 0.1, -70.0, 60.0, 0.05, 20.0]])
+    dark = _without(likelihood, pair)
+    assert dark[0].tolist() == [90.0, 10.0, 0.0, -70.0, 60.0, 0.0, 20.0]
+    star = Likelihood(niriss(), BinaryModel(companions=0, diameter_mas="free"))
+    assert likelihood.chi2(dark)[0] == pytest.approx(star.chi2([[20.0]])[0], rel=1e-12)
+    assert pair[0, 2] == 0.1

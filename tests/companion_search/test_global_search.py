@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from brute_force import COVERAGES, Case, case, compared
 
+from amibayes.companion_search.exact_map import LADDER
+
 
 def excess(drawn: Case, starts: int, seed: int) -> float:
     """By how much the search's χ² is above that of brute force."""
@@ -43,3 +45,11 @@ def test_bright_companion_of_a_resolved_star_whose_size_alone_is_far_off() -> No
 def test_bright_companion_among_many_places_that_look_alike(seed: int) -> None:
     """NIRISS to 3 arcsec: forty places are nearly aliases, and disc and smearing look alike."""
     assert excess(case("niriss", seed, smeared=True, disc=True), 40, seed) < 1.0
+
+
+def test_contrasts_of_the_exact_map_rise_in_steps_that_a_fit_closes() -> None:
+    """Of ln c/(1 + c), by which data change; up to nearly equal stars."""
+    steps = np.diff(np.log(np.array(LADDER) / (1.0 + np.array(LADDER))))
+    assert (steps > 0.0).all()
+    assert steps.max() < 1.0
+    assert 0.9 < LADDER[-1] < 1.0

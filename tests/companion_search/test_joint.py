@@ -8,15 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from epochs import F430M, F480M, MJD, epoch, noisy
+from helpers import niriss, simulated
 from scipy import linalg, optimize, stats
 from scipy.special import logsumexp
 
 from amibayes.calibration import calibrate
+from amibayes.companion_search import second_companion
 from amibayes.companion_search.field import resolution_mas
-from amibayes.companion_search.grid import make_grid, trial_rates
+from amibayes.companion_search.grid import Grid, make_grid, trial_rates
 from amibayes.companion_search.optimise import fit_single, refine
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
+from amibayes.companion_search.seeds import peaks
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.covariance import dense_covariance, diagonal_covariance
@@ -577,3 +580,27 @@ def test_estimates_drawn_anew_search_all_bands(model, rng) -> None:
         expected = other.hits(covariance.whiten(colour @ means[:, k])[:, None])
         assert found.gain[k] == pytest.approx(expected.gain[0], rel=1e-3)
         assert found.position[k] == expected.position[0]
+
+
+def test_a_second_companion_is_not_sought_at_the_place_of_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What stands there is the first one's error; at its mirror image there may be another."""
+    theta = [120.0, -80.0, 0.05]
+    result = search(Likelihood(simulated(niriss(), theta, np.random.default_rng(2))), (50.0, 400.0))
+    asked: list[np.ndarray] = []
+
+    def recorded(grid: Grid, gain: np.ndarray, fringe_mas: float) -> np.ndarray:
+        asked.append(gain.copy())
+        return peaks(grid, gain, fringe_mas)
+
+    monkeypatch.setattr(second_companion, "peaks", recorded)
+    bank = TemplateBank(result.likelihood, result.grid, result.single_theta)
+    two = result.likelihood.with_model(BinaryModel(companions=2))
+    second_companion._beside(result, bank, two, np.array(result.theta))
+    left = bank.survey(result.likelihood.residuals(result.theta)[:, 0]).gain
+    place, radius = result.companion, 0.25 * resolution_mas(two)
+    away = result.grid.east_mas - place.east_mas, result.grid.north_mas - place.north_mas
+    near = np.hypot(*away) < radius
+    assert near.any()
+    np.testing.assert_array_equal(asked[0], np.where(near, 0.0, left))

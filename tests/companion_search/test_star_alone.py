@@ -10,7 +10,7 @@ from brute_force import coverage
 from helpers import simulated
 from interferometer import darkened_disc, visibilities
 
-from amibayes.companion_search.optimise import fit_single
+from amibayes.companion_search.optimise import _without_gradients, fit_single
 from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
@@ -81,3 +81,19 @@ def test_one_baseline_is_fitted_by_many_stars_and_by_one_of_them_exactly() -> No
     one = replace(one, vis2=replace(one.vis2, value=np.array([0.4])))
     likelihood = Likelihood(one, BinaryModel(diameter_mas="free", limb_darkening="free"))
     assert fit_single(likelihood)[1] < 1e-6
+
+
+@pytest.mark.parametrize("scale", [(0.2, 5.0), (5.0, 0.2)])
+def test_a_fit_without_gradients_ends_at_its_bounds(scale: tuple[float, float]) -> None:
+    """A paraboloid whose bottom lies outside, whatever the units of the optimiser."""
+    unit = np.array(scale)
+    bounds = np.array([[1.0, 3.0], [-2.0, 4.0]])
+    for bottom, expected in (((-9.0, 0.5), (1.0, 0.5)), ((2.0, 9.0), (2.0, 4.0)),
+                             ((9.0, -9.0), (3.0, -2.0))):  # fmt: skip
+
+        def loss(x: np.ndarray, _: np.ndarray, bottom: tuple[float, float] = bottom) -> float:
+            return float((((x * unit) - bottom) ** 2).sum())
+
+        found, value = _without_gradients(loss, np.array([2.0, 1.0]), unit, bounds)
+        np.testing.assert_allclose(found, expected, atol=0.01)
+        assert value == pytest.approx(((found - bottom) ** 2).sum())

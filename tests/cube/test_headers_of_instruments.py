@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from amibayes.cube import read_cube
+from amibayes.cube.header import integration_time_of, pixel_scale_of, wcs_matrix
 from amibayes.errors import DataError
 from amibayes.instrument import instrument_names, load_instrument
 from amibayes.units import MAS
@@ -120,3 +122,76 @@ def test_every_name_of_a_filter_in_a_header_is_one_of_the_instrument(name: str) 
     for found in header_rules(name).filters.values():
         for one in found.split(" or "):
             assert not one or load_instrument(name, one).bandpass.name == one
+
+
+@pytest.mark.parametrize(
+    ("header", "matrix"),
+    [
+        ({"CD1_1": -2e-5, "CD1_2": 1e-5, "CD2_1": 1e-5, "CD2_2": 2e-5},
+         [[-2e-5, 1e-5], [1e-5, 2e-5]]),
+        ({"CD1_1": -2e-5, "CD2_2": 2e-5}, [[-2e-5, 0.0], [0.0, 2e-5]]),
+        ({"CDELT1": -2e-5, "CDELT2": 3e-5}, [[-2e-5, 0.0], [0.0, 3e-5]]),
+        ({"CDELT1": -2e-5, "CDELT2": 3e-5, "PC1_2": 0.6, "PC2_1": -0.6},
+         [[-2e-5, -1.2e-5], [-1.8e-5, 3e-5]]),
+        ({"CDELT1": -2e-5, "CDELT2": 3e-5, "PC1_1": 0.8, "PC2_2": 0.7},
+         [[-1.6e-5, 0.0], [0.0, 2.1e-5]]),
+        ({"CDELT1": -2e-5}, None),
+        ({}, None),
+    ],
+)  # fmt: skip
+def test_matrices_of_a_wcs_are_those_of_the_standard(
+    header: dict[str, float], matrix: list[list[float]] | None
+) -> None:
+    """CD as it is, PC times CDELT, the unit matrix where neither is given (astropy's too)."""
+    axes = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}
+    found = wcs_matrix(axes | header, "a")
+    assert wcs_matrix(header, "a") is None
+    if matrix is None:
+        assert found is None
+        return
+    assert found is not None
+    np.testing.assert_allclose(np.degrees(found), matrix, rtol=1e-12)
+    np.testing.assert_allclose(np.degrees(found), WCS(axes | header).pixel_scale_matrix)
+
+
+@pytest.mark.parametrize(
+    ("scale", "comment", "mas"),
+    [
+        (0.0656, "", 65.6),
+        (65.6, "[mas] side of a pixel", 65.6),
+        (0.0656, "arcsec per pixel", 65.6),
+        (9.9, "", 9900.0),
+        (0.011, "mas", 0.011),
+        (10.1, "", None),
+        (0.009, "mas", None),
+        (0.0, "", None),
+        (-0.0656, "", None),
+    ],
+)
+def test_pixel_scales_are_of_a_size_that_pixels_have(
+    scale: float, comment: str, mas: float | None
+) -> None:
+    header, comments = {"PIXELSCL": scale}, {"PIXELSCL": comment}
+    if mas is None:
+        with pytest.raises(DataError, match="is no pixel scale"):
+            pixel_scale_of(header, "a", comments)
+    else:
+        found = pixel_scale_of(header, "a", comments)
+        assert found is not None
+        assert np.degrees(found) * 3.6e6 == pytest.approx(mas)
+
+
+@pytest.mark.parametrize(
+    ("header", "seconds"),
+    [
+        ({"EFFINTTM": 1.5, "TGROUP": 0.5, "NGROUPS": 7}, 1.5),
+        ({"TGROUP": 0.5, "TFRAME": 0.1, "NGROUPS": 7}, 3.5),
+        ({"TFRAME": 0.1, "NGROUPS": 7}, 0.7),
+        ({"TGROUP": 0.5}, None),
+        ({"NGROUPS": 7}, None),
+        ({}, None),
+    ],
+)
+def test_time_of_an_integration(header: dict[str, float], seconds: float | None) -> None:
+    found = integration_time_of(header, "a")
+    assert found == (None if seconds is None else pytest.approx(seconds))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from astropy.io import fits
 
 from amibayes.cube import DO_NOT_USE, JUMP_DET, SATURATED, open_cube, read_cube
 from amibayes.cube.ramps import RampFile
+from amibayes.cube.reference_files import _part
 from amibayes.errors import DataError
 
 GAIN, READ_DN, TIME_S = 1.61, 9.0, 0.07544
@@ -174,3 +176,28 @@ def test_read_variance_is_known_as_well_as_stated(tmp_path: Path) -> None:
     # 60 draws know their own variance to 18 %.
     scatter = np.var(found, ddof=1) / np.mean(found) ** 2
     assert 1.0 / 2.2 < 2.0 / scatter / degrees < 2.2
+
+
+@pytest.mark.parametrize(("x", "y", "nx", "ny"), [(1, 1, 4, 3), (3, 2, 4, 3), (5, 4, 4, 3)])
+@pytest.mark.parametrize("part", [False, True])
+def test_reference_files_are_cut_to_the_subarray(
+    x: int, y: int, nx: int, ny: int, *, part: bool
+) -> None:
+    """Pixels by their place on a detector of 8 × 6; a file of the subarray is taken whole."""
+    detector = np.arange(48.0).reshape(6, 8) + 100.0 * np.arange(2)[:, None, None]
+    expected = detector[:, y - 1 : y - 1 + ny, x - 1 : x - 1 + nx]
+    corner = {"SUBSTRT1": x, "SUBSTRT2": y, "SUBSTRT3": 2}
+    primary = fits.PrimaryHDU()
+    if part:
+        primary.header.update(corner)
+    held = expected if part else detector
+    images = [fits.ImageHDU(held, name="COEFFS"), fits.ImageHDU(held[1], name="DQ")]
+    hdus = fits.HDUList([primary, *images])
+    buffer = io.BytesIO()
+    hdus.writeto(buffer)
+    with fits.open(io.BytesIO(buffer.getvalue())) as opened:
+        found = _part(opened, "COEFFS", corner, (ny, nx))
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(_part(opened, "DQ", corner, (ny, nx)), expected[1])
+        # Beyond the detector there is nothing.
+        assert part or _part(opened, "COEFFS", corner | {"SUBSTRT1": 9}, (ny, nx)) is None

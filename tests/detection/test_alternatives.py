@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import interferometer
 import numpy as np
@@ -10,12 +12,14 @@ import pytest
 from brute_force import coverage
 from interferometer import darkened_disc
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
-from amibayes.detection.alternatives import alternative, symmetric_chi2
+from amibayes.detection.alternatives import _extended_light, alternative, symmetric_chi2
 from amibayes.detection.verdict import Verdict, without_companion
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.extended import Extended
 from amibayes.units import MAS
 
 Visibility = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -53,6 +57,16 @@ def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
     return (darkened_disc(0.5, 0.0, u, v) + 0.03 * shift) / 1.03
 
 
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_a_disc_of_a_tenth_of_the_light_is_found_in_any_noise(seed: int) -> None:
+    """No worse than the disc that it is; fits ended at one ten times as bright as the star."""
+    result = search(Likelihood(observed(halo, seed), MODEL), (0.7, 10.0))
+    disc = Extended("gaussian", "halo", smearing=False)
+    wide = result.likelihood.with_model(replace(MODEL, companions=0, surroundings=(disc,)))
+    truth = wide.chi2(np.array([[0.5, 0.1, 2.5, np.sqrt(0.3), 90.0]]))[0]
+    assert _extended_light(result.likelihood, result).chi2 - 4.0 < truth
+
+
 @pytest.mark.parametrize(
     ("source", "kind"),
     [
@@ -71,6 +85,11 @@ def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | 
     assert (None if found is None else found.kind) == kind
     if found is not None:
         assert abs(found.chi2 - n) < 4.0 * np.sqrt(2.0 * n)  # it is the true kind of source
+    if found is not None and kind == "extended light":
+        size, share, percent = map(float, re.findall(r"[\d.]+(?= mas| λ/B| %)", found.words))
+        assert size == pytest.approx(2.5, rel=0.15)
+        assert share * resolution_mas(result.likelihood) == pytest.approx(size, rel=0.06)
+        assert percent == pytest.approx(10.0, rel=0.1)
 
 
 def swelling(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import niriss, simulated
 
 from amibayes.companion_search.search import search
-from amibayes.detection.false_alarm import beside_bright, bright_probability, significance
+from amibayes.detection.false_alarm import (
+    Significance,
+    beside_bright,
+    bright_probability,
+    significance,
+)
 from amibayes.detection.statistic import statistic_of
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
@@ -56,3 +62,62 @@ def test_noise_of_any_size_never_looks_like_a_bright_companion(rng) -> None:
         result = search(Likelihood(data), FIELD)
         bound = bright_probability(result, statistic_of(result))
         assert bound is None or bound > 1e-2
+
+
+@pytest.mark.parametrize(
+    ("bound", "p", "stated"),
+    [(None, 0.3, None), (0.2, 0.3, None), (0.15, 0.3, None), (0.1, 0.3, 0.2), (0.0, 0.3, 1e-10)],
+)
+def test_the_smaller_of_two_probabilities_counts_twice(
+    bound: float | None, p: float, stated: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tested = Significance(1.0, np.arange(10_000.0), p, (0.2, 0.4), None, 0.0013)
+    monkeypatch.setattr("amibayes.detection.false_alarm.bright_probability", lambda *_: bound)
+    partly, nearly = (SimpleNamespace(chi2_single=1.0, chi2_binary=left) for left in (0.2, 0.001))
+    found = beside_bright(tested, partly, ExtraNoise())  # type: ignore[arg-type]
+    for noise in (ExtraNoise(vis2=0.01), ExtraNoise(closure_phase_rad=0.01)):
+        # Beside noise that was added the companion has to explain more.
+        assert beside_bright(tested, partly, noise) is tested  # type: ignore[arg-type]
+        beside = beside_bright(tested, nearly, noise)  # type: ignore[arg-type]
+        assert beside.probability == found.probability
+    if stated is None:
+        assert found is tested
+    else:
+        assert (found.probability, found.bright) == (stated, stated)
+        assert found.interval == (0.0, stated)
+
+
+@pytest.mark.parametrize(
+    ("upper", "draws", "detected", "words"),
+    [
+        (1e-4, 10_000, True, "True"),
+        (2e-3, 10_000, False, "False"),
+        (1e-4, 100, None, "cannot be told below 0.0013 with so few draws"),
+    ],
+)
+def test_what_is_shown_of_a_probability(
+    upper: float, draws: int, detected: bool | None, words: str
+) -> None:
+    null = np.arange(float(draws))
+    tested = Significance(draws - 3.0, null, 1e-5, (0.0, upper), None, 0.0013)
+    assert tested.detected is detected
+    assert (tested.n_draws, tested.n_above) == (draws, 3)
+    assert tested.parametric == pytest.approx(4.0 / (draws + 1.0))
+    shown = dict(tested.rows())
+    assert shown["detected"] == words
+    assert shown["null draws"] == f"{draws}, 3 of them as large"
+    assert shown["extrapolated"] == "no"
+    assert shown["statistic"] == f"{draws - 3.0:.4g}"
+    assert "Pareto" in dict(replace(tested, tail=object()).rows())["extrapolated"]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("p", "stated"), [(None, 0.01), (0.005, 0.01), (0.01, 0.01), (0.2, 0.2)])
+def test_the_larger_probability_of_two_checks_is_stated(p: float | None, stated: float) -> None:
+    tested = Significance(1.0, np.arange(100.0), 0.01, (0.0, 0.02), None, 0.0013)
+    check = SimpleNamespace(
+        probability=p, interval=None if p is None else (p / 2, 2 * p), tail=None
+    )
+    found = tested.beside(check)  # type: ignore[arg-type]
+    assert found.probability == stated
+    assert found.randomised is check
+    assert found.interval == ((0.0, 0.02) if stated == 0.01 else (0.1, 0.4))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -167,3 +168,20 @@ def test_kinds_that_share_errors_are_drawn_together(rng: np.random.Generator) ->
     assert _share_errors(likelihood, list(_kinds(shared).values()))
     found = compare(likelihood, np.array(TRUTH), "observables", _kinds(shared), rng, 200)
     assert 0.0 < found.p <= 1.0
+
+
+@pytest.mark.parametrize("unexplained", [0, 3])
+def test_the_rest_of_noise_is_what_no_parameter_explains(
+    unexplained: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of it for data that have as many parameters as numbers: nothing is added."""
+    parts = [SimpleNamespace(unexplained=unexplained, slopes_of_noise=lambda n, rng: None)]
+    parts[0].likelihood = SimpleNamespace(noise=SimpleNamespace(floor=False))
+    n = 20_000
+    each, together = np.full(n, 9.0), np.linspace(1.0, 11.0, n)
+    monkeypatch.setattr("amibayes.detection.consistency._gains", lambda *_: (each, together))
+    ratio, gain = _apart_by_noise(parts, n, np.random.default_rng(1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(gain, np.maximum(9.0 - together, 0.0))
+    rest = (gain / np.where(gain > 0.0, ratio, 1.0) - together)[gain > 0.0]
+    assert rest.mean() == pytest.approx(unexplained, abs=0.1)
+    assert rest.var() == pytest.approx(2.0 * unexplained, abs=0.3)

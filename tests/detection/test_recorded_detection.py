@@ -186,7 +186,7 @@ def test_probabilities(result: SearchResult, num_regression) -> None:
             .tail_curves()
             .values()
         ],
-        bright=(bright_probability(bright, free), _share(bright, free, free.bank, 0.0)),
+        bright=(np.log(bright_probability(bright, free)), _share(bright, free, free.bank, 0.0)),
         shuffled=randomised(shuffled, 60, np.random.default_rng(9)),
         choices=(shuffle.log_choices, shuffle.n_exposures),
         orders=shuffle.draw(shuffled.residual, 3, np.random.default_rng(1)),

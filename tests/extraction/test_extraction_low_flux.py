@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from conftest import script
 
+from amibayes.extraction.fourier.low_flux import _pairs, _triples
 from amibayes.extraction.fourier.sampling import OneEach
 from amibayes.instrument import load_instrument
 
@@ -84,3 +87,18 @@ def test_noise_of_real_parts_alone_is_that_of_draws() -> None:
     # A variance to 0.6 %, more for what is not Gaussian; the covariance of two to 1 % of it.
     expected = np.cov(closure.T)
     np.testing.assert_allclose(found[21:, 21:], expected, atol=0.06 * expected.max())
+
+
+def test_pairs_and_triples_of_legs_are_those_of_all_their_orders(rng: np.random.Generator) -> None:
+    """Sums written out over the legs of 4 triangles with those of 5: the latter is a permanent."""
+    means = rng.standard_normal((3, 4, 3, 5)) + 1j * rng.standard_normal((3, 4, 3, 5))
+    orders = list(permutations(range(3)))
+    three = sum(np.prod([means[p, :, q] for p, q in enumerate(order)], axis=0) for order in orders)
+    np.testing.assert_allclose(_triples(means), three)
+    two = sum(
+        means[p, :, q] * means[p + more, :, other]
+        for p in range(3)
+        for more in range(1, 3 - p)
+        for q, other in permutations(range(3), 2)
+    )
+    np.testing.assert_allclose(_pairs(means), two)

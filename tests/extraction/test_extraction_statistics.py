@@ -15,6 +15,7 @@ from amibayes.cube import Cube
 from amibayes.data.shrinkage import lag_one, shrunk_covariance
 from amibayes.extraction import Extraction, ExtractOptions, extract_all
 from amibayes.extraction.image_plane import fringe_sampling
+from amibayes.extraction.noise import scatter_about_pointing
 from amibayes.instrument import load_instrument
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.optics import psf
@@ -229,3 +230,22 @@ def quiet(scene: Scene) -> Extraction:
     )
     options = ExtractOptions(covariance="physical")
     return extract_all(replace(bare, error=noisy.error), options)[0]
+
+
+@pytest.mark.parametrize("n", [5, 6, 11, 12, 30])
+def test_what_goes_with_the_pointing_is_no_scatter(n: int) -> None:
+    """Its polynomial of as many terms as are at most half of the integrations."""
+    rng = np.random.default_rng(n)
+    shift, noise = rng.standard_normal((n, 2)), rng.standard_normal((n, 3))
+    x, y = shift.T
+    kinds = [np.ones(n), x + 2.0 * y, x**2 - 3.0 * x * y + y**2]
+    least = [1, 6, 12]
+    for terms, kind in zip(least, kinds, strict=True):
+        left = scatter_about_pointing(1e3 * kind[:, None] * np.ones(3), shift)
+        assert (left < 1e-12).all() == (n >= terms)
+    design = np.stack(
+        [np.ones(n), x, y, x * x, x * y, y * y][: 6 if n >= 12 else 3 if n >= 6 else 1]
+    )
+    rest = noise - design.T @ np.linalg.lstsq(design.T, noise, rcond=None)[0]
+    expected = (rest**2).sum(axis=0) / (n - len(design))
+    np.testing.assert_allclose(scatter_about_pointing(noise, shift), expected)

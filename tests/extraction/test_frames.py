@@ -11,6 +11,7 @@ from amibayes.cube import Cube
 from amibayes.cube.source import InMemoryCube
 from amibayes.data.outliers import look_elsewhere
 from amibayes.errors import DataError
+from amibayes.extraction.cleaning import Reference
 from amibayes.extraction.extract import TIMES, _mjd, _with_times
 from amibayes.extraction.frames import (
     Frames,
@@ -23,6 +24,7 @@ from amibayes.extraction.frames import (
 )
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
+from amibayes.extraction.view import _part
 from amibayes.instrument import load_instrument
 from amibayes.optics import psf
 from amibayes.units import ComplexArray
@@ -210,3 +212,33 @@ def test_integrations_are_laid_end_to_end_and_chosen() -> None:
     assert len(both) == 5
     np.testing.assert_array_equal(both.power[2:], other.power)
     np.testing.assert_array_equal(both.select(np.arange(5) > 3).bispectrum, other.bispectrum[2:])
+
+
+def test_an_integration_of_another_flux_is_no_outlier_and_its_hot_pixel_is() -> None:
+    """Nine times the flux; the hot pixel, of a thousand times, does not decide what it is."""
+    shape = (8, 8)
+    reference = Reference(
+        np.ones(shape), np.ones(shape), np.ones(shape, dtype=bool), None, 0,  # type: ignore[arg-type]
+        np.ones((1, *shape)), has_errors=False, source="",
+    )  # fmt: skip
+    images = np.array([1.0, 9.0, 9.0, 9.0])[:, None, None] * np.ones(shape)
+    images[2, 3, 4] = 7000.0
+    images[3, 3, 4] = -7000.0
+    bad = np.zeros(images.shape, dtype=bool)
+    bad[1, 0, 0] = True
+    images[1, 0, 0] = 1e9
+    found = reference.outliers(images, bad, 5.0)
+    assert np.argwhere(found).tolist() == [[2, 3, 4], [3, 3, 4]]
+
+
+@pytest.mark.parametrize("size", [40, 80, 99, 100, 101, 300])
+def test_the_part_of_an_image_around_a_star(size: int) -> None:
+    """As large as usual, inside, and as near the middle as that allows; all if hardly larger."""
+    for place in (0, 5, size // 2, size - 1):
+        part = _part(size, 80, place)
+        if size <= 100:
+            assert part == slice(0, size)
+            continue
+        assert part.stop - part.start == 80
+        starts = np.arange(size - 79)
+        assert part.start == starts[np.abs(starts + 40 - place).argmin()]

@@ -16,12 +16,13 @@ import amibayes
 from amibayes.calibration import calibrate
 from amibayes.cube import Cube, write_cube
 from amibayes.extraction.extract import extract_all
+from amibayes.extraction.mask_map import MapEstimate, MaskMap, combined, far_from_stated
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.reading import read_observations
 from amibayes.extraction.table import target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import visit_maps
-from amibayes.instrument import load_instrument
+from amibayes.instrument import Distortion, load_instrument
 from amibayes.optics.holes import hole_transform
 from amibayes.scene.orientation import Orientation
 from amibayes.units import DEGREE, MAS, FloatArray
@@ -185,3 +186,39 @@ def test_times_are_those_of_the_exposure_where_integrations_have_none(star: Floa
     header = dict(given.header) | {"EXPMID": 60123.25}
     (found,) = extract_all(replace(given, header=header))
     assert found.observables.vis2.mjd[0] == pytest.approx(60123.25)
+
+
+@pytest.mark.parametrize("n", [0, 1, 3])
+def test_maps_are_joined_by_least_squares(n: int) -> None:
+    """With the prior as one more measurement; exposures that tell nothing are none."""
+    rng = np.random.default_rng(n)
+    prior = Distortion(np.array([[1.01, 0.002], [-0.003, 0.99]]), 0.004)
+    estimates: list[MapEstimate | None] = [None]
+    design, value = [np.eye(4) / 0.004], [prior.matrix.ravel() / 0.004]
+    for _ in range(n):
+        root = 1e-3 * rng.standard_normal((4, 4))
+        found = prior.matrix.ravel() + 0.003 * rng.standard_normal(4)
+        estimates.append(MapEstimate(found, root @ root.T))
+        design.append(np.linalg.inv(root))
+        value.append(np.linalg.solve(root, found))
+    rows = np.concatenate(design)
+    expected = np.linalg.lstsq(rows, np.concatenate(value), rcond=None)[0]
+    joined = combined(estimates, prior)
+    np.testing.assert_allclose(joined.matrix.ravel(), expected, rtol=1e-6)
+    error = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)))
+    np.testing.assert_allclose(joined.error.ravel(), error, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("off", "error", "told"),
+    [(0.009, 0.001, False), (-0.011, 0.001, True), (0.011, 0.01, False), (0.035, 0.01, True)],
+)
+def test_a_map_beyond_a_percent_or_three_errors_is_doubted(
+    off: float, error: float, *, told: bool
+) -> None:
+    stated = Distortion(np.array([[1.01, 0.002], [-0.003, 0.99]]), error)
+    change = np.array([[0.001, 0.0], [off, -0.002]])
+    found = far_from_stated(MaskMap(stated.matrix + change, np.full((2, 2), 1e-5)), stated)
+    assert len(found) == told
+    if told:
+        assert f"{100.0 * abs(off):.1f} % off" in found[0]

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from helpers import niriss
-from pupil_images import Pupil, write_kernel_file
+from pupil_images import WAVELENGTH, Pupil, write_kernel_file
 from scipy import stats
 
 import amibayes as ab
 from amibayes.calibration import calibrate
 from amibayes.cli import main
 from amibayes.companion_search.grid import make_grid
+from amibayes.data.kernel_model import stands_alone
 from amibayes.data.observables import join
 from amibayes.detection.statistic import make_statistic
 from amibayes.kpfits import kernel_observables, write_kpfits
-from amibayes.kpfits.audit import audit_kpfits
-from amibayes.kpfits.file import open_kpfits
+from amibayes.kpfits.audit import _scatter, audit_kpfits
+from amibayes.kpfits.file import _wavelengths, open_kpfits
+from amibayes.kpfits.write import write_observables
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.rings import make_rings
 
@@ -148,11 +150,25 @@ def test_frames_of_several_orientations_keep_their_own(tmp_path: Path) -> None:
         tmp_path / "a.fits", PUPIL, value, np.tile(covariance(), (5, 1, 1)), angles
     )
     data = kernel_observables(path)
-    assert len(data.setups) == 4  # 359.99 and 0.05 are one only where they are next to each other
+    assert len(data.setups) == 3
     likelihood = Likelihood(data)
     difference = likelihood.difference(np.array([[EAST, NORTH, CONTRAST]]))[:, 0]
     assert np.abs(difference).max() < 2e-5
-    assert likelihood.n_independent == 4 * 80
+    assert likelihood.n_independent == 3 * 80
+
+
+@pytest.mark.parametrize("angles", [(360.0, 0.0), (359.95, -0.05), (0.1, 359.9, 0.0), (-0.1, 0.1)])
+def test_frames_of_one_orientation_across_north_have_their_mean(
+    angles: tuple[float, ...], tmp_path: Path
+) -> None:
+    value = np.array([PUPIL.phases(EAST, NORTH, CONTRAST, a) for a in angles])
+    path = write_kernel_file(
+        tmp_path / "a.fits", PUPIL, value, np.tile(covariance(), (len(angles), 1, 1)),
+        np.array(angles),
+    )  # fmt: skip
+    likelihood = Likelihood(kernel_observables(path))
+    assert likelihood.n_independent == 80
+    assert np.abs(likelihood.difference(np.array([[EAST, NORTH, CONTRAST]]))).max() < 2e-5
 
 
 def test_calibrators_take_the_pupil_out_with_their_errors(tmp_path: Path) -> None:
@@ -185,6 +201,7 @@ def test_written_file_reads_back(tmp_path: Path) -> None:
         tmp_path / "a.fits", PUPIL, value, np.tile(covariance(), (2, 1, 1)), angles
     )
     data = kernel_observables(path)
+    assert data.notes == ("frames in 2 orientations, each averaged by itself",)
     write_kpfits(tmp_path / "b.fits", data)
     again = kernel_observables(tmp_path / "b.fits")
     theta = np.array([[EAST, NORTH, CONTRAST]])
@@ -383,3 +400,105 @@ def test_instrument_is_named_by_the_first_keyword_that_does(tmp_path: Path) -> N
             hdus[0].header.update(changes)
         names.append(open_kpfits(path).instrument)
     assert names == ["NIRISS_F480M", "NIRC2_F480M", "KPFITS_F480M"]
+
+
+def test_observables_of_two_kinds_go_to_two_files_over_old_ones(tmp_path: Path) -> None:
+    kernel, masked = kernel_observables(kernel_file(tmp_path / "k.fits")), niriss()
+    path, beside = tmp_path / "a.oifits", tmp_path / "a_kpfits.fits"
+    both = join([masked, kernel])
+    for data, expected in (
+        (kernel, (beside,)),
+        (masked, (path,)),
+        (both, (path, beside)),
+        (both, (path, beside)),
+        (kernel, (beside,)),
+    ):
+        assert write_observables(path, data) == expected
+    np.testing.assert_allclose(kernel_observables(beside).data, kernel.data, atol=1e-12)
+    np.testing.assert_allclose(ab.read_oifits(path).data, masked.data, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("excess", "seen"), [(1.0, False), (1.03, False), (0.97, False), (1.1, True)]
+)
+def test_scatter_off_by_a_few_per_cent_is_no_finding(
+    excess: float, *, seen: bool, tmp_path: Path
+) -> None:
+    """400 frames know their scatter to 0.4 %: what is 8σ off is named where it matters too."""
+    file, n = open_kpfits(kernel_file(tmp_path / "a.fits")), 400
+    draws = excess * noisy(np.random.default_rng(3), n)
+    many = replace(
+        file,
+        value=draws[:, None],
+        covariance=np.broadcast_to(file.covariance[:1], (n, *file.covariance.shape[1:])),
+        position_angle_deg=np.zeros(n),
+    )
+    assert len(list(_scatter(many))) == seen
+
+
+@pytest.mark.parametrize("left", [0.5, 0.88, 0.93])
+def test_a_window_that_dims_the_field_is_named(left: float, tmp_path: Path) -> None:
+    """exp(−(ρ/r)⁴) of the light is left at a radius ρ: here at the edge, λ/B_min."""
+    path = kernel_file(tmp_path / "a.fits")
+    assert not [f for f in audit_kpfits(path).findings if f.code == "kp-window"]
+    edge = np.degrees(WAVELENGTH / np.hypot(*PUPIL.points.T).min()) * 3.6e6
+    fits.setval(path, "WRAD", value=float(edge / 65.0 / (-np.log(left)) ** 0.25))
+    found = [f for f in audit_kpfits(path).findings if f.code == "kp-window"]
+    assert len(found) == (left < 0.9)
+    for finding in found:
+        assert f"leaves {100 * left:.2g} % at {edge:.0f} mas" in finding.what
+
+
+def test_wavelengths_as_older_files_state_them(tmp_path: Path) -> None:
+    """An image of them, a keyword in µm or one in metres, instead of a table."""
+    image = kernel_file(tmp_path / "a.fits", drop=("CWAVEL",))
+    with fits.open(image, mode="update") as hdus:
+        hdus.append(fits.ImageHDU(np.array([WAVELENGTH]), name="CWAVEL"))
+    file = open_kpfits(image)
+    assert (file.wavelength_m.tolist(), file.band_m.tolist()) == ([WAVELENGTH], [0.0])
+    for key, value in (("CWAVEL", WAVELENGTH), ("HIERARCH ESO INS CWLEN", 1e6 * WAVELENGTH)):
+        path = kernel_file(tmp_path / "b.fits", drop=("CWAVEL",))
+        with pytest.raises(ab.DataError, match="does not state its wavelength"):
+            open_kpfits(path)
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].header[key] = value
+        file = open_kpfits(path)
+        assert file.wavelength_m == pytest.approx([WAVELENGTH])
+        assert file.band_m.tolist() == [0.0]
+
+
+def test_one_angle_serves_all_frames_and_several_must_be_as_many(tmp_path: Path) -> None:
+    one = kernel_file(tmp_path / "a.fits", frames=3, DETPA=np.array([40.0]))
+    np.testing.assert_array_equal(open_kpfits(one).position_angle_deg, 40.0)
+    same = kernel_file(tmp_path / "a.fits", frames=3, DETPA=np.array([40.0, 40.0]))
+    np.testing.assert_array_equal(open_kpfits(same).position_angle_deg, 40.0)
+    for angles in ([40.0, 50.0], []):
+        wrong = kernel_file(tmp_path / "b.fits", frames=3, DETPA=np.array(angles))
+        with pytest.raises(ab.DataError, match=f"{len(angles)} position angles for 3 frames"):
+            open_kpfits(wrong)
+
+
+def test_kernel_phases_are_told_from_triangles_and_have_no_period(tmp_path: Path) -> None:
+    stations = np.array([[0, 1, 2], [3, 3, 3], [1, 1, 2], [2, 1, 1], [1, 2, 1]])
+    np.testing.assert_array_equal(stands_alone(stations), [False, True, False, False, False])
+    value = np.linspace(-9.0, 9.0, len(PUPIL.kernel))
+    likelihood = Likelihood(kernel_observables(kernel_file(tmp_path / "a.fits", value)))
+    np.testing.assert_allclose(likelihood.wrapped(value[:, None].copy())[:, 0], value)
+
+
+def test_the_star_is_named_by_the_first_keyword_that_does(tmp_path: Path) -> None:
+    path, names = kernel_file(tmp_path / "a.fits"), []
+    for changes in ({}, {"TARGPROP": " ", "OBJECT": "b "}, {"TARGNAME": "c"}, {"TARGET": "d"}):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].header.update(changes)
+        names.append(open_kpfits(path).target)
+    assert names == ["HD 1", "b", "c", "c"]
+
+
+@pytest.mark.parametrize("wrong", [4.8, 4800.0, 0.0, 9e-8, np.nan, np.inf])
+def test_one_wavelength_that_is_not_in_metres_refuses_all(wrong: float) -> None:
+    for wavelengths in ([wrong], [4.8e-6, wrong], [wrong, 4.8e-6]):
+        with pytest.raises(ab.DataError, match="is not in metres"):
+            _wavelengths({"CWAVEL": np.array(wavelengths)}, {}, "a")
+    found, band = _wavelengths({"CWAVEL": np.array([1.1e-7, 0.9])}, {}, "a")
+    assert (found.tolist(), band.tolist()) == ([1.1e-7, 0.9], [0.0, 0.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import join
 from amibayes.detection.ratio import Ratio
 from amibayes.detection.statistic import make_statistic, statistic_of
+from amibayes.likelihood.channel_noise import Correlation
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.noise_fit import fit_noise
+from amibayes.likelihood.linear_response import linear_response
+from amibayes.likelihood.noise_fit import _Fit, fit_noise
+from amibayes.models.binary import LinearResponse
 
 FIELD = (50.0, 400.0)
 EXTRA = ExtraNoise(0.02, np.radians(1.0))
@@ -157,3 +161,49 @@ def test_files_have_one_noise_unless_told_otherwise() -> None:
     assert common.vis2 == pytest.approx(0.04 / np.sqrt(2.0), rel=0.35)
     own = fit_noise(stated, np.array(theta), per_file=True)
     assert [f.vis2 for f in own.files] == [pytest.approx(0.04, rel=0.25), 0.0]
+
+
+@pytest.mark.parametrize("zero", ["none", "some", "all"])
+def test_response_to_a_companion_of_lopsided_light_is_the_derivative(zero: str) -> None:
+    """dV² = 2 Re(V₀* dV) and dφ = Im(V₀* dV)/|V₀|², with V₀ of any phases."""
+    likelihood = Likelihood(niriss(channels=2))
+    samples, rng = likelihood.samples, np.random.default_rng(3)
+    n = len(samples)
+    star, scale, disc = rng.uniform(0.5, 1.0, (3, n))
+    across = 0.2 * rng.standard_normal(n)
+    across[: {"none": 0, "some": n // 2, "all": n}[zero]] = 0.0
+    response = LinearResponse(star, scale, disc, across)
+    model = SimpleNamespace(linear_response=lambda samples, nuisance: response)
+    stub = SimpleNamespace(model=model, samples=samples, noise=likelihood.noise)
+    found = linear_response(stub, np.zeros(0))  # type: ignore[arg-type]
+    wave = disc * np.exp(1j * rng.uniform(0.0, 2.0 * np.pi, n))
+    v0 = star + 1j * across
+    turned = np.conj(v0) * scale * (wave - v0)
+    data = [samples.squares @ (2.0 * turned.real), samples.legs @ (turned.imag / np.abs(v0) ** 2)]
+    expected = likelihood.noise.covariance.whitening @ np.concatenate(data)
+    template = np.zeros(len(expected))
+    template[found.even.rows] += found.even.matrix @ wave.real - found.offset
+    template[found.odd.rows] -= found.odd.matrix @ wave.imag
+    np.testing.assert_allclose(template, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [
+        (Correlation(), False),
+        (Correlation(error=0.1), True),
+        (Correlation(value=0.2), True),
+        (Correlation(lasting=(0.0, 0.3)), True),
+    ],
+)
+def test_shares_of_channels_are_told_where_they_are_measured(
+    share: Correlation, monkeypatch: pytest.MonkeyPatch, *, told: bool
+) -> None:
+    """Also none at all, with its error; of one kind of observable or both."""
+    likelihood = Likelihood(niriss())
+    theta = np.array([150.0, -80.0, 0.01])
+    for other in (share, Correlation()):
+        shares = iter([share, other])
+        monkeypatch.setattr(_Fit, "of_kind", lambda *_, s=shares: (0.0, next(s)))
+        found = fit_noise(likelihood, theta).channels
+        assert [(c.vis2, c.closure_phase) for c in found] == [(share, other)] * told

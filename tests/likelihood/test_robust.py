@@ -10,6 +10,7 @@ from helpers import niriss, simulated
 from scipy import integrate, stats
 from weighted_draws import ranks_of
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.grid import make_grid
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.robust import RobustFits, search_robust
@@ -301,3 +302,18 @@ def test_power_of_the_t_likelihood_obeys_bartletts_identity() -> None:
     mass = stats.norm.pdf(z) * (z[1] - z[0])
     score = np.gradient(normal_moments().power * stats.t.logpdf(z, DEGREES), z)
     assert mass @ score**2 == pytest.approx(-(mass @ np.gradient(score, z)), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "start", [(140.0, -90.0, 0.01), (150.0, -80.0, 0.3), (120.0, -60.0, 0.1), (200.0, -30.0, 0.05)]
+)
+def test_weights_and_fit_go_on_until_every_weight_holds(
+    start: tuple[float, float, float], rng
+) -> None:
+    """Those that a fit ends with are those that its residuals have, to half a percent."""
+    data, _ = spoiled([150.0, -80.0, 0.02], rng)
+    work = RobustFits(Likelihood(data), FIELD, True, per_file=False)
+    box = Box(*FIELD, resolution_mas(work.likelihood))
+    stretch, theta = work.steps(np.array(start), box)
+    again = work._stretch(work.likelihood.residuals(theta)[:, 0])[0]
+    assert np.abs(np.log(again / stretch)).max() < 0.005

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from amibayes import (
     simulate,
 )
 from amibayes.data.observables import Observables
+from amibayes.limits.image_injection import _filled
 from amibayes.limits.injection import at_its_place
 from amibayes.scene.sources import Point
 from amibayes.units import DEGREE, MAS, offset
@@ -163,3 +165,17 @@ def test_places_are_the_same_within_half_a_fringe() -> None:
     places = np.array([[100.0, 0.0], [-30.0, 40.0], [10.0, 10.0]])
     moved = places + np.array([[3.0, 4.0], [12.0, 0.0], [0.0, -9.9]])
     assert at_its_place(moved, places, 20.0).tolist() == [True, False, True]
+
+
+def test_integrations_that_cannot_be_measured_are_those_in_the_middle() -> None:
+    """Medians of those that can be: one that is far off moves nothing."""
+    used = np.array([True, True, True, False, False])
+    flux = np.array([1.0, 2.0, 90.0, np.nan, 7.0])
+    shift = np.array([[0.1, 0.2], [0.3, -0.2], [9.0, 0.0], [np.nan, np.nan], [5.0, 5.0]])
+    frames = SimpleNamespace(used=used, flux=flux, shift_px=shift, reason=["dark"])
+    found = _filled(frames, "")  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found[0], [1.0, 2.0, 90.0, 2.0, 2.0])
+    np.testing.assert_array_equal(found[1], [*shift[:3], [0.3, 0.0], [0.3, 0.0]])
+    frames.used = np.zeros(5, dtype=bool)
+    with pytest.raises(DataError, match="no integration can be used: dark"):
+        _filled(frames, "")  # type: ignore[arg-type]

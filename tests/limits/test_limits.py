@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from amibayes.detection.statistic import statistic_of
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import recover
+from amibayes.limits.limit import SHARES, DetectionLimit
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.false_alarm import false_alarm
 from amibayes.pipeline.field import search_field
@@ -309,3 +311,29 @@ def test_a_kind_of_observable_that_cannot_carry_a_fit_is_left_out_and_named(tmp_
     report = measure_limits([path], [], LimitsOptions(search, criterion="candid", n_separations=3))
     assert [limit.observables for limit in report.limits] == [("vis2", "cp"), ("cp",)]
     assert any("no limit from vis2 alone" in said for said in report.warnings)
+
+
+def test_shares_between_rings_and_levels_are_interpolated() -> None:
+    """Of a curve by which the share is linear in ln contrast, and one that stays incomplete."""
+    rising = np.exp(np.interp(SHARES, [0.0, 1.0], np.log([1e-3, 1e-2])))
+    critical = np.stack([rising, np.where(SHARES < 0.6, rising, np.nan), np.full(400, np.nan)])
+    limit = SimpleNamespace(
+        critical=critical,
+        separation_mas=np.array([100.0, 200.0, 300.0]),
+        by_detection=np.array([True, False, False]),
+    )
+    limit._share = lambda ring, contrast: DetectionLimit._share(limit, ring, contrast)  # type: ignore[arg-type]
+
+    def probability(separation: float, contrast: float) -> float:
+        return DetectionLimit.probability(limit, separation, contrast)  # type: ignore[arg-type]
+
+    middle = 10.0**-2.5
+    for contrast, shares in ((1e-4, (0.0, 0.0)), (middle, (0.5, 0.5)), (0.1, (1.0, 0.6))):
+        assert probability(100.0, contrast) == pytest.approx(shares[0], abs=0.003)
+        assert probability(200.0, contrast) == pytest.approx(shares[1], abs=0.003)
+        mean = 0.75 * shares[0] + 0.25 * shares[1]
+        assert probability(125.0, contrast) == pytest.approx(mean, abs=0.003)
+        assert probability(300.0, contrast) == 0.0
+        assert np.isnan([probability(99.0, contrast), probability(301.0, contrast)]).all()
+    anywhere = [DetectionLimit.counts_anywhere(limit, s) for s in (90.0, 149.0, 151.0, 400.0)]  # type: ignore[arg-type]
+    assert anywhere == [True, True, False, False]

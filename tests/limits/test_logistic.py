@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from amibayes.limits.logistic import fit_logistic
+from amibayes.limits.logistic import LOOSENESS, TYPICAL, fit_logistic
 
 X = np.log(np.geomspace(0.4, 4.0, 14))
 
@@ -84,3 +84,18 @@ def test_all_or_nothing() -> None:
     assert 0.0 < error < 0.2
     assert fit_logistic(X, 0.0 * step, trials).crossing(0.95)[0] == np.inf
     assert fit_logistic(X, trials, trials).crossing(0.5)[0] == -np.inf
+
+
+@pytest.mark.parametrize("seed", [*range(8), 291, 306, 735, 1017])
+def test_the_fit_is_where_the_posterior_is_flat(seed: int) -> None:
+    """Also of data that are all or nothing, rise late, or fall: steps of both signs lead there."""
+    rng = np.random.default_rng(seed)
+    trials = rng.integers(1, 400, len(X)).astype(float)
+    beta = rng.normal([0.0, 4.0, 0.0, 0.0], [6.0, 5.0, 3.0, 3.0])
+    p = special.expit(np.polynomial.Polynomial(beta)(X))
+    found = {0: 0.0 * trials, 1: trials.copy()}.get(seed, rng.binomial(trials.astype(int), p) * 1.0)
+    fit = fit_logistic(X, found, trials)
+    design = np.vander(X - fit.centre, 4, increasing=True)
+    left = design.T @ (found - trials * special.expit(design @ fit.beta))
+    left -= (fit.beta - TYPICAL) / LOOSENESS**2
+    assert np.abs(left * np.sqrt(np.diag(fit.covariance))).max() < 1e-5

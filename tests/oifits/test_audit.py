@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits, write_oifits
 from amibayes.oifits.audit import audit, errors_in, repair
 from amibayes.oifits.audit.repair import REMEDIES
+from amibayes.oifits.audit.structure import array_centre
 
 DEGREE = np.pi / 180
 
@@ -369,8 +371,12 @@ def test_vis2_errors_divided_twice(n: int, tmp_path: Path) -> None:
         assert audit(tmp_path / "b.fits").findings == ()
 
 
-def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
-    """Target 0.9 ± 0.001 over calibrator 0.8 ± 0.004, propagated rightly and exchanged."""
+@pytest.mark.parametrize("factor", [0.05, 1.0, 20.0])
+def test_exchanged_errors(factor: float, rng: np.random.Generator, tmp_path: Path) -> None:
+    """Target 0.9 ± 0.001 over calibrator 0.8 ± 0.004, propagated rightly and exchanged.
+
+    A factor that all errors of amplitudes share, and what 1 % of rounding leaves, say nothing.
+    """
     target, calibrator = rng.uniform(0.5, 1.0, 21), rng.uniform(0.5, 1.0, 21)
     e_t, e_c = 0.001, 0.004
 
@@ -382,14 +388,18 @@ def test_exchanged_errors(rng: np.random.Generator, tmp_path: Path) -> None:
         hdus["OI_VIS2"].data["VIS2DATA"] = value
         hdus["OI_VIS2"].data["VIS2ERR"] = exchanged if wrong else right
         hdus["OI_VIS"].data["VISAMP"] = np.sqrt(value)
-        hdus["OI_VIS"].data["VISAMPERR"] = right / (2 * np.sqrt(value))
+        rounded = factor * rng.uniform(0.995, 1.005, 21)
+        hdus["OI_VIS"].data["VISAMPERR"] = rounded * right / (2 * np.sqrt(value))
 
     for wrong in (True, False):
         path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")
         assert ("exchanged-errors" in codes(path)) == wrong
 
 
-def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: Path) -> None:
+@pytest.mark.parametrize("flagged", [False, True])
+def test_phase_errors_that_were_not_divided(
+    rng: np.random.Generator, tmp_path: Path, *, flagged: bool
+) -> None:
     """Noise alike along and across the bispectrum of N = 69 integrations."""
     amplitude = rng.uniform(0.2, 0.9, 35)
     estimates = rng.chisquare(68, (2, 35)) / 68
@@ -399,6 +409,10 @@ def test_phase_errors_that_were_not_divided(rng: np.random.Generator, tmp_path: 
         data = hdus["OI_T3"].data
         data["T3AMP"], data["T3AMPERR"] = amplitude, along
         data["T3PHIERR"] = np.degrees(across / (1 if wrong else amplitude))
+        if flagged:  # says nothing, whatever it holds
+            data["FLAG"][:20] = True
+            data["T3PHIERR"][:20] *= 50.0 if wrong else amplitude[:20]
+            data["T3AMP"][20], data["T3AMPERR"][21], data["T3PHIERR"][22] = 0.0, 0.0, 0.0
 
     for wrong in (True, False):
         path = changed(tmp_path / "a.fits", lambda h, w=wrong: write(h, wrong=w), kind="diagonal")
@@ -646,3 +660,24 @@ def test_errors_are_told_before_warnings(rng: np.random.Generator, tmp_path: Pat
     n = severities.count("error")
     assert n > 0
     assert severities[:n] == ["error"] * n
+
+
+@pytest.mark.parametrize(
+    ("frame", "km", "wrong"),
+    [
+        ("GEOCENTRIC", 6290.0, True),
+        ("GEOCENTRIC", 6357.0, False),
+        ("GEOCENTRIC", 6384.0, False),
+        ("GEOCENTRIC", 6510.0, True),
+        ("SKY", 0.0, False),
+    ],
+)
+def test_the_centre_of_an_array_is_on_the_earth(frame: str, km: float, *, wrong: bool) -> None:
+    """Poles, equator and mountains are; a hundred kilometres above them nothing observes."""
+    centre = 1e3 * km * np.array([0.48, -0.6, 0.64])
+    keywords = {"FRAME": frame, **dict(zip(("ARRAYX", "ARRAYY", "ARRAYZ"), centre, strict=True))}
+    table = SimpleNamespace(keyword=keywords.get, label="OI_ARRAY", header=keywords)
+    found = list(array_centre(SimpleNamespace(named=lambda _: [table])))  # type: ignore[arg-type]
+    assert len(found) == wrong
+    for finding in found:
+        assert f"{km:.0f} km" in finding.what

@@ -53,5 +53,11 @@ def test_errors_of_an_average_are_said_to_be_the_scatter(
     )
     codes = [f.code for f in audit(path).findings]
     assert codes.count("scatter-of-integrations") == 2
+    with fits.open(tmp_path / "a.oifits") as hdus:
+        hdus["OI_VIS2"].data["VIS2ERR"][4] = 0.0
+        hdus["OI_T3"].data["T3PHIERR"][:] = 0.0
+        hdus.writeto(tmp_path / "b.oifits")
+    codes = [f.code for f in audit(tmp_path / "b.oifits").findings]
+    assert codes.count("scatter-of-integrations") == 1
     (found,) = read_observations(path)
     assert found.covariance_kind == "assumed"

@@ -21,9 +21,13 @@ from oi_builders import HandMade, table
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.oifits import observables_of, open_oifits, read_oifits
+from amibayes.oifits.columns import _in_metres
 from amibayes.oifits.correlations import shared_baseline_sign
-from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME
+from amibayes.oifits.rows import times_of
+from amibayes.oifits.scales import ANGLE, FREQUENCY, LENGTH, TIME, scale_of
+from amibayes.oifits.setups import array_table, wavelength_table
 from amibayes.oifits.stated import _integrations
+from amibayes.oifits.uv_stations import _corners
 
 DEGREE = np.pi / 180
 
@@ -623,7 +627,8 @@ def test_units_are_worth_what_astropy_says(known: dict[str, float], si: str) -> 
 @pytest.mark.parametrize("name", ["mas", "arcsec"])
 def test_frequencies_are_the_inverse_of_angles(name: str) -> None:
     for form in ("{}-1", "{}^-1", "1/{}", "cycles/{}"):
-        assert FREQUENCY[form.format(name)] * ANGLE[name] == pytest.approx(1.0, rel=1e-12)
+        factor, _ = scale_of(form.format(name), FREQUENCY, "lambda")
+        assert factor * ANGLE[name] == pytest.approx(1.0, rel=1e-12)
     assert ANGLE["arcsec"] == pytest.approx(units.arcsec.to(units.rad), rel=1e-12)
 
 
@@ -668,3 +673,156 @@ def test_rows_without_a_date_have_that_of_their_table(tmp_path: Path) -> None:
     by_row = np.unique(np.stack([found.vis2.row, found.vis2.mjd], axis=1), axis=0)[:, 1]
     np.testing.assert_allclose(by_row, mjd, rtol=0.0, atol=1e-8)
     assert "MJD missing; taken from DATE-OBS and TIME" in " ".join(found.notes)
+
+
+PER_RADIAN = {
+    1.0: "lambda wavelength wavelengths rad-1 rad^-1 1/rad cycles/rad cycle/rad",
+    1e3: "klambda kilolambda 1e3lambda",
+    1e6: "mlambda megalambda 1e6lambda",
+    1e9: "glambda gigalambda 1e9lambda",
+}
+
+
+def test_frequencies_are_numbers_of_wavelengths() -> None:
+    for factor, names in PER_RADIAN.items():
+        for name in names.split():
+            assert scale_of(f" {name.title()} ", FREQUENCY, "lambda") == (factor, True)
+    assert scale_of("", FREQUENCY, "klambda") == (1e3, True)
+    assert scale_of("furlong", FREQUENCY, "klambda") == (1e3, False)
+
+
+@pytest.mark.parametrize(
+    ("unit", "u", "metres"),
+    [("", 9e4, 9e4), ("m", 9e4, 9e4), ("km", 90.0, 9e4), ("furlong", 9e4, 9e4),
+     ("", 1.3e5, 0.52), ("m", 1.3e5, 0.52), ("MLAMBDA", 0.13, 0.52), ("rad-1", 9e4, 0.36)],
+)  # fmt: skip
+def test_baselines_of_a_hundred_kilometres_are_numbers_of_wavelengths(
+    unit: str, u: float, metres: float
+) -> None:
+    """Of light of 4 µm; one row that is wrong says nothing of the unit."""
+    values = np.array([u, -u, u, 1e12 * u, np.nan])
+    table = SimpleNamespace(units={"UCOORD": unit}, label="OI_VIS2")
+    found, note = _in_metres(SimpleNamespace(path=""), table, "UCOORD", values, np.array([4e-6]))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found[:3], [metres, -metres, metres])
+    assert ("in wavelengths" in note) == (metres < 1.0)
+    assert ("read as m" in note) == (unit == "furlong")
+    if metres < 1.0:
+        with pytest.raises(DataError, match="there are 2 channels"):
+            _in_metres(
+                SimpleNamespace(path=""),
+                table,
+                "UCOORD",
+                values,
+                np.array([4e-6, 5e-6]),  # type: ignore[arg-type]
+            )
+
+
+def test_triangles_of_one_shape_get_their_places_one_after_the_other() -> None:
+    """Three places on a line of telescopes; one of another shape has stations of its own."""
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [4.0, 0.0], [0.0, 7.0], [1.0, 7.0],
+                       [3.0, 7.0]])  # fmt: skip
+    step = np.array([[1.0, 0.0], [2.0, 0.0], [-3.0, 0.0]])
+    other = np.array([[5.0, 1.0], [0.0, 2.0], [-5.0, -3.0]])
+    stations = 10 + np.arange(7)
+    found, total = _corners(np.array([step, step, other, step]), [places], [stations], 1e-3, 20)
+    assert found.tolist() == [[10, 11, 12], [14, 15, 16], [20, 21, 22], [10, 11, 12]]
+    assert total == 23
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "found"),
+    [
+        ("I", ("I",), 0),
+        ("i  ", ("J", "I"), 1),
+        (None, ("J",), 0),
+        (None, ("J", "I"), None),
+        ("K", ("J",), None),
+        ("I", ("I", "I"), 0),
+    ],
+)
+def test_wavelengths_are_those_of_the_instrument_that_is_named(
+    asked: str | None, there: tuple[str, ...], found: int | None
+) -> None:
+    """A table that names none has those of the file, if there is one set of them."""
+
+    class Table(SimpleNamespace):
+        label, extver = "OI_VIS2", 1
+
+        def keyword(self, _: str) -> str | None:
+            return self.name
+
+        def __len__(self) -> int:
+            return 3
+
+    tables = [Table(name=name) for name in there]
+    oifits = SimpleNamespace(named=lambda _: tables, path="")
+    if found is None:
+        with pytest.raises(DataError, match="no OI_WAVELENGTH has that INSNAME"):
+            wavelength_table(oifits, Table(name=asked), 3)  # type: ignore[arg-type]
+    else:
+        assert wavelength_table(oifits, Table(name=asked), 3) is tables[found]  # type: ignore[arg-type]
+
+
+DAY = 57000.0
+"""2014-12-09."""
+
+
+@pytest.mark.parametrize(
+    ("mjd", "seconds", "unit", "date", "expected", "words"),
+    [
+        ([DAY + 0.25, DAY + 0.5], [0.0, 60.0], "s", "2014-12-09", [0.25, 0.5], ""),
+        ([DAY, DAY], [0.0, 864.0], "s", "2014-12-09", [0.0, 0.01], "MJD is a date"),
+        ([DAY, DAY], [2.0, 2.5], "s", "", [2.0 / 86400, 2.5 / 86400], "MJD is a date"),
+        ([DAY, DAY], [0.0, 14.4], "min", "", [0.0, 0.01], "MJD is a date"),
+        ([DAY, DAY], [864.0, 864.0], "s", "2014-12-09", [0.0, 0.0], ""),
+        ([DAY, DAY + 0.5], [0.0, 864.0], "s", "2014-12-09", [0.0, 0.5], ""),
+        ([0.0, DAY + 0.5], [864.0, 1.0], "s", "2014-12-09", [0.01, 0.5], "MJD missing"),
+        ([np.nan, DAY + 0.5], [864.0, 1.0], "s", "2014-12-09", [0.01, 0.5], "MJD missing"),
+        (None, [864.0, 1728.0], "s", "2014-12-09", [0.01, 0.02], "MJD missing"),
+        (None, [864.0, 1728.0], "s", "", [0.01 - DAY, 0.02 - DAY], "no date"),
+        ([0.0, DAY + 0.5], [864.0, 1.0], "s", "", [0.01 - DAY, 0.5], "no date"),
+    ],
+)
+def test_dates_are_of_mjd_or_of_the_clock_and_the_day(
+    mjd: list[float] | None,
+    seconds: list[float],
+    unit: str,
+    date: str,
+    expected: list[float],
+    words: str,
+) -> None:
+    """Days from `DAY`; without any date rows keep their order."""
+
+    class Rows(SimpleNamespace):
+        def __len__(self) -> int:
+            return 2
+
+    columns = {"TIME": np.array(seconds)} | ({} if mjd is None else {"MJD": np.array(mjd)})
+    rows = Rows(columns=columns, units={"TIME": unit}, label="OI_T3", keyword=lambda _: date)
+    found, note = times_of(rows)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found - DAY, expected, atol=1e-9)
+    assert words in note
+    assert bool(note) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "found"),
+    [("", ("X",), 0), ("", ("X", "Y"), None), ("", (), None), ("y ", ("X", "Y"), 1),
+     ("Z", ("X",), None)],
+)  # fmt: skip
+def test_an_array_is_the_one_that_is_named_or_the_only_one(
+    asked: str, there: tuple[str, ...], found: int | None
+) -> None:
+    arrays = [SimpleNamespace(keyword=lambda _, n=name: n) for name in there]
+    oifits = SimpleNamespace(named=lambda _: arrays)
+    array = array_table(oifits, SimpleNamespace(keyword=lambda _: asked))  # type: ignore[arg-type]
+    assert array is (None if found is None else arrays[found])
+
+
+def test_a_file_that_names_no_target_has_one(made: HandMade, tmp_path: Path) -> None:
+    del made.tables["OI_TARGET"]
+    for name in ("OI_VIS2", "OI_T3"):
+        del made.tables[name]["TARGET_ID"]
+    data = read_oifits(made.write(tmp_path / "a.fits"))
+    assert {s.target for s in data.setups} == {"target 1"}
+    assert data.n_vis2 == 18

@@ -5,10 +5,12 @@ from __future__ import annotations
 import warnings
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.io import fits
+from helpers import niriss
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oi_builders import diagonal, random_observables
@@ -17,8 +19,12 @@ from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.covariance import dense_covariance, diagonal_covariance
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables, join
+from amibayes.data.setup import Setup
 from amibayes.errors import DataError, RunError, UsageError
 from amibayes.oifits import read_oifits, write_oifits
+from amibayes.oifits.layout import grids_of
+from amibayes.oifits.off_axis import LATTICE, RESPONSE, with_response
+from amibayes.oifits.tables import OWN_KEY
 
 DEGREE = np.pi / 180
 
@@ -443,3 +449,51 @@ def test_entries_of_two_tables_of_one_file_stay_apart(
     first, second = np.split(read_oifits(tmp_path / "b.fits").vis2.value, 2)
     np.testing.assert_allclose(second, first + 1.0)
     np.testing.assert_allclose(np.sort(first), np.sort(data.vis2.value))
+
+
+def test_rows_without_a_date_have_the_same_in_every_channel() -> None:
+    """That no channel knows the date is no difference; stations and dates that differ are."""
+    data = niriss(channels=3)
+    unknown = [
+        replace(m, mjd=np.full(len(m), np.nan), integration_s=np.full(len(m), np.nan))
+        for m in (data.vis2, data.closure_phase)
+    ]
+    grids = grids_of(replace(data, vis2=unknown[0], closure_phase=unknown[1]))
+    assert [len(g.first) for g in grids] == [21, 35]
+    for name, fault in (("mjd", 60000.5), ("u_m", 3.0), ("stations", 5)):
+        values = getattr(data.vis2, name).copy()
+        values[1] = fault
+        wrong = replace(data, vis2=replace(data.vis2, **{name: values}))
+        with pytest.raises(ValueError, match=f"{name} differs between the channels"):
+            grids_of(wrong)
+
+
+def test_a_response_belongs_to_its_setup_and_is_of_single_samples_unless_told() -> None:
+    """Opposite places of the lattice are conjugate, and so are the two orders of a pair."""
+    setup, rng = niriss().setups[0], np.random.default_rng(5)
+    half = rng.standard_normal((2, 41)) + 1j * rng.standard_normal((2, 41))
+    index = np.array([[setup.station_index[0], setup.station_index[2]], [99, 100]])
+    lattice = {f"{OWN_KEY} {key}": float(k) for k, key in enumerate(LATTICE)}
+
+    def read(own: int, **header: object) -> Setup:
+        table = SimpleNamespace(
+            name=RESPONSE,
+            header=lattice | {f"{OWN_KEY} {k}": v for k, v in ({"SETUP": 2} | header).items()},
+            columns={"STA_INDEX": index, "COEFF": half},
+        )
+        return with_response(SimpleNamespace(tables=[table]), setup, own)  # type: ignore[arg-type]
+
+    assert read(0) is read(1) is setup
+    for header, single, method in (
+        ({}, True, ""),
+        ({"SINGLE": False, "METHOD": "fringes"}, False, "fringes"),
+        ({"SINGLE": True}, True, ""),
+    ):
+        found = read(2, **header).response
+        assert found is not None
+        assert (found.single, found.method) == (single, method)
+        image = found.coefficients[0, 2]
+        np.testing.assert_allclose(image.ravel()[:41], half[0], rtol=1e-6)
+        np.testing.assert_allclose(image[::-1, ::-1].conj().ravel()[:40], half[0, :40], rtol=1e-6)
+        np.testing.assert_array_equal(found.coefficients[2, 0], image.conj())
+        assert np.count_nonzero(found.coefficients) == 2 * 81

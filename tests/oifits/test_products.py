@@ -7,6 +7,7 @@ public data are at hand.
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,8 @@ from amibayes.instrument import load_instrument
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.oifits.audit import audit, repair
 from amibayes.oifits.products import open_products, pointing_of, product_of, read_product
+from amibayes.oifits.products.reading import SAME_ORIENTATION_RAD, _alike
+from amibayes.oifits.products.repairs import repaired, vis2_error, with_columns
 from amibayes.oifits.tables import open_oifits
 from amibayes.units import MAS
 
@@ -327,3 +330,60 @@ def test_genuine_products_give_the_companion(route: str, data: Path) -> None:
     assert found.separation_mas == pytest.approx(198.8, abs=0.5)
     assert found.position_angle_deg == pytest.approx(305.57, abs=0.15)
     assert found.contrast == pytest.approx(0.01, abs=0.0001)
+
+
+def test_errors_of_negative_vis2_are_positive(tmp_path: Path, rng: np.random.Generator) -> None:
+    """σ(V²) = 2|V|·σ(|V|) = 2|V²|·σ(|V|)/|V|, also where noise made V² negative."""
+    found = product_of(open_oifits(made("ami-oi", tmp_path / "a.fits", rng)))
+    assert found is not None
+    table, amplitude = found.table("OI_VIS2"), found.table("OI_VIS")
+    value = table.columns["VIS2DATA"] * np.where(np.arange(21) % 3, 1.0, -1.0)
+    sigma = vis2_error(found, with_columns(table, {"VIS2DATA": value}))
+    ratio = amplitude.columns["VISAMPERR"] / amplitude.columns["VISAMP"]
+    np.testing.assert_allclose(sigma, 2.0 * np.abs(value) * ratio)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "seconds"),
+    [({}, 20 * 0.7544), ({"EFFEXPTM": 7.0}, 7.0), ({"EFFEXPTM": 0.0}, 20 * 0.7544),
+     ({"EFFEXPTM": "x", "EFFINTTM": 0.5}, 10.0), ({"EFFEXPTM": 0.0, "EFFINTTM": 0.0}, 0.7544)],
+)  # fmt: skip
+def test_integration_time_is_that_of_the_exposure(
+    keywords: dict[str, object], seconds: float, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    oifits = as_oifits(tmp_path / "a.fits", "ami-oi", draws(rng), **keywords)
+    found = product_of(oifits)
+    assert found is not None
+    for table in repaired(found)[0].named("OI_VIS2"):
+        np.testing.assert_allclose(table.columns["INT_TIME"], seconds)
+
+
+def test_exposures_of_one_star_belong_together_and_those_of_no_name_do_not() -> None:
+    uv = np.array([[3.0, 4.0], [-2.0, 1.0]])
+
+    def product(header: dict[str, str], places: np.ndarray = uv) -> SimpleNamespace:
+        columns = {"UCOORD": places[:, 0], "VCOORD": places[:, 1]}
+        return SimpleNamespace(
+            oifits=SimpleNamespace(header={"INSTRUME": "NIRISS", "FILTER": "F480M"} | header),
+            table=lambda name: SimpleNamespace(columns=columns) if name == "OI_VIS2" else None,
+        )
+
+    one = product({"TARGPROP": "HD 1"})
+    nearly, turned = uv @ turn(0.5 * SAME_ORIENTATION_RAD), uv @ turn(3.0 * SAME_ORIENTATION_RAD)
+    for other, together in (
+        (product({"TARGPROP": "hd 1"}), True),
+        (product({"TARGPROP": "HD 1"}, nearly), True),
+        (product({"TARGPROP": "HD 1"}, turned), False),
+        (product({"TARGPROP": "HD 1"}, uv[:1]), False),
+        (product({"TARGPROP": "HD 2"}), False),
+        (product({"TARGPROP": "HD 1", "TARGNAME": "b"}), False),
+        (product({"TARGPROP": "HD 1", "FILTER": "F430M"}), False),
+        (product({"TARGPROP": "HD 1", "INSTRUME": "X"}), False),
+    ):
+        assert _alike(one, other) == _alike(other, one) == together  # type: ignore[arg-type]
+    assert not _alike(product({}), product({}))  # type: ignore[arg-type]
+    assert _alike(product({"TARGNAME": "b"}), product({"TARGNAME": "b"}))  # type: ignore[arg-type]
+
+
+def turn(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

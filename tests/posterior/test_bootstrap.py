@@ -14,7 +14,7 @@ from amibayes.data.point_source import point_source
 from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.posterior.bootstrap import bootstrap, exposures_of
+from amibayes.posterior.bootstrap import _numbered, bootstrap, exposures_of
 
 TRUTH = np.array([120.0, -60.0, 0.05])
 
@@ -87,3 +87,14 @@ def test_few_exposures_are_refused(rng) -> None:
     result = search(Likelihood(data), (80.0, 200.0))
     with pytest.raises(DataError, match="4 exposures, too few"):
         bootstrap(result, ExtraNoise(), 5, rng)
+
+
+@pytest.mark.parametrize(("seconds", "exposures"), [(0.0, 1), (50.0, 1), (70.0, 2)])
+def test_tables_whose_mean_dates_differ_by_a_minute_are_of_one_exposure(
+    seconds: float, exposures: int
+) -> None:
+    """V² and closure phases of a file, and those of another file at the same time."""
+    keys = np.array([[0, 0, 1], [0, 1, 2], [0, 0, 0]])
+    number = _numbered(keys, 60000.0 + np.array([0.0, seconds, 0.0]) / 86400.0)
+    assert len(set(number[:2].tolist())) == exposures
+    assert number[2] not in number[:2]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import niriss, simulated
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from amibayes.companion_search.search import search
 from amibayes.companion_search.second_companion import search_second
@@ -19,8 +20,8 @@ from amibayes.models.binary import BinaryModel
 from amibayes.posterior import evidence
 from amibayes.posterior.evidence import compare_models, log_evidence_importance
 from amibayes.posterior.grid import grid_posterior
-from amibayes.posterior.laplace import log_evidence_laplace
-from amibayes.posterior.priors import default_prior
+from amibayes.posterior.laplace import log_evidence_laplace, log_masses
+from amibayes.posterior.priors import Prior, default_prior
 from amibayes.posterior.sampler import draw_posterior
 
 FIELD = (50.0, 400.0)
@@ -258,3 +259,23 @@ def test_few_draws_of_importance_scatter_as_stated_about_the_grid(monkeypatch) -
     pulls = (found[:, 0] - found[:, 0].mean()) / found[:, 1]
     low, high = chi2.ppf([5e-5, 1.0 - 5e-5], len(found) - 1)
     assert low < pulls @ pulls < high
+
+
+def test_laplace_cuts_gaussians_off_at_both_ends_of_a_range() -> None:
+    """A nuisance parameter that is known, by its range, to a part of its own error."""
+    model = BinaryModel(diameter_mas="free")
+    data = simulated(niriss(), [150.0, -80.0, 0.05, 40.0], None, model)
+    likelihood = Likelihood(data, model)
+    mode = SimpleNamespace(theta=(150.0, -80.0, 0.05, 40.0))
+    sigma = float(np.sqrt(likelihood.errors(np.array(mode.theta))[3, 3]))
+    assert 6.0 * sigma < 40.0
+
+    def mass(low: float, high: float) -> float:
+        prior = Prior(50.0, 400.0, 1e-4, 1.0, nuisance=((40.0 + low * sigma, 40.0 + high * sigma),))
+        # Of the density over the range, the Gaussian's share times its width.
+        return float(log_masses(likelihood, [mode], prior)[0] + np.log(high - low))  # type: ignore[list-item]
+
+    whole = mass(-6.0, 6.0)
+    for low, high in ((-0.5, 1.0), (-1.5, 0.2), (-6.0, 0.0)):
+        share = np.log(norm.cdf(high) - norm.cdf(low))
+        assert mass(low, high) - whole == pytest.approx(share, abs=1e-5)

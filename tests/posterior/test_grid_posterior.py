@@ -18,8 +18,8 @@ from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.models.binary import BinaryModel
-from amibayes.posterior.grid import GridPosterior, grid_posterior
-from amibayes.posterior.integrand import polar_cells
+from amibayes.posterior.grid import GridPosterior, grid_posterior, integrable
+from amibayes.posterior.integrand import Integrand, polar_cells
 from amibayes.posterior.nuisance import log_evidence_none
 from amibayes.posterior.priors import Prior, default_prior, edit_prior, parse_setting
 
@@ -267,3 +267,36 @@ def test_evidence_of_a_star_that_does_not_fit_has_its_tails() -> None:
     expected = log.max() + np.log(np.trapezoid(np.exp(log - log.max()), x))
     assert alone.chi2(result.single_theta[None])[0] > 10.0 * likelihood.n_independent
     assert log_evidence_none(likelihood, prior) == pytest.approx(expected, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, True),
+        ({"diameter_mas": "free"}, True),
+        ({"companion_diameter_mas": "free"}, False),
+        ({"fastest_mas_yr": 50.0}, False),
+        ({"companions": 2}, False),
+        ({"companion_diameter_mas": "free", "fastest_mas_yr": 50.0}, False),
+    ],
+)
+def test_models_whose_dimensions_the_grid_has(options: dict[str, object], *, expected) -> None:
+    likelihood = Likelihood(niriss(), BinaryModel(**options))  # type: ignore[arg-type]
+    assert integrable(likelihood) is expected
+
+
+def test_gains_of_cells_are_those_of_their_noise() -> None:
+    """Twice that in ln L where errors are stated; no more than the data can give else."""
+    likelihood, prior = problem([150.0, -80.0, 0.01])
+    peak = np.array([0.0, 3.0, 40.0])
+    work = Integrand(likelihood, prior)
+    np.testing.assert_allclose(work.delta_chi2(work.best_none + peak), 2.0 * peak, rtol=1e-9)
+    data = replace(
+        likelihood.observables, covariance_kind="estimated", n_integrations=60, scatter=None
+    )
+    estimated = Integrand(Likelihood(data), prior)
+    gains = np.array([0.0, 3.0, 1e4])
+    found = estimated.delta_chi2(estimated.best_none + gains)
+    exact = estimated.likelihood.noise.delta_chi2(gains)
+    np.testing.assert_allclose(found[:2], exact[:2])
+    assert found[2] == pytest.approx(max(estimated.most, 2e4))

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import emcee
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from scipy.integrate import cumulative_simpson
 
 from amibayes.companion_search.search import search
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.posterior.ensemble import sample
-from amibayes.posterior.priors import Prior, default_prior
+from amibayes.posterior.priors import Prior, Range, default_prior
 
 FIELD = (50.0, 400.0)
 
@@ -148,3 +150,42 @@ def test_inference_data_without_arviz_says_what_to_install(found, monkeypatch) -
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(UsageError, match=r"pip install 'amibayes\[arviz\]'"):
         posterior.to_inference_data()
+
+
+RANGES = {
+    "uniform": (Range(-0.5, 2.0), lambda x: np.ones_like(x)),
+    "half-Cauchy": (Range(0.3, 4.0, 0.7), lambda x: 1.0 / (1.0 + (x / 0.7) ** 2)),
+    "logarithmic": (Range(0.2, 9.0, logarithmic=True), lambda x: 1.0 / x),
+}
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_laws_of_ranges_are_integrals_of_their_densities(name: str) -> None:
+    law, shape = RANGES[name]
+    x = np.linspace(law.low, law.high, 20_001)
+    total = cumulative_simpson(shape(x), x=x, initial=0.0)
+    np.testing.assert_allclose(law.cdf(x), total / total[-1], atol=1e-8)
+    np.testing.assert_allclose(law.log_density(x), np.log(shape(x) / total[-1]), atol=1e-8)
+    np.testing.assert_allclose(law.quantile(law.cdf(x)), x, rtol=1e-9)
+    beyond = np.array([law.low - 0.1, law.high + 0.1])
+    np.testing.assert_array_equal(law.cdf(beyond), [0.0, 1.0])
+    assert np.isneginf(law.log_density(beyond)).all()
+
+
+def test_a_prior_is_described_by_all_that_it_has() -> None:
+    plain = Prior(50.0, 400.0, 1e-4, 0.5)
+    assert plain.description == "uniform in area, log-uniform in contrast"
+    other = replace(plain, position_form="separation", contrast_form="uniform")
+    assert other.description == "uniform in separation and angle, uniform in contrast"
+    more = replace(
+        plain,
+        n_contrasts=3,
+        fastest_mas_yr=20.0,
+        nuisance=((0.0, 4.0), (0.0, 1.0)),
+        half_cauchy=(0.7, 0.0),
+    )
+    assert more.description == (
+        "uniform in area, log-uniform in contrast (3 bands, independently), uniform in rate, "
+        "half-Cauchy of 0.7 mas in the star's diameter"
+    )
+    assert [r.scale for r in more.ranges] == [0.7, 0.0]

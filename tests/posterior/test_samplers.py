@@ -8,6 +8,7 @@ from helpers import niriss, simulated
 from scipy.special import logsumexp
 
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.models.binary import BinaryModel
 from amibayes.posterior.chain import EnsembleSampler
 from amibayes.posterior.grid import grid_posterior
 from amibayes.posterior.independence import GridSampler
@@ -108,3 +109,16 @@ def test_walkers_that_cannot_move_give_a_chain_that_is_said_not_to_have_converge
     assert found.diagnostics["split_rhat"] > 1e6
     assert np.isin(found.samples[:, 0], possible).all()
     assert told == [(500, 1000), (1000, 1000)]
+
+
+def test_of_two_companions_the_brighter_one_comes_first(rng: np.random.Generator) -> None:
+    """Whatever else the pair has, it is the same pair."""
+    likelihood = Likelihood(niriss(), BinaryModel(companions=2))
+    prior = ModelPrior(Prior(50.0, 400.0, 1e-4, 1.0), likelihood.parameters)
+    cube = rng.random((50, prior.n_dim))
+    plain, found = prior.prior.from_cube(cube), prior.from_cube(cube)
+    pairs = (a.reshape(50, 2, 3) for a in (plain, found))
+    for before, after in zip(*pairs, strict=True):
+        assert after[0, 2] >= after[1, 2]
+        order = np.argsort(-before[:, 2])
+        np.testing.assert_array_equal(after, before[order])

@@ -24,7 +24,7 @@ from amibayes.scene.sources import (
     SkyImage,
     UniformDisc,
 )
-from amibayes.scene.spectrum import Tabulated
+from amibayes.scene.spectrum import Tabulated, read_spectrum, spectrum_named
 from amibayes.units import DEGREE, MAS, FloatArray, offset
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "paper_scene.toml"
@@ -396,3 +396,36 @@ def test_parts_of_a_scene_add_up() -> None:
     )
     # Windows of the convolution differ with the width of what is convolved.
     np.testing.assert_allclose(whole, sum(each), atol=1e-6 * whole.max())
+
+
+def test_a_spectrum_is_read_from_a_table(tmp_path: Path) -> None:
+    """Wavelengths in µm, flux per wavelength: photons are their product."""
+    path = tmp_path / "s.txt"
+    path.write_text("# um flux other\n4.0 2.0 9\n4.2 3.0 9\n4.6 1.0 9\n", encoding="utf-8")
+    found = spectrum_named(str(path))
+    assert isinstance(found, Tabulated)
+    assert found.name == "s.txt"
+    np.testing.assert_allclose(found.wavelength_m, [4.0e-6, 4.2e-6, 4.6e-6])
+    np.testing.assert_array_equal(found.flux_density, [2.0, 3.0, 1.0])
+    np.testing.assert_allclose(
+        found.photon_density(np.array([4.0e-6, 4.4e-6])), [4.0 * 2.0, 4.4 * 2.0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (None, "cannot be read"),
+        ("4.0\n4.2\n", "needs two columns of finite numbers"),
+        ("4.0 nan\n4.2 1\n", "needs two columns of finite numbers"),
+        ("4.0 a\n", "is not a table of numbers"),
+    ],
+)
+def test_tables_that_are_no_spectrum_are_named(
+    text: str | None, fault: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "s.txt"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(DataError, match=fault):
+        read_spectrum(path)

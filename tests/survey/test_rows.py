@@ -179,3 +179,14 @@ def test_a_survey_that_sees_nothing_counts_nothing() -> None:
     assert suggested_box([]) is None
     content = survey_json("search", 1, [blind], whole=True)
     assert content["companion_frequency"] is None
+
+
+def test_an_entry_says_what_went_wrong_and_what_a_star_is() -> None:
+    facts = {"distance_pc": 12.0, "mass_table": "a.csv", "unknown": 1}
+    done = Outcome("a", "done", key="k", row={"files": ["t"]}, facts=facts, chosen="b (2 deg)")
+    assert done.entry() == {
+        "name": "a", "status": "done", "error": None, "key": "k", "distance_pc": 12.0,
+        "chosen_calibrators": "b (2 deg)", "files": ["t"],
+    }  # fmt: skip
+    failed = Outcome("a", "failed", "no light")
+    assert failed.entry() == {"name": "a", "status": "failed", "error": "no light", "key": ""}

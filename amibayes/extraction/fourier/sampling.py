@@ -179,15 +179,14 @@ class OneEach:
         """All orders that matter of a faint star; see `low_flux.observable_covariance`."""
         # In units of the flux, so that single precision holds it.
         samples, noise = samples / flux, self.covariance(variance / flux**2)
-        share, slope = self.shares(1.0, samples), self.jacobian(1.0, samples)
+        share, slope = self.shares(samples), self.jacobian(1.0, samples)
         numbers, third = self.single.T[:-1], skewness / flux**3
         return observable_covariance(samples, self.triangles, noise, share, slope, numbers, third)
 
-    def shares(self, flux: float, samples: ComplexArray) -> FloatArray:
-        """V² as a sum of squares of the numbers: their shares (n_baselines, n_numbers)."""
-        each = np.eye(self.n_samples) / flux**2
-        power = self.power(samples[None])[0]
-        return np.column_stack([-power / flux**4, each, each])
+    def shares(self, samples: ComplexArray) -> FloatArray:
+        """V², of a flux of 1, as a sum of squares of the numbers: (n_baselines, n_numbers)."""
+        each = np.eye(self.n_samples)
+        return np.column_stack([-self.power(samples[None])[0], each, each])
 
     def jacobian(self, flux: float, samples: ComplexArray) -> FloatArray:
         """Derivatives of V² and closure phase by the numbers, at one set of samples.

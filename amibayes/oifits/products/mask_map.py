@@ -107,7 +107,7 @@ def _logged(product: Product) -> FloatArray | None:
 
 
 def _text(table: OITable) -> str:
-    parts = (np.asarray(column).ravel() for column in table.columns.values())
+    parts = (np.asarray(column) for column in table.columns.values())
     return "".join(p.astype(np.uint8).tobytes().decode("utf-8", "replace") for p in parts)
 
 
