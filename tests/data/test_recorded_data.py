@@ -89,7 +89,6 @@ def test_block_covariances_are_those_recorded(num_regression) -> None:
         against=whole.against(addition, x[:, 0]),
         sparse=whole.sparse,
         independent=whole.independent,
-        entries=whole.entries,
         from_matrix=covariance_from_matrix(plain.dense()),
         joint=BlockCovariance(4, [Block(np.arange(4), root @ root.T + low[:4] @ low[:4].T)]),
     )
