@@ -218,7 +218,8 @@ def _disc_like_the_data(wide: Likelihood, result: SearchResult, disc: Extended) 
     tried = np.empty((len(shapes), len(wide.parameters)))
     for k, name in enumerate(wide.parameters.names):
         tried[:, k] = shapes[:, names.index(name)] if name in names else result.nuisance(name)
-    return np.asarray(tried[wide.chi2(tried).argmin()])
+    chi2 = np.concatenate([wide.chi2(part) for part in wide.in_parts(tried)])
+    return np.asarray(tried[chi2.argmin()])
 
 
 def _extended_light(likelihood: Likelihood, result: SearchResult) -> Alternative:

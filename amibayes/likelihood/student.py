@@ -299,7 +299,7 @@ def student_terms(
         for kind, which, typical in kinds_of(data, here):
             share = symmetric.share[which]
             rows = csr_array(diags_array(1.0 / np.sqrt(share)) @ symmetric.rows[which])
-            used = rows.count_nonzero(axis=0) > 0
+            used = abs(rows).sum(axis=0) > 0.0
             log_det = covariance.select(np.flatnonzero(which)).logdet()
             term = StudentTerm(
                 kind, covariance.whitening[used], share, typical, log_det,
