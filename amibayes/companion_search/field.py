@@ -96,14 +96,15 @@ def look_outside(result: SearchResult) -> float | None:
 
     As far as the channels allow, within `MAX_LOOKED_AT` and `MAX_WORK`. An alias of what was
     found is left out: it fits as well by the geometry alone. One of several thousand in Δχ² is
-    told from it by the width of the channels, and may be where the companion is.
+    told from it by the width of the channels, and may be where the companion is. Where there is
+    an alias inside, that the sky repeats itself is said already.
 
     Returns
     -------
     float or None
         Its separation in mas; None where nothing outside is as good.
     """
-    if result.delta_chi2 < PERHAPS_NOT_NOISE:
+    if result.delta_chi2 < PERHAPS_NOT_NOISE or result.aliases:
         return None
     likelihood, outer = result.likelihood, result.grid.outer_mas
     fringe = resolution_mas(likelihood)

@@ -45,7 +45,7 @@ def found_in(grid: Any, gain: float, **options: Any) -> Any:
     known: dict[str, Any] = {"delta_chi2": 100.0, "single_theta": np.empty(0), "chi2_single": 150.0}
     bank_gain = np.array([0.2 * gain, gain, 0.0])
     likelihood = Likelihood(niriss())
-    known["companion"] = Companion(0.0, 90.0, 0.01)
+    known |= {"companion": Companion(0.0, 90.0, 0.01), "aliases": ()}
     return SimpleNamespace(
         grid=grid, bank_gain=bank_gain, likelihood=likelihood, **(known | options)
     )
@@ -166,6 +166,7 @@ def test_a_look_inside_has_a_bounded_number_of_places(looked: SimpleNamespace) -
         ({"delta_chi2": 19.9}, 1e3, 1e3, False),
         ({"delta_chi2": 20.0}, 1e3, 1e3, True),
         ({"delta_chi2": 1e5}, 1e3, 1e3, True),
+        ({"aliases": (None,)}, 1e3, 1e3, False),
         ({}, 70.9, 1e3, False),  # 0.8 · 100 − 9
         ({}, 71.1, 1e3, True),
         ({}, 1e3, 90.9, False),  # the fit of 100, less 9
@@ -173,7 +174,7 @@ def test_a_look_inside_has_a_bounded_number_of_places(looked: SimpleNamespace) -
     ],
 )
 def test_a_place_outside_counts_where_it_is_as_good(
-    options: dict[str, float],
+    options: dict[str, Any],
     gain: float,
     fitted: float,
     seen: bool,
