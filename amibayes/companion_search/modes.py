@@ -30,17 +30,11 @@ def with_exchanged(
     A contrast is 1 at most: of two stars that are equal within the errors the one that is taken
     for the companion may be either, and the positions are opposite.
     """
-    parameters = likelihood.parameters
-    bright = [m for m in modes if parameters.companions == 1 and _contrast(m) > NEARLY_EQUAL]
-    fits = [
-        refine(likelihood, _exchanged(likelihood, np.array(m.theta)), box, deviance_single)
-        for m in bright[:1]
-    ]
-    return [*modes, *fits]
-
-
-def _contrast(mode: Mode) -> float:
-    return mode.companion.contrast
+    bright = next((m for m in modes if m.contrast > NEARLY_EQUAL), None)
+    if bright is None or likelihood.parameters.companions != 1:
+        return list(modes)
+    start = _exchanged(likelihood, np.array(bright.theta))
+    return [*modes, refine(likelihood, start, box, deviance_single)]
 
 
 def _exchanged(likelihood: Likelihood, theta: FloatArray) -> FloatArray:

@@ -149,7 +149,11 @@ class Mode:
         )
 
 
-def is_opposite(mode: Mode, place: FloatArray, within_mas: float = 1e-2) -> bool:
+OPPOSITE_MAS = 1e-2
+"""Distance from the opposite place up to which two fits are mirror images: their rounding."""
+
+
+def is_opposite(mode: Mode, place: FloatArray, within_mas: float = OPPOSITE_MAS) -> bool:
     """Whether a mode is the mirror image of a place, mas."""
     return bool(np.hypot(*np.add(mode.place, place)) < within_mas)
 

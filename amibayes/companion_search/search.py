@@ -17,7 +17,14 @@ from amibayes.companion_search.modes import (
     with_exchanged,
 )
 from amibayes.companion_search.optimise import fit_single, global_check
-from amibayes.companion_search.result import RIVAL, Mode, SearchResult, companions_of, is_opposite
+from amibayes.companion_search.result import (
+    OPPOSITE_MAS,
+    RIVAL,
+    Mode,
+    SearchResult,
+    companions_of,
+    is_opposite,
+)
 from amibayes.companion_search.scan import ScanResult
 from amibayes.companion_search.seeds import (
     NOT_FAINT,
@@ -305,7 +312,7 @@ def _warnings(
     warnings, here = [], np.array(modes[0].place)
     # The fit of stars that have changed places is not quite at the opposite place.
     equal = modes[0].contrast > NEARLY_EQUAL
-    within = 0.25 * resolution_mas(likelihood) if equal else 1e-2
+    within = 0.25 * resolution_mas(likelihood) if equal else OPPOSITE_MAS
     opposite = [m for m in modes[1:] if is_opposite(m, here, within)]
     if not likelihood.observables.n_closure_phases:
         if any(m in aliases for m in opposite):

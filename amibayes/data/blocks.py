@@ -193,6 +193,7 @@ class Stack:
         return np.asarray((left @ right).swapaxes(1, 2))
 
 
+Factors = tuple[FloatArray, FloatArray]
 LARGE = 16
 """Data of a block from which on full matrices are faster: five times for 120 triangles."""
 
@@ -221,7 +222,9 @@ class BlockCovariance:
         everywhere = np.concatenate([np.empty(0, np.intp), *(s.index.ravel() for s in self.stacks)])
         if len(everywhere) != size or not np.array_equal(np.sort(everywhere), np.arange(size)):
             raise ValueError("the blocks of a covariance have to tile the data vector")
-        self.whitening, colouring, self._logdet = self._assemble()
+        factors = [stack.factors() for stack in self.stacks]
+        self.whitening, colouring, self._logdet = self._assemble(factors)
+        self._full = [white if white.shape[2] >= LARGE else None for white, _ in factors]
         self.colouring = csr_array(colouring.T)
         self._unwhitening = self.whitening.T.tocsr()
         self.rank = int(self.whitening.shape[0])
@@ -253,14 +256,11 @@ class BlockCovariance:
         rank = sum(len(s.index) * s.shape[1] for s in self.stacks)
         return csr_array((values, self._places), shape=(rank, self.size))
 
-    def _assemble(self) -> tuple[csr_array, csr_array, float]:
+    def _assemble(self, factors: Sequence[Factors]) -> tuple[csr_array, csr_array, float]:
         """Whitening and transposed colouring, (rank, size), and ln of the determinant."""
-        factors = [stack.factors() for stack in self.stacks]
         colours = [colour.swapaxes(1, 2) for _, colour in factors]
-        logdet = sum(
-            float(np.linalg.slogdet(c @ colour)[1].sum())
-            for c, (_, colour) in zip(colours, factors, strict=True)
-        )
+        inner = (colour @ colour.swapaxes(1, 2) for colour in colours)
+        logdet = sum(float(np.linalg.slogdet(matrix)[1].sum()) for matrix in inner)
         return self.laid_out([white for white, _ in factors]), self.laid_out(colours), logdet
 
     @property
@@ -274,7 +274,7 @@ class BlockCovariance:
     @property
     def has_large_blocks(self) -> bool:
         """Whether a block is large enough to be whitened as a full matrix."""
-        return any(s.shape[0] >= LARGE for s in self.stacks)
+        return any(white is not None for white in self._full)
 
     @cached_property
     def _parts(self) -> list[tuple[slice, IntArray | None, Any]]:
@@ -282,8 +282,8 @@ class BlockCovariance:
         last = np.cumsum([len(s.index) * s.shape[1] for s in self.stacks]).tolist()
         rows = [slice(*ends) for ends in pairwise([0, *last])]
         return [
-            (at, None, self.whitening[at]) if s.shape[0] < LARGE else (at, s.index, s.factors()[0])
-            for at, s in zip(rows, self.stacks, strict=True)
+            (at, None, self.whitening[at]) if white is None else (at, stack.index, white)
+            for at, stack, white in zip(rows, self.stacks, self._full, strict=True)
         ]
 
     def whiten(self, x: FloatArray) -> FloatArray:

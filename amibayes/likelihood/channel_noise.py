@@ -168,7 +168,7 @@ class ChannelCovariance:
         colour = csr_array(self._colouring)
         return np.asarray((colour @ colour.T).toarray())
 
-    @property
+    @cached_property
     def symmetric(self) -> csr_array:
         """Rows (size, rank) of the symmetric whitening; see `Covariance.symmetric`."""
         return csr_array(self.base.symmetric @ self.rows.rotation.T)

@@ -60,6 +60,18 @@ def test_light_far_off_the_axis_is_no_hot_pixel(contrast: float, step: tuple[flo
     assert made.reference.good.all()
 
 
+def misfits(image: np.ndarray, model: np.ndarray) -> list[list[int]]:
+    """Rows and columns of hot pixels of an image that is fitted by a model of one shape."""
+    fit = SimpleNamespace(
+        design=model.reshape(-1, 1),
+        inverse=np.zeros((1, model.size)),
+        solve=lambda _: np.ones((1, 1)),
+    )
+    good = np.ones(model.shape, dtype=bool)
+    found = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
+    return np.argwhere(found).tolist()
+
+
 @pytest.mark.parametrize(
     ("sizes", "expected"),
     [((0.8, 0.0), []), ((1.3, 0.8), [0]), ((3.0, 1.3), [0]), ((2.5, -1.4), [0, 1])],
@@ -74,14 +86,7 @@ def test_a_misfit_in_the_dark_is_hot_by_a_share_of_the_peak(
     image = model.copy()
     for place, size in zip(places, sizes, strict=True):
         image[place] += size * FAINT * 50.0
-    fit = SimpleNamespace(
-        design=model.reshape(-1, 1),
-        inverse=np.zeros((1, model.size)),
-        solve=lambda _: np.ones((1, 1)),
-    )
-    good = np.ones(model.shape, dtype=bool)
-    found = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
-    assert np.argwhere(found).tolist() == sorted([list(places[k]) for k in expected])
+    assert misfits(image, model) == sorted([list(places[k]) for k in expected])
 
 
 @pytest.mark.parametrize(("size", "found"), [(0.8, 0), (1.3, 1)])
@@ -94,14 +99,7 @@ def test_a_misfit_beside_modelled_light_is_hot_by_a_share_of_it(
     model[12, 12], model[3, 3] = sign * 50.0, 60.0
     image = model.copy()
     image[14, 11] += size * LIGHT * 50.0
-    fit = SimpleNamespace(
-        design=model.reshape(-1, 1),
-        inverse=np.zeros((1, model.size)),
-        solve=lambda _: np.ones((1, 1)),
-    )
-    good = np.ones(model.shape, dtype=bool)
-    hot = _misfitting(image, good, np.zeros(model.shape), fit)  # type: ignore[arg-type]
-    assert np.argwhere(hot).tolist() == [[14, 11]] * found
+    assert misfits(image, model) == [[14, 11]] * found
 
 
 @pytest.mark.parametrize("place", [(0, 0), (0, 9), (11, 4), (5, 6), (19, 19)])
