@@ -1,8 +1,7 @@
-"""Nonlinear fits with NLopt: without a companion, from a seed, and over the whole field."""
+"""Nonlinear fits with NLopt: without a companion, and from a seed."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import nlopt
@@ -10,19 +9,22 @@ import numpy as np
 from scipy.stats import qmc
 
 from amibayes.companion_search.result import Mode, mode_of
-from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.models.parameters import Box
+from amibayes.models.parameters import Box, Parameters
 from amibayes.units import FloatArray, IntArray
 
-SPREAD_STARTS, BEST_STARTS = 2048, 8
-"""Points of a fit of extended light, and how many of the best ones are fitted to the end."""
+MIN_SPREAD, MAX_SPREAD, SPREAD_WORK = 2048, 8192, 4e6
+"""Points of a fit of extended light: fewer where that would be more model values."""
+
+BEST_STARTS, APART = 8, 0.25
+"""How many of the best points are fitted to the end, and how far apart these are in one parameter
+at least, as a part of its range. Of 2048 points the very best led to another minimum one fit in
+five."""
 
 Objective = Callable[[FloatArray, FloatArray], float]
 
-
-EVALUATIONS_PER_FRINGE, MIN_EVALUATIONS, MAX_EVALUATIONS = 40, 400, 3000
-"""Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
+Fit = tuple[FloatArray, float]
+"""Parameters, and deviance or χ²."""
 
 
 ROUNDS, TOLERANCE, EVALUATIONS = 3, 1e-9, 200
@@ -65,10 +67,15 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
 
     A ``known`` fit of nearly the same problem, (n_nuisance,), is one of the starting points.
     """
+    return fits_single(likelihood, known)[0]
+
+
+def fits_single(likelihood: Likelihood, known: FloatArray | None = None) -> list[Fit]:
+    """All fits without a companion, from several starting points, the best first."""
     without = single_likelihood(likelihood)
     bounds = np.array(without.parameters.bounds(without.parameters.nuisance)).reshape(-1, 2)
     if not len(bounds):
-        return np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0])
+        return [(np.empty(0), float(without.deviance(without.chi2(np.empty((1, 0))))[0]))]
     lower, width = bounds[:, 0], bounds[:, 1] - bounds[:, 0]
     scale = np.maximum(lower + FINEST_STEP * width, 1e-6)
     objective = _objective(without, scale)
@@ -80,27 +87,45 @@ def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple
     ladders = [lower + part * width for part in (parts if several else parts[:1])]
     starts = [_best_of(without.chi2, ladder) for ladder in ladders]
     starts = sorted(starts, key=lambda start: start[1])[:STAR_FITS]
+    # Angles go round: a fit that passes the end of their range goes on.
+    turn = np.where([p.unit == "deg" for p in without.parameters], width, 0.0)
+    bounds = bounds + np.outer(turn, [-1.0, 1.0])
     fits = [_minimise(objective, start, scale, bounds) for start, _ in starts]
+    if likelihood.model.surroundings:
+        n = np.clip(SPREAD_WORK / len(without.samples), MIN_SPREAD, MAX_SPREAD)
+        even = qmc.Sobol(len(bounds), rng=np.random.default_rng(0)).random_base2(int(np.log2(n)))
+        ladders.append(lower + even ** _powers(without.parameters) * width)
+        chi2 = [without.chi2(part) for part in without.in_parts(ladders[-1])]
+        best = _apart(even, np.concatenate(chi2))
+        fits += [_minimise(objective, ladders[-1][k], scale, bounds) for k in best]
     if several and likelihood.observables.n_vis2:
         fits += _across_walls(without, objective, ladders, fits, scale, bounds)
     if known is not None:
         fits.append(_minimise(objective, known, scale, bounds))
-    if likelihood.model.surroundings:
-        # Extended light has several parameters, and its flux is mostly small.
-        even = qmc.Sobol(len(bounds), rng=np.random.default_rng(0)).random(SPREAD_STARTS)
-        spread = lower + even**2 * width
-        best = np.argsort(without.chi2(spread), kind="stable")[:BEST_STARTS]
-        fits += [_minimise(objective, spread[k], scale, bounds) for k in best]
-    return min(fits, key=lambda fit: fit[1])
-
-
-Fit = tuple[FloatArray, float]
-"""Parameters, and deviance or χ²."""
+    fits.sort(key=lambda fit: fit[1])
+    return [(np.where(turn > 0.0, lower + (x - lower) % width, x), value) for x, value in fits]
 
 
 def _best_of(chi2: Callable[[FloatArray], FloatArray], thetas: FloatArray) -> Fit:
     found = chi2(thetas)
     return thetas[np.argmin(found)], float(found.min())
+
+
+def _powers(parameters: Parameters) -> FloatArray:
+    """Powers of even numbers that are parts of ranges: most fluxes and sizes are small ones."""
+    power = np.ones(len(parameters))
+    power[parameters.discs] = 2.0
+    power[[p.unit == "" and p.upper > 1.0 for p in parameters]] = 4.0
+    return power
+
+
+def _apart(points: FloatArray, chi2: FloatArray) -> list[int]:
+    """Some of the best of points (n, n_dim), none near a better one."""
+    left, found = np.ones(len(points), dtype=bool), list[int]()
+    while left.any() and len(found) < BEST_STARTS:
+        found.append(int(np.argmin(np.where(left, chi2, np.inf))))
+        left &= np.abs(points - points[found[-1]]).max(axis=1) > APART
+    return found
 
 
 def _across_walls(
@@ -250,42 +275,6 @@ def widest_steps(likelihood: Likelihood, box: Box) -> FloatArray:
     discs = np.intersect1d(parameters.columns("shape"), parameters.discs)
     widest[discs] = 0.3 * box.fringe_mas
     return widest
-
-
-def global_check(
-    likelihood: Likelihood,
-    coarse: Likelihood,
-    bank: TemplateBank,
-    box: Box,
-    single: FloatArray,
-    deviance_single: float,
-) -> Mode:
-    """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
-
-    It shares neither the lattice nor the choice of peaks with the search. A field of very
-    many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
-    ``coarse``, the same data or those with their channels averaged.
-    """
-    best_at = bank.matched_filter(single_likelihood(coarse).residuals(single)[:, 0])
-
-    def inside(position: FloatArray) -> bool:
-        return box.inner_mas <= math.hypot(*position) <= box.outer_mas
-
-    def loss(position: FloatArray, _: FloatArray) -> float:
-        return -best_at(position)[1] if inside(position) else 0.0
-
-    optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
-    optimiser.set_lower_bounds([-box.outer_mas] * 2)
-    # The box is a little lopsided so that its first trial is not the star itself.
-    optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
-    optimiser.set_min_objective(loss)
-    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
-    wanted = int(EVALUATIONS_PER_FRINGE * patches)
-    optimiser.set_maxeval(min(max(wanted, MIN_EVALUATIONS), MAX_EVALUATIONS))
-    start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
-    position = np.asarray(optimiser.optimize(start))
-    position = position if inside(position) else start
-    return refine_at(likelihood, position, best_at(position)[0], single, box, deviance_single)
 
 
 def refine_at(

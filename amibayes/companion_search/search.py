@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import nlopt
 import numpy as np
 
 from amibayes.companion_search.field import default_separation, resolution_mas
@@ -16,7 +18,7 @@ from amibayes.companion_search.modes import (
     innermost_first,
     with_exchanged,
 )
-from amibayes.companion_search.optimise import fit_single, global_check
+from amibayes.companion_search.optimise import Fit, fits_single, refine_at
 from amibayes.companion_search.result import (
     OPPOSITE_MAS,
     RIVAL,
@@ -51,11 +53,18 @@ AFFORDABLE_WORK = 1e8
 """Positions times data of a search, beyond which the lattice is made coarser: ten thousand null
 searches of that take half a minute."""
 
+EVALUATIONS_PER_FRINGE, MIN_EVALUATIONS, MAX_EVALUATIONS = 40, 400, 3000
+"""Size of the global check: per patch (λ/B_max)² of the field, and its limits."""
+
 MAX_POSITIONS = 2_000_000
 """Positions of a search: more would take hours and all the memory."""
 
 MAX_NUISANCE_ROUNDS = 3
 """How often the exact map is made with the nuisance parameters of the best fit so far."""
+
+ANOTHER_MINIMUM, MAX_OTHER_STARS = 0.1, 3
+"""Difference in χ² of fits of light around the star that are not of one minimum, and how many of
+them are tried beside the best."""
 
 MISFIT = 10.0
 """Reduced χ² of the best fit from which other sizes of the star are tried."""
@@ -102,12 +111,13 @@ def search(
     inner, outer = separation_mas or default_separation(likelihood)
     box = Box(inner, outer, resolution_mas(likelihood))
     grid = _grid(likelihood, box)
-    single, deviance_single = fit_single(likelihood, single)
+    stars = fits_single(likelihood, single)
+    single, deviance_single = stars[0]
     bank = TemplateBank(likelihood, grid, single)
     residuals = single_likelihood(likelihood).residuals(single)[:, 0]
     survey = bank.survey(residuals)
     coarse = coarse_likelihood(likelihood, box)
-    found = _fits(likelihood, coarse, grid, survey, single, box, deviance_single, known)
+    found = _fits(likelihood, coarse, grid, survey, stars, box, known)
     # Where no peak is worth a fit, the global optimiser's is the one solution.
     checked = None if found else _checked(likelihood, coarse, grid, box, single, deviance_single)
     every = _all_modes(likelihood, found if checked is None else [checked], box, deviance_single)
@@ -174,7 +184,7 @@ def _checked(
         grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas)
     # Combining the data for some hundred positions would take longer than it saves.
     bank = TemplateBank(coarse, grid, single)
-    return global_check(likelihood, coarse, bank, box, single, deviance_single)
+    return _best_by_direct(likelihood, coarse, bank, box, single, deviance_single)
 
 
 def _solutions(
@@ -253,16 +263,17 @@ def _fits(
     coarse: Likelihood,
     grid: Grid,
     survey: ScanResult,
-    single: FloatArray,
+    alone: Sequence[Fit],
     box: Box,
-    deviance_single: float,
     known: FloatArray | None,
 ) -> list[Mode]:
     """Local fits from the peaks of the linear map, and of the exact one where it may differ.
 
     The star alone takes a part of a bright companion's light for its own disc: the exact map
-    is made again with the star of the best fit, until that stays.
+    is made again with the star of the best fit, until that stays. Light around a star makes up
+    for a companion even more: with it the other fits of ``alone``, without one, are tried too.
     """
+    single, deviance_single = alone[0]
     seeds = linear_seeds(likelihood, grid, survey, single, box)
     if known is not None:
         seeds = np.vstack([seeds, known])
@@ -278,8 +289,10 @@ def _fits(
     stars = [single]
     if max(linear, fitted) > NOT_FAINT or _misfits(likelihood, found):
         stars = trial_stars(likelihood, single, box)
+    others = _other_minima(alone) if likelihood.model.surroundings else []
     for _ in range(MAX_NUISANCE_ROUNDS):
-        new = [star for star in stars if _is_new(likelihood, star, tried)]
+        new = [star for star in stars if _is_new(likelihood, star, tried)] + others
+        others = []
         if not new:
             break
         starts = np.vstack([bright_seeds(coarse, star, box) for star in new])
@@ -287,6 +300,13 @@ def _fits(
         best = max(found, key=lambda m: m.delta_chi2)
         stars = [np.array(best.theta)[likelihood.parameters.nuisance]]
     return found
+
+
+def _other_minima(fits: Sequence[Fit]) -> list[FloatArray]:
+    """Parameters of fits, sorted by their χ², that are of another minimum than the first."""
+    values = np.array([value for _, value in fits])
+    other = np.flatnonzero(np.diff(values) > ANOTHER_MINIMUM) + 1
+    return [fits[k][0] for k in other[:MAX_OTHER_STARS]]
 
 
 def _misfits(likelihood: Likelihood, found: Sequence[Mode]) -> bool:
@@ -331,3 +351,39 @@ def _warnings(
             "fit as well; the innermost is reported"
         )
     return tuple(warnings)
+
+
+def _best_by_direct(
+    likelihood: Likelihood,
+    coarse: Likelihood,
+    bank: TemplateBank,
+    box: Box,
+    single: FloatArray,
+    deviance_single: float,
+) -> Mode:
+    """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
+
+    It shares neither the lattice nor the choice of peaks with the search. A field of very
+    many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
+    ``coarse``, the same data or those with their channels averaged.
+    """
+    best_at = bank.matched_filter(single_likelihood(coarse).residuals(single)[:, 0])
+
+    def inside(position: FloatArray) -> bool:
+        return box.inner_mas <= math.hypot(*position) <= box.outer_mas
+
+    def loss(position: FloatArray, _: FloatArray) -> float:
+        return -best_at(position)[1] if inside(position) else 0.0
+
+    optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
+    optimiser.set_lower_bounds([-box.outer_mas] * 2)
+    # The box is a little lopsided so that its first trial is not the star itself.
+    optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
+    optimiser.set_min_objective(loss)
+    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
+    wanted = int(EVALUATIONS_PER_FRINGE * patches)
+    optimiser.set_maxeval(min(max(wanted, MIN_EVALUATIONS), MAX_EVALUATIONS))
+    start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
+    position = np.asarray(optimiser.optimize(start))
+    position = position if inside(position) else start
+    return refine_at(likelihood, position, best_at(position)[0], single, box, deviance_single)

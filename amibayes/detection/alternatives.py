@@ -44,10 +44,6 @@ OVAL_SIZES, OVAL_ANGLES, OVAL_AXES = 32, 12, np.log([0.5, 0.65, 0.8, 0.92])
 OVAL_FITS = 6
 """Sizes, angles and ratios of the axes that are tried, and fits that are finished."""
 
-DISC_FLUXES, DISC_SIZES, DISC_AXES = (0.03, 0.1, 0.3, 1.0), 8, (0.3, 0.6, 1.0)
-DISC_ANGLES = 6
-"""Fluxes, sizes, ratios of the axes and angles of light around the star that are tried."""
-
 EDGE = 1e-6
 """How far inside of its bounds a fit begins."""
 
@@ -205,30 +201,13 @@ def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative
     return Alternative("elongated star", 2.0 * float(fit.cost) + max(more, 0), words)
 
 
-def _disc_like_the_data(wide: Likelihood, result: SearchResult, disc: Extended) -> FloatArray:
-    """Best of some discs (n_dim,), around the star of the search, from which a fit begins.
-
-    Those that a fit of its own starts from may be ten times as bright as the star: the best of
-    them are of a minimum in which the star is a faint part of its disc.
-    """
-    names = [p.name for p in disc.parameters]
-    angles = np.linspace(0.0, 180.0, DISC_ANGLES, endpoint=False)
-    sizes = resolution_mas(wide) * np.geomspace(0.25, 4.0, DISC_SIZES)
-    shapes = np.array(list(product(DISC_FLUXES, sizes, DISC_AXES, angles)))
-    tried = np.empty((len(shapes), len(wide.parameters)))
-    for k, name in enumerate(wide.parameters.names):
-        tried[:, k] = shapes[:, names.index(name)] if name in names else result.nuisance(name)
-    chi2 = np.concatenate([wide.chi2(part) for part in wide.in_parts(tried)])
-    return np.asarray(tried[chi2.argmin()])
-
-
 def _extended_light(likelihood: Likelihood, result: SearchResult) -> Alternative:
     """An inclined Gaussian disc around the star."""
     disc = Extended("gaussian", "halo", smearing=likelihood.model.smearing)
     around = (*likelihood.model.surroundings, disc)
     model = replace(likelihood.model, companions=0, surroundings=around)
     wide = likelihood.with_model(model)
-    theta, chi2 = fit_single(wide, _disc_like_the_data(wide, result, disc))
+    theta, chi2 = fit_single(wide)
     found = dict(zip(wide.parameters.names, theta, strict=True))
     size = found[f"halo_{disc.size}"]
     ratio = size / resolution_mas(likelihood)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import interferometer
 import numpy as np
 import pytest
 from brute_force import coverage
 from helpers import simulated
 from interferometer import darkened_disc, visibilities
+from scipy.special import j0
 
+from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import _without_gradients, fit_single
 from amibayes.data.assumed_covariance import covariance_of_errors
 from amibayes.data.observables import Observables
@@ -17,6 +20,8 @@ from amibayes.data.systematics import Systematics
 from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
+from amibayes.models.extended import Extended, Profile
+from amibayes.units import MAS
 
 COHERENT = 0.003
 """Error of each visibility, which makes closure phases near a null uncertain by radians."""
@@ -97,3 +102,43 @@ def test_a_fit_without_gradients_ends_at_its_bounds(scale: tuple[float, float]) 
         found, value = _without_gradients(loss, np.array([2.0, 1.0]), unit, bounds)
         np.testing.assert_allclose(found, expected, atol=0.01)
         assert value == pytest.approx(((found - bottom) ** 2).sum())
+
+
+@pytest.mark.parametrize(
+    ("name", "profile", "flux", "fringes", "ratio", "angle"),
+    [
+        ("niriss", "ring", 2.97, 2.05, 0.37, 20.0),
+        ("pionier", "uniform", 0.17, 1.79, 0.69, 50.0),
+        ("pionier", "ring", 0.031, 2.04, 0.66, 110.0),
+        ("gravity", "gaussian", 0.017, 3.35, 0.63, 1.0),
+        ("gravity", "ring", 0.029, 1.95, 0.65, 179.0),
+        ("mirc4t", "uniform", 0.183, 3.11, 0.64, 90.0),
+        ("mirc4t", "ring", 0.79, 1.4, 0.81, 150.0),
+    ],
+)
+def test_light_around_a_star_is_fitted_as_well_as_from_the_truth(
+    name: str, profile: Profile, flux: float, fringes: float, ratio: float, angle: float
+) -> None:
+    """Many of these fits ended where the star is a faint part of its disc, or the angle at 180."""
+    sheet = coverage(name, 0.01, np.radians(0.5))
+    disc = Extended(profile, "light", smearing=False)
+    model = BinaryModel(companions=0, diameter_mas="free", smearing=False, surroundings=(disc,))
+    fringe = resolution_mas(Likelihood(sheet, model))
+    size, sine, cosine = fringes * fringe, np.sin(np.radians(angle)), np.cos(np.radians(angle))
+
+    def source(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        x = np.pi * MAS * size * np.hypot(u * sine + v * cosine, ratio * (u * cosine - v * sine))
+        waves = {
+            "gaussian": np.exp(-(x**2) / (4.0 * np.log(2.0))),
+            "uniform": darkened_disc(size, 0.0, x / (np.pi * MAS * size), np.zeros_like(x)),
+            "ring": j0(x),
+        }
+        star = darkened_disc(0.3 * fringe, 0.0, u, v)
+        return np.asarray((star + flux * waves[profile]) / (1.0 + flux)) + 0j
+
+    data = interferometer.observed(sheet, source, np.random.default_rng(7))
+    likelihood = Likelihood(data, model)
+    truth = np.array([0.3 * fringe, flux, size, ratio, angle])
+    found = fit_single(likelihood)[1]
+    assert found < likelihood.chi2(truth[None])[0]
+    assert found < fit_single(likelihood, truth)[1] + 0.5
