@@ -289,7 +289,11 @@ class BankStatistic:
 
 @checks_arguments
 def statistic_of(
-    result: SearchResult, *, stated_errors: bool = False, beside: bool = False
+    result: SearchResult,
+    *,
+    stated_errors: bool = False,
+    beside: bool = False,
+    companion_known: bool = False,
 ) -> BankStatistic:
     """Make the statistic of a search, with the noise that was fitted.
 
@@ -303,11 +307,15 @@ def statistic_of(
     beside : bool
         For a second companion: all that the first one can do by moving or brightening is
         projected out, of the data and of the null sets.
+    companion_known : bool
+        What exposures share is what they do beside the companion that was found. A test whether
+        there is one may not say so: it takes for drift all that is common to exposures.
     """
     likelihood, whitening = null_likelihood(result)
     exposures = None
     if whitening is None and not stated_errors:
-        exposures = exposure_noise(likelihood, result.single_theta)
+        found = result.theta if companion_known else None
+        exposures = exposure_noise(likelihood, result.single_theta, beside=found)
     if exposures is not None:
         likelihood = likelihood.with_noise(exposures.noise)
     made = make_statistic(

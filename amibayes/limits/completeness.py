@@ -16,7 +16,7 @@ from scipy import stats
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.detection.false_alarm import Significance, draws_needed
-from amibayes.detection.statistic import Statistic
+from amibayes.detection.statistic import Statistic, statistic_of
 from amibayes.detection.tails import pareto_quantile
 from amibayes.errors import UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -204,6 +204,8 @@ def _without_companion(
         )
     known = significance.null
     if significance.detected:
+        if test.exposures is not None:
+            test, known = statistic_of(result, companion_known=True), known[:0]
         test = test.with_noise_of(test.likelihood.residuals(result.theta)[:, 0])
         known = known[:0] if test.null_rests_on_residuals else known
     n = max(min(NULL_DRAWS - len(known), int(FRESH_WORK / test.bank.work)), 0)
