@@ -63,6 +63,10 @@ class Statistic(Protocol):
         """Of the data, with the noise that was fitted."""
 
     @property
+    def single(self) -> FloatArray:
+        """The fit without a companion, (n_nuisance,)."""
+
+    @property
     def bank(self) -> TemplateBank:
         """Positions that are searched, and what a companion does there."""
 

@@ -28,6 +28,7 @@ from amibayes.limits.critical import (
     directions_of,
 )
 from amibayes.limits.limit import SHARES, DetectionLimit
+from amibayes.limits.own_drift import with_own_drift
 from amibayes.limits.pooled import Pooled, quantiles
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.parallel import Executor, Journals, Progress, spawn
@@ -154,7 +155,10 @@ def _injected(
     if more := _more(critical, trials):
         further = replace(draws, per_place=more, seed=draws.seed + 1)
         critical = critical.joined(of(further, "more injections"))
-    return critical
+    return with_own_drift(
+        test, threshold, rings, critical, draws.seed,
+        executor=executor, journal=journals.of("drift") if journals else None,
+    )  # fmt: skip
 
 
 def _more(critical: CriticalContrasts, trials: int) -> int:
