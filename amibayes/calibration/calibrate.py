@@ -170,7 +170,7 @@ def calibrate(
     target = _joined(parts, calibrators := list(calibrators))
     keys = keys_of(target, window_days)
     seen = _transfers(calibrators, keys, diameters_mas)
-    serving = _serving(target, calibrators, seen)
+    serving = _serving(target, calibrators, seen, window_days)
     chosen = _method(method, target, [seen[j] for j in serving])
     covariate = _covariate(charge_levels, calibrators, serving, chosen)
     used = [calibrators[j] for j in serving]
@@ -324,7 +324,10 @@ def _diameters(
 
 
 def _serving(
-    target: Observables, calibrators: list[Observables], seen: list[Transfer]
+    target: Observables,
+    calibrators: list[Observables],
+    seen: list[Transfer],
+    window_days: float | None,
 ) -> list[int]:
     """Numbers of the calibrators that have something in common with the target."""
     serving = [j for j, transfer in enumerate(seen) if transfer.seen.any()]
@@ -336,8 +339,9 @@ def _serving(
                 source=target.source,
                 remedy="extract both with one model of the pupil",
             )
+        near = "" if window_days is None else f" within {window_days:g} d"
         raise DataError(
-            f"has no baseline at the same wavelength in common with {names}",
+            f"has no baseline at the same wavelength{near} in common with {names}",
             source=target.source,
             remedy="give calibrators of the same instrument, stations and filter",
         )

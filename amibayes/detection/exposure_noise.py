@@ -91,7 +91,9 @@ class ExposureNoise:
         return replace(self, roots=bank.reduction.roots(self.roots))
 
 
-def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise | None:
+def exposure_noise(
+    likelihood: Likelihood, single: FloatArray, *, beside: FloatArray | None = None
+) -> ExposureNoise | None:
     """Find what exposures share, and how large floors are, from a fit without a companion.
 
     None where no baseline was observed twice in a night and no calibration errors are known, and
@@ -102,6 +104,8 @@ def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise 
     likelihood : Likelihood
     single : (n_nuisance,) float array
         The fit.
+    beside : (n_dim,) float array, optional
+        The fit with a companion, in its place: what is left beside one that is known.
     """
     data = likelihood.observables.unflagged()
     layout, rows = channel_layout(data), likelihood.noise.rows
@@ -116,8 +120,9 @@ def exposure_noise(likelihood: Likelihood, single: FloatArray) -> ExposureNoise 
     sizes = _sizes(rows, layout, DRAWN_OF_FLOORS if many else DRAWN)
     if not (series or np.ptp(sizes, axis=0).any()):
         return None
-    star = single_likelihood(likelihood.with_noise(noise_with_rows(data, rows, floor=floor)))
-    both = np.column_stack([star.residuals(single)[:, 0], star.jacobian(single)])
+    fit = likelihood.with_noise(noise_with_rows(data, rows, floor=floor))
+    fit, theta = (single_likelihood(fit), single) if beside is None else (fit, beside)
+    both = np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)])
     of_kinds = [[one for one in series if one.vis2 == kind] for kind in (True, False)]
     vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
     turned, roots = _turned(rows, sizes, series, vis2, closure)

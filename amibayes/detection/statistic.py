@@ -63,6 +63,10 @@ class Statistic(Protocol):
         """Of the data, with the noise that was fitted."""
 
     @property
+    def single(self) -> FloatArray:
+        """The fit without a companion, (n_nuisance,)."""
+
+    @property
     def bank(self) -> TemplateBank:
         """Positions that are searched, and what a companion does there."""
 
@@ -289,7 +293,11 @@ class BankStatistic:
 
 @checks_arguments
 def statistic_of(
-    result: SearchResult, *, stated_errors: bool = False, beside: bool = False
+    result: SearchResult,
+    *,
+    stated_errors: bool = False,
+    beside: bool = False,
+    companion_known: bool = False,
 ) -> BankStatistic:
     """Make the statistic of a search, with the noise that was fitted.
 
@@ -303,11 +311,15 @@ def statistic_of(
     beside : bool
         For a second companion: all that the first one can do by moving or brightening is
         projected out, of the data and of the null sets.
+    companion_known : bool
+        What exposures share is what they do beside the companion that was found. A test whether
+        there is one may not say so: it takes for drift all that is common to exposures.
     """
     likelihood, whitening = null_likelihood(result)
     exposures = None
     if whitening is None and not stated_errors:
-        exposures = exposure_noise(likelihood, result.single_theta)
+        found = result.theta if companion_known else None
+        exposures = exposure_noise(likelihood, result.single_theta, beside=found)
     if exposures is not None:
         likelihood = likelihood.with_noise(exposures.noise)
     made = make_statistic(

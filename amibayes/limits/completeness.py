@@ -16,7 +16,7 @@ from scipy import stats
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.detection.false_alarm import Significance, draws_needed
-from amibayes.detection.statistic import Statistic
+from amibayes.detection.statistic import Statistic, statistic_of
 from amibayes.detection.tails import pareto_quantile
 from amibayes.errors import UsageError
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -28,6 +28,7 @@ from amibayes.limits.critical import (
     directions_of,
 )
 from amibayes.limits.limit import SHARES, DetectionLimit
+from amibayes.limits.own_drift import with_own_drift
 from amibayes.limits.pooled import Pooled, quantiles
 from amibayes.limits.rings import Rings, make_rings
 from amibayes.parallel import Executor, Journals, Progress, spawn
@@ -154,7 +155,10 @@ def _injected(
     if more := _more(critical, trials):
         further = replace(draws, per_place=more, seed=draws.seed + 1)
         critical = critical.joined(of(further, "more injections"))
-    return critical
+    return with_own_drift(
+        test, threshold, rings, critical, draws.seed,
+        executor=executor, journal=journals.of("drift") if journals else None,
+    )  # fmt: skip
 
 
 def _more(critical: CriticalContrasts, trials: int) -> int:
@@ -204,6 +208,8 @@ def _without_companion(
         )
     known = significance.null
     if significance.detected:
+        if test.exposures is not None:
+            test, known = statistic_of(result, companion_known=True), known[:0]
         test = test.with_noise_of(test.likelihood.residuals(result.theta)[:, 0])
         known = known[:0] if test.null_rests_on_residuals else known
     n = max(min(NULL_DRAWS - len(known), int(FRESH_WORK / test.bank.work)), 0)

@@ -79,6 +79,19 @@ class CriticalContrasts:
         each = (np.concatenate(pair, axis=2) for pair in both)
         return replace(self, **dict(zip(names, each, strict=True)))
 
+    def less_sensitive(self, factor: FloatArray) -> CriticalContrasts:
+        """The same where detection takes contrasts larger by factors (n_rings,).
+
+        From which contrast on a companion that is detected is seen at its place does not change.
+        """
+        detected = self.detected * factor[:, None, None]
+        return replace(
+            self,
+            detected=detected,
+            located=np.maximum(self.located, detected),
+            sigma=self.sigma * factor[:, None],
+        )
+
 
 @dataclass(frozen=True)
 class Draws:

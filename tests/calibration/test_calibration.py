@@ -687,7 +687,7 @@ def bad(  # noqa: C901
         ("twice", "c.fits: holds the data of another calibrator c.fits"),
         ("wavelength", "t.fits: has no baseline at the same wavelength in common with c.fits"),
         ("stations", "t.fits: has no baseline at the same wavelength in common"),
-        ("time", "t.fits: has no baseline at the same wavelength in common"),
+        ("time", "t.fits: has no baseline at the same wavelength within 1 d in common"),
         ("diameters", "2 diameters for 1 calibrators"),
         ("diameter", "a diameter that is negative or not finite"),
         ("faint", "t.fits: nothing is left"),

@@ -124,6 +124,18 @@ def test_sides_are_compared_with_baselines_of_their_time() -> None:
     assert [part.shape for part in _legs(none, 1.0)] == [(10, 2)] * 3
 
 
+def test_sides_of_exposures_without_times_are_compared_with_any_of_them() -> None:
+    """Files whose MJD is 0, or that of the night: exposures of a turning sky have one date."""
+    made = data(n_exposures=3)
+    for which in ("vis2", "closure_phase"):
+        made = changed(made, which, list(range(99)), mjd=lambda t: 0.0 * t + 59000.0)
+        rows = list(range(10, 20))  # of the second exposure
+        made = changed(made, which, rows, u_m=lambda u: 1.2 * u, v_m=lambda v: 1.2 * v)
+    assert list(uv_against_stations(HERE, [made])) == []
+    moved = changed(made, "closure_phase", [1, 4, 9], u_m=lambda u: u + np.array([[0.0, 0.4]]))
+    assert list(uv_against_stations(HERE, [moved]))
+
+
 def test_the_other_direction_of_stations_turns_a_side() -> None:
     made = data(n_exposures=1)
     other = changed(

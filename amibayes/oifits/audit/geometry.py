@@ -158,7 +158,7 @@ def _legs(part: Observables, factor: float) -> tuple[BoolArray, BoolArray, BoolA
     for side in range(2):
         pair = closure.stations[:, side : side + 2]
         uv = factor * np.stack([closure.u_m[:, side], closure.v_m[:, side]], axis=1)
-        nearest, days = _same_baseline(closure, pair, vis2)
+        nearest, days = _same_baseline(closure, pair, uv, vis2)
         turned = (pair[:, 0] > pair[:, 1]) != (
             vis2.stations[nearest, 0] > vis2.stations[nearest, 1]
         )
@@ -180,14 +180,20 @@ def _rows(m: Measurements) -> Measurements:
 
 
 def _same_baseline(
-    closure: Measurements, pair: IntArray, vis2: Measurements
+    closure: Measurements, pair: IntArray, uv: FloatArray, vis2: Measurements
 ) -> tuple[IntArray, FloatArray]:
-    """V² row of the same setup and baseline nearest in time to each triangle, and how near."""
+    """V² row of the same setup and baseline nearest in time to each triangle, and how near.
+
+    Of exposures with one date (of the night, or none) the one whose (u, v) is nearest.
+    """
     wanted = np.column_stack([closure.setup, np.sort(pair, axis=1)])
     there = np.column_stack([vis2.setup, np.sort(vis2.stations, axis=1)])
     same = (wanted[:, None] == there[None]).all(axis=2)
     days = np.where(same, np.abs(closure.mjd[:, None] - vis2.mjd), np.inf)
-    nearest = np.argmin(days, axis=1)
+    theirs = np.concatenate([vis2.u_m, vis2.v_m], axis=1)
+    apart = [np.linalg.norm(uv[:, None] - sense * theirs, axis=2) for sense in (1.0, -1.0)]
+    first = days <= days.min(axis=1, keepdims=True)
+    nearest = np.where(first, np.minimum(*apart), np.inf).argmin(axis=1)
     return nearest, days[np.arange(len(nearest)), nearest]
 
 
