@@ -124,7 +124,10 @@ def detection_limit(
         test, threshold, rings, draws, trials,
         executor=executor, progress=progress, journals=journals,
     )  # fmt: skip
-    return _summarised(test, null, threshold, rings, critical)
+    critical, drift_error = with_own_drift(
+        test, threshold, rings, critical, draws.seed, executor=executor, journals=journals
+    )
+    return _summarised(test, null, threshold, rings, critical, drift_error)
 
 
 def _injected(
@@ -155,10 +158,7 @@ def _injected(
     if more := _more(critical, trials):
         further = replace(draws, per_place=more, seed=draws.seed + 1)
         critical = critical.joined(of(further, "more injections"))
-    return with_own_drift(
-        test, threshold, rings, critical, draws.seed,
-        executor=executor, journal=journals.of("drift") if journals else None,
-    )  # fmt: skip
+    return critical
 
 
 def _more(critical: CriticalContrasts, trials: int) -> int:
@@ -255,6 +255,7 @@ def _summarised(
     threshold: float,
     rings: Rings,
     critical: CriticalContrasts,
+    drift_error: FloatArray,
 ) -> DetectionLimit:
     """Gather what was found on every ring."""
     in_errors = over_components(critical)
@@ -268,6 +269,7 @@ def _summarised(
     every, error = pooled.contrast(SHARES)
     every = np.maximum.accumulate(every, axis=1)
     error = np.hypot(error, goal[1] / (goal[0] + stats.norm.ppf(SHARES)))
+    error = np.hypot(error, drift_error[:, None])
     at = [int(np.abs(SHARES - share).argmin()) for share in (COMPLETENESS, 0.5)]
     return DetectionLimit(
         method="injection",

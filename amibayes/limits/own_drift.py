@@ -20,16 +20,20 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.linear_response import companions_beside
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.limits.rings import Rings
-from amibayes.parallel import Executor, Journal, SerialExecutor, run_job
+from amibayes.parallel import Executor, Journals, SerialExecutor, run_job
 from amibayes.units import FloatArray
 
-TRIALS, LEAST_PER_RING = 96, 2
-"""Companions in all, and on each ring at least: the logarithm of the factor differs by 0.3 from one
-to the next, and its mean is then known to 0.03."""
+LEAST_PER_RING, TRIALS, WANTED = 2, 96, 0.02
+"""Companions on each ring at first, and in all at most: as many as it takes to know the logarithm
+of the mean factor to so much. It differs by 0.3 from one companion to the next where drift is
+large."""
 
-RANGE, LESS, STEP = 8.0, 0.8, 0.35
-"""Factor either way in which contrasts are looked for, the least of those with drift fitted again,
-and steps of their logarithm, between which the root of the statistic is as good as straight."""
+LOOKS, CLOSE, FARTHEST = 5, 0.15, np.log(8.0)
+"""Contrasts that are tried of a companion at most, the step of the logarithm that is taken without
+another look (the root of the statistic is as good as straight in it), and the longest step."""
+
+SLOPES = (0.3, 3.0)
+"""Power of the contrast that the root of the statistic goes with: 1, less where it is noise."""
 
 SMOOTH = 2
 """Degree of the polynomial in the number of the ring that means follow."""
@@ -47,8 +51,8 @@ def with_own_drift(
     seed: int,
     *,
     executor: Executor | None = None,
-    journal: Journal | None = None,
-) -> CriticalContrasts:
+    journals: Journals | None = None,
+) -> tuple[CriticalContrasts, FloatArray]:
     """Critical contrasts where what exposures share is fitted with the companion in the data.
 
     Those of detection are larger by one factor on a ring: quantiles of some hundred trials are
@@ -63,28 +67,54 @@ def with_own_drift(
     critical : CriticalContrasts
         On these rings, with the drift of the data at hand.
     seed : int
-    executor, journal : optional
+    executor, journals : optional
         As in `amibayes.limits.completeness.detection_limit`.
+
+    Returns
+    -------
+    critical : CriticalContrasts
+    log_error : (n_rings,) float array
+        Error of the logarithm of the factor.
     """
     drift, n_rings = test.exposures, len(rings.separation_mas)
     if drift is None or (drift.vis2 is None and drift.closure_phase is None):
-        return critical
-    each = max(LEAST_PER_RING, -(-TRIALS // n_rings))
-    pieces = [_some_places(rings, critical, ring, each, seed) for ring in range(n_rings)]
-    work = partial(_piece, test, threshold)
-    done = run_job(work, pieces, executor or SerialExecutor(), journal=journal)
-    change = np.concatenate([piece["change"] for piece in done])
-    number = np.arange(n_rings)
-    line = np.polyfit(np.repeat(number, each), change, min(SMOOTH, n_rings - 1))
-    return critical.less_sensitive(np.exp(np.polyval(line, number)))
+        return critical, np.zeros(n_rings)
+
+    def changes(each: int, first: int) -> FloatArray:
+        """Changes (n_rings, each) by companions from number ``first`` of each ring on."""
+        rng = [np.random.default_rng([seed, ring, first]) for ring in range(n_rings)]
+        pieces = [_some_places(rings, critical, k, each, own) for k, own in enumerate(rng)]
+        journal = journals.of(f"drift from {first}") if journals else None
+        work = partial(_piece, test, threshold)
+        done = run_job(work, pieces, executor or SerialExecutor(), journal=journal)
+        return np.stack([piece["change"] for piece in done])
+
+    found = changes(LEAST_PER_RING, 0)
+    factor, error = _smooth(found)
+    wanted = LEAST_PER_RING * (float(np.median(error)) / WANTED) ** 2
+    if (more := int(min(np.ceil(wanted), TRIALS // n_rings)) - LEAST_PER_RING) > 0:
+        factor, error = _smooth(np.hstack([found, changes(more, LEAST_PER_RING)]))
+    return critical.less_sensitive(np.exp(factor)), error
+
+
+def _smooth(change: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (n_rings,) of changes (n_rings, n) that goes smoothly with the ring, and its error."""
+    n_rings, n = change.shape
+    powers = np.vander(np.linspace(-1.0, 1.0, n_rings), min(SMOOTH + 1, n_rings))
+    basis = np.linalg.qr(powers)[0]
+    mean = basis @ (basis.T @ change.mean(axis=1))
+    left = ((change - mean[:, None]) ** 2).sum() / max(change.size - basis.shape[1], 1)
+    return mean, np.sqrt(left / n * (basis**2).sum(axis=1))
 
 
 _Piece = tuple[FloatArray, float, np.random.Generator]
 
 
-def _some_places(rings: Rings, critical: CriticalContrasts, ring: int, n: int, seed: int) -> _Piece:
+def _some_places(
+    rings: Rings, critical: CriticalContrasts, ring: int, n: int, rng: np.random.Generator
+) -> _Piece:
     """Places (n, 2) all around a ring, the typical contrast there, and random numbers."""
-    rng, n_angles = np.random.default_rng([seed, ring]), rings.east_mas.shape[1]
+    n_angles = rings.east_mas.shape[1]
     angles = ((np.arange(n) + rng.uniform()) * n_angles / n).astype(int) % n_angles
     places = np.column_stack([rings.east_mas[ring, angles], rings.north_mas[ring, angles]])
     known = critical.detected[ring][np.isfinite(critical.detected[ring])]
@@ -97,22 +127,23 @@ def _piece(test: Statistic, threshold: float, piece: _Piece) -> dict[str, FloatA
     noise, goal = test.likelihood.noise.draw(len(places), rng).T, float(np.sqrt(threshold))
     change = []
     for place, own in zip(places, noise, strict=True):
-        trial, start = _Trial(test, place, own), float(np.log(typical / RANGE))
-        kept = _crossing(partial(trial.root, again=False), goal, start)
-        change.append(_crossing(partial(trial.root, again=True), goal, kept + np.log(LESS)) - kept)
+        trial = _Trial(test, place, own)
+        kept = _crossing(partial(trial.root, again=False), goal, float(np.log(typical)))
+        change.append(_crossing(partial(trial.root, again=True), goal, kept) - kept)
     return {"change": np.array(change)}
 
 
 def _crossing(root: Callable[[float], float], goal: float, start: float) -> float:
-    """Logarithm of the contrast, about 1 at most, at which a root of the statistic is ``goal``."""
-    before, x = root(start), start
-    if before >= goal:
-        return start
-    while x < min(start + 2.0 * np.log(RANGE), 0.0):
-        there = root(x + STEP)
-        if there >= goal:
-            return x + STEP * (goal - before) / (there - before)
-        before, x = there, x + STEP
+    """Logarithm of the contrast, 1 at most, at which a root of the statistic is ``goal``."""
+    x, slope, before = start, 1.0, None
+    for _ in range(LOOKS):
+        off = float(np.log(max(root(x), 1e-9) / goal))
+        if before is not None and x != before[0]:
+            slope = float(np.clip((off - before[1]) / (x - before[0]), *SLOPES))
+        step = float(np.clip(-off / slope, -FARTHEST, min(FARTHEST, -x)))
+        before, x = (x, off), x + step
+        if abs(step) < CLOSE:
+            break
     return x
 
 
