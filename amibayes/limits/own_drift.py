@@ -36,7 +36,8 @@ SLOPES = (0.3, 3.0)
 """Power of the contrast that the root of the statistic goes with: 1, less where it is noise."""
 
 SMOOTH = 2
-"""Degree of the polynomial in the number of the ring that means follow."""
+"""Degree of the polynomial in 1/separation that means follow: what a companion does changes the
+faster from exposure to exposure the farther it is, and is the less like drift."""
 
 FINER, AROUND = 64, 4
 """Parts of a step of the field's lattice that places are put at, and steps around a place in which
@@ -90,17 +91,18 @@ def with_own_drift(
         return np.stack([piece["change"] for piece in done])
 
     found = changes(LEAST_PER_RING, 0)
-    factor, error = _smooth(found)
+    factor, error = _smooth(found, rings.separation_mas)
     wanted = LEAST_PER_RING * (float(np.median(error)) / WANTED) ** 2
     if (more := int(min(np.ceil(wanted), TRIALS // n_rings)) - LEAST_PER_RING) > 0:
-        factor, error = _smooth(np.hstack([found, changes(more, LEAST_PER_RING)]))
+        every = np.hstack([found, changes(more, LEAST_PER_RING)])
+        factor, error = _smooth(every, rings.separation_mas)
     return critical.less_sensitive(np.exp(factor)), error
 
 
-def _smooth(change: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean (n_rings,) of changes (n_rings, n) that goes smoothly with the ring, and its error."""
+def _smooth(change: FloatArray, separation_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean of changes (n_rings, n) that goes smoothly with separation, and its error (n_rings,)."""
     n_rings, n = change.shape
-    powers = np.vander(np.linspace(-1.0, 1.0, n_rings), min(SMOOTH + 1, n_rings))
+    powers = np.vander(separation_mas.min() / separation_mas, min(SMOOTH + 1, n_rings))
     basis = np.linalg.qr(powers)[0]
     mean = basis @ (basis.T @ change.mean(axis=1))
     left = ((change - mean[:, None]) ** 2).sum() / max(change.size - basis.shape[1], 1)
