@@ -16,6 +16,7 @@ from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import statistic_of
+from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import recover
@@ -361,6 +362,12 @@ def test_a_kind_of_observable_that_cannot_carry_a_fit_is_left_out_and_named(tmp_
     report = measure_limits([path], [], LimitsOptions(search, criterion="candid", n_separations=3))
     assert [limit.observables for limit in report.limits] == [("vis2", "cp"), ("cp",)]
     assert any("no limit from vis2 alone" in said for said in report.warnings)
+
+
+def test_limits_at_no_separation_are_refused(setting) -> None:
+    result, _, tested, _ = setting
+    with pytest.raises(UsageError, match="separation_mas is empty"):
+        detection_limit(result, tested, np.random.default_rng(1), separation_mas=[])
 
 
 def test_shares_between_rings_and_levels_are_interpolated() -> None:
