@@ -96,8 +96,8 @@ MODES_TRIED = 3
 may come first by chance."""
 
 NOT_CONVERGED = (
-    "companion and extra noise did not converge: the data fit neither, and the most likely of the "
-    "pairs tried is given"
+    "position and extra noise did not converge: with the noise beside each best position another "
+    "one is best; the most likely of the pairs tried is given"
 )
 
 
