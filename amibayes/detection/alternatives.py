@@ -13,6 +13,7 @@ from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_law
 
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.optimise import fit_single
@@ -26,6 +27,9 @@ from amibayes.units import FloatArray
 CLEARLY = 10.0
 """Δχ² by which a companion is the better explanation: odds of 150 to 1, before they pay for the
 choice among the field's positions."""
+
+LOW_CHI2 = 0.05
+"""Probability of so low a χ² by which stated errors are too large."""
 
 MAX_NODES = 32
 """Wavelengths at which a diameter is free, linear in between; all channels' if there are fewer."""
@@ -61,7 +65,7 @@ class Alternative:
     kind : {"chromatic star", "elongated star", "extended light"}
     chi2 : float
         With the noise of the search, and 1 more for each parameter beyond those of the companion's
-        model: so much a parameter takes of noise.
+        model: so much a parameter takes of noise. Less where the stated errors are too large.
     words : str
         What it is, for the reason of a verdict.
     plausible : bool
@@ -82,7 +86,8 @@ def alternative(result: SearchResult) -> Alternative | None:
     result : SearchResult
         With its noise. Data without V² or closure phases have no alternative.
     """
-    likelihood, most = result.likelihood, result.chi2_binary + CLEARLY
+    likelihood = result.likelihood
+    most = result.chi2_binary + CLEARLY * _too_large(result)
     data = likelihood.observables
     both = 0 < data.n_vis2 < len(data.data)
     if not both or symmetric_chi2(likelihood) > most:
@@ -93,6 +98,21 @@ def alternative(result: SearchResult) -> Alternative | None:
     others = (_extended_light(likelihood, result), _elongated_star(likelihood, result))
     best = min(others, key=lambda other: other.chi2)
     return best if best.chi2 <= most else None
+
+
+def _too_large(result: SearchResult) -> float:
+    """χ² per datum where the stated errors are larger than chance allows, else 1.
+
+    A detection is told by residuals of any size, and differences of models must be as well: of
+    companions near the limit half were said to be light around the star where the stated errors
+    were twice too large.
+    """
+    return min(1.0, result.chi2_binary / float(chi2_law.ppf(LOW_CHI2, result.ndof)))
+
+
+def _noise_of(parameters: int, result: SearchResult) -> float:
+    """χ² that some more parameters take of noise."""
+    return _too_large(result) * max(parameters, 0)
 
 
 def symmetric_chi2(likelihood: Likelihood) -> float:
@@ -147,13 +167,13 @@ def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative
         best = tried[:, np.argmin(coloured.chi2_of_model(seen(tried)))]
     best = np.clip(best, *bounds)
     fit = least_squares(white, best, bounds=bounds, max_nfev=STEPS)
-    more = len(nodes) - len(result.theta)
+    more = _noise_of(len(nodes) - len(result.theta), result)
     words = (
         f"a star whose diameter changes with wavelength, from {fit.x.min():.4g} to "
         f"{fit.x.max():.4g} mas"
     )
     plausible = bool(fit.x.max() <= LARGEST_CHANGE * fit.x.min())
-    return Alternative("chromatic star", 2.0 * float(fit.cost) + max(more, 0), words, plausible)
+    return Alternative("chromatic star", 2.0 * float(fit.cost) + more, words, plausible)
 
 
 def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative:
@@ -197,8 +217,8 @@ def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative
     fit = min(fits, key=lambda one: float(one.cost))
     size, axes = np.exp(fit.x[:2])
     words = f"an elongated star (axes of {size:.4g} and {size * axes:.4g} mas)"
-    more = 3 - len(result.theta)
-    return Alternative("elongated star", 2.0 * float(fit.cost) + max(more, 0), words)
+    more = _noise_of(3 - len(result.theta), result)
+    return Alternative("elongated star", 2.0 * float(fit.cost) + more, words)
 
 
 def _extended_light(likelihood: Likelihood, result: SearchResult) -> Alternative:
@@ -215,5 +235,5 @@ def _extended_light(likelihood: Likelihood, result: SearchResult) -> Alternative
         f"light around the star (an inclined disc of {size:.3g} mas, {ratio:.2g} λ/B, "
         f"{100.0 * found['halo_flux']:.3g} % of the star's light)"
     )
-    more = len(theta) - len(likelihood.parameters)
-    return Alternative("extended light", chi2 + max(more, 0), words)
+    more = _noise_of(len(theta) - len(likelihood.parameters), result)
+    return Alternative("extended light", chi2 + more, words)

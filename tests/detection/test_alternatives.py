@@ -57,6 +57,12 @@ def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
     return (darkened_disc(0.5, 0.0, u, v) + 0.03 * shift) / 1.03
 
 
+def faint(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+    """A star and a companion of 0.4 %."""
+    shift = np.exp(-2j * np.pi * MAS * (4.0 * u - 3.0 * v))
+    return (darkened_disc(0.5, 0.0, u, v) + 0.004 * shift) / 1.004
+
+
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_a_disc_of_a_tenth_of_the_light_is_found_in_any_noise(seed: int) -> None:
     """No worse than the disc that it is; fits ended at one ten times as bright as the star."""
@@ -90,6 +96,18 @@ def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | 
         assert size == pytest.approx(2.5, rel=0.15)
         assert share * resolution_mas(result.likelihood) == pytest.approx(size, rel=0.06)
         assert percent == pytest.approx(10.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("source", "kind"), [(halo, "extended light"), (faint, None)])
+@pytest.mark.parametrize("too_large", [1.0, 3.0])
+def test_errors_that_are_too_large_change_no_comparison(
+    source: Visibility, kind: str | None, too_large: float
+) -> None:
+    """Of sources whose χ² differ by some tens in errors of the right size."""
+    data = observed(source, 2)
+    stated = replace(data, covariance=data.covariance.scaled(np.full(len(data.data), too_large)))
+    found = alternative(search(Likelihood(stated, MODEL), (0.7, 10.0)))
+    assert (None if found is None else found.kind) == kind
 
 
 def swelling(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
