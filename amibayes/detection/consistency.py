@@ -274,18 +274,22 @@ def _apart(parts: Sequence[_Part], residual: FloatArray) -> tuple[FloatArray, Fl
     each, together = _gains(parts, slopes)
     gain = np.maximum(each - together, 0.0)
     chi2 = np.sum([(w**2).sum(axis=0) for w in white], axis=0)
-    return _ratio(parts, gain, chi2 - gain), gain
+    return _ratio(parts, gain, chi2 - each), gain
 
 
 def _ratio(parts: Sequence[_Part], gain: FloatArray, rest: FloatArray) -> FloatArray:
-    """Gain over the rest of χ², (n,).
+    """Gain over the rest of χ² that no part can explain, (n,).
 
-    Errors with a floor are not smaller for data that do not show it: the rest then counts as no
-    less than its expectation.
+    What the companion of all data takes is no part of the rest: at the best fit it is taken, and
+    draws of noise, about the truth, would have more of it. Errors with a floor are not smaller for
+    data that do not show it: the rest then counts as no less than its expectation. Without a rest
+    nothing tells the size of the noise, and the ratio is 0.
     """
+    unexplained = sum(part.unexplained for part in parts)
+    if not unexplained:
+        return np.zeros_like(gain)
     floored = any(part.likelihood.noise.floor for part in parts)
-    least = sum(part.unexplained for part in parts) if floored else 0
-    return np.asarray(gain / np.maximum(rest, max(least, 1e-300)))
+    return np.asarray(gain / np.maximum(rest, unexplained if floored else 1e-300))
 
 
 def _apart_by_noise(
@@ -295,7 +299,7 @@ def _apart_by_noise(
     each, together = _gains(parts, [part.slopes_of_noise(n, rng) for part in parts])
     gain = np.maximum(each - together, 0.0)
     unexplained = sum(part.unexplained for part in parts)
-    rest = together + (rng.chisquare(unexplained, n) if unexplained else 0.0)
+    rest = rng.chisquare(unexplained, n) if unexplained else np.zeros(n)
     return _ratio(parts, gain, rest), gain
 
 

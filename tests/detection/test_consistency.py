@@ -66,6 +66,19 @@ def test_probability_is_uniform_where_the_parts_agree(rng) -> None:
     assert stats.binomtest(int((p < 0.05).sum()), 80, 0.05).pvalue > 1e-4
 
 
+def test_probability_is_uniform_for_few_data(rng) -> None:
+    """One exposure of four telescopes: 6 V² and 3 independent closure phases; KS p > 1e-4."""
+    sheet, truth, found = four_telescopes(1, 1), np.array([5.0, -4.0, 0.2]), []
+    clean = simulated(sheet, truth, None).data
+    for noise in 0.1 * sheet.covariance.draw(rng, 150).T:
+        data = sheet.with_data(clean + noise)
+        likelihood = Likelihood(data)
+        theta = np.array(refine(likelihood, truth, Box(2, 15, 3.1), 0.0).theta)
+        found.append(compare(likelihood, theta, "observables", _kinds(data), rng, 400).p)
+    assert stats.kstest(found, "uniform").pvalue > 1e-4
+    assert stats.binomtest(int((np.array(found) < 0.05).sum()), 150, 0.05).pvalue > 1e-4
+
+
 def test_star_and_background_may_differ_between_parts(rng) -> None:
     """A disc that V² of one night calibrates wrongly is no other companion."""
     model = BinaryModel(diameter_mas="free")
@@ -174,7 +187,7 @@ def test_kinds_that_share_errors_are_drawn_together(rng: np.random.Generator) ->
 def test_the_rest_of_noise_is_what_no_parameter_explains(
     unexplained: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of it for data that have as many parameters as numbers: nothing is added."""
+    """What the companion of all data takes is no part of it; without a rest nothing is told."""
     parts = [SimpleNamespace(unexplained=unexplained, slopes_of_noise=lambda n, rng: None)]
     parts[0].likelihood = SimpleNamespace(noise=SimpleNamespace(floor=False))
     n = 20_000
@@ -182,6 +195,9 @@ def test_the_rest_of_noise_is_what_no_parameter_explains(
     monkeypatch.setattr("amibayes.detection.consistency._gains", lambda *_: (each, together))
     ratio, gain = _apart_by_noise(parts, n, np.random.default_rng(1))  # type: ignore[arg-type]
     np.testing.assert_array_equal(gain, np.maximum(9.0 - together, 0.0))
-    rest = (gain / np.where(gain > 0.0, ratio, 1.0) - together)[gain > 0.0]
+    if not unexplained:
+        np.testing.assert_array_equal(ratio, 0.0)
+        return
+    rest = gain[gain > 0.0] / ratio[gain > 0.0]
     assert rest.mean() == pytest.approx(unexplained, abs=0.1)
     assert rest.var() == pytest.approx(2.0 * unexplained, abs=0.3)
