@@ -16,8 +16,9 @@ from amibayes.detection.alternatives import Alternative
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import SEE, note_of
 from amibayes.detection.splits import Consistency
+from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
-from amibayes.likelihood.extra_noise import MAX_ROUNDS, NoisePrior
+from amibayes.likelihood.extra_noise import MAX_ROUNDS, ExtraNoise, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.likelihood.residuals import files_of
@@ -72,7 +73,7 @@ def verdict(
     splits: Sequence[Consistency],
     *,
     structured: bool = True,
-    shape: float = 0.0,
+    noise: ExtraNoise | None = None,
     compared: bool = False,
     alone: tuple[Likelihood, FloatArray] | None = None,
 ) -> Verdict:
@@ -91,8 +92,8 @@ def verdict(
     structured : bool
         Whether that structure is more than what the calibration of the instrument may leave: see
         `within_calibration`. Structure that is not does not speak against the model.
-    shape : float
-        Of `parts_of_fit`: `SHAPE` where noise was fitted.
+    noise : ExtraNoise, optional
+        That was fitted: see `parts_of_fit`.
     compared : bool
         Whether models of the sky are compared too.
     alone : (Likelihood, (n_nuisance,) float array), optional
@@ -105,7 +106,7 @@ def verdict(
     sets against each other as well as a bad calibration does.
     """
     alpha = tested.alpha
-    parts = parts_of_fit(result.likelihood, result.theta, result.ndof, shape)
+    parts = parts_of_fit(result.likelihood, result.theta, result.ndof, noise)
     fit = joint_probability(parts)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
@@ -122,7 +123,7 @@ def verdict(
     left = WITHIN if small and not structured else ""
     if tested.detected:
         return _companion(result, tested, left, p_model, compared=compared)
-    if alone is not None and (misfit := _misfit_alone(*alone, shape, alpha)):
+    if alone is not None and (misfit := _misfit_alone(*alone, noise, alpha)):
         return Verdict("model rejected", f"{misfit}; and {_nothing(tested)}", p_model)
     return Verdict("no companion", _nothing(tested) + left, p_model)
 
@@ -213,6 +214,10 @@ SHAPE = 0.1
 noise differs between baselines and channels. It matters from some hundred data on."""
 
 
+LEAST_KNOWN = 1.0
+"""The same by a correlation of channels of which the data tell nothing."""
+
+
 @dataclass(frozen=True)
 class FitOfPart:
     """χ² of one kind of observable of one file, its degrees of freedom and probability."""
@@ -235,17 +240,16 @@ def joint_probability(parts: Sequence[FitOfPart]) -> float:
 
 
 def parts_of_fit(
-    likelihood: Likelihood, theta: FloatArray, ndof: int, shape: float = 0.0
+    likelihood: Likelihood, theta: FloatArray, ndof: int, noise: ExtraNoise | None = None
 ) -> list[FitOfPart]:
     """Kinds of observables of files, as a best fit leaves them, with the noise that was fitted.
 
-    A ``shape`` is the standard deviation of ln χ² by noise of another shape: probabilities are
-    means over it.
+    Where ``noise`` was fitted, probabilities are means over what it may be instead.
     """
     difference = likelihood.difference(np.atleast_2d(theta))[:, 0]
     covariance, share = likelihood.noise.covariance, ndof / likelihood.n_independent
     nodes, weights = np.polynomial.hermite_e.hermegauss(41)
-    factors, weights = np.exp(shape * nodes), weights / weights.sum()
+    weights = weights / weights.sum()
     found = []
     for file in files_of(likelihood.observables):
         for kind in NAMES:
@@ -253,14 +257,30 @@ def parts_of_fit(
             if not len(at):
                 continue
             chi2, rank = chi2_of_part(covariance, at, difference)
+            factors = np.exp(_shape(noise, kind, file.source) * nodes)
             each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
             found.append(FitOfPart(kind, file.source, chi2, share * rank, float(weights @ each)))
     return found
 
 
-def _misfit_alone(likelihood: Likelihood, theta: FloatArray, shape: float, alpha: float) -> str:
+def _shape(noise: ExtraNoise | None, kind: str, source: str) -> float:
+    """Standard deviation of ln χ² by noise of another shape than the one that was fitted.
+
+    Differences of neighbouring channels have a variance of 1 − r, r their correlation.
+    """
+    if noise is None:
+        return 0.0
+    share = share_of(noise.channels, source)
+    found = share.vis2 if kind == "vis2" else share.closure_phase
+    unknown = found.error / (1.0 - found.value) if found.value > 0.0 else 0.0
+    return float(np.hypot(SHAPE, min(np.nan_to_num(unknown), LEAST_KNOWN)))
+
+
+def _misfit_alone(
+    likelihood: Likelihood, theta: FloatArray, noise: ExtraNoise | None, alpha: float
+) -> str:
     """Say how a star alone does not fit; empty where it does."""
-    parts = parts_of_fit(likelihood, theta, likelihood.n_independent - len(theta), shape)
+    parts = parts_of_fit(likelihood, theta, likelihood.n_independent - len(theta), noise)
     if joint_probability(parts) >= alpha:
         return ""
     return f"a star alone does not fit: {_misfit(parts, _worst(parts, likelihood.degrees))}"

@@ -24,7 +24,6 @@ from amibayes.detection.residuals import correlated
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.detection.verdict import (
-    SHAPE,
     Verdict,
     at_the_edge,
     star_alone,
@@ -182,7 +181,7 @@ def verdict_of(
     change = test.change_by(test.strongest)[:, 0]
     within = within_calibration(result.likelihood.observables, change)
     structured = rest.probability > options.alpha or not within
-    shape = SHAPE if options.extra_noise else 0.0
+    noise = found.noise if options.extra_noise else None
     compared = options.models is not None
     alone = None
     if not tested.detected:
@@ -194,7 +193,7 @@ def verdict_of(
         )
     said = verdict(
         result, tested, rest, splits,
-        structured=structured, shape=shape, compared=compared, alone=alone,
+        structured=structured, noise=noise, compared=compared, alone=alone,
     )  # fmt: skip
     if said.statement == "companion" and (other := alternative(result)) is not None:
         said = without_companion(said, other, result, compared=compared)

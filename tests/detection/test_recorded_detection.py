@@ -57,6 +57,7 @@ from amibayes.detection.tails import (
 )
 from amibayes.detection.treatments import FreeScale, drawn_scale
 from amibayes.detection.verdict import change_by_companion, joint_probability, parts_of_fit, verdict
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise import noise_of
 from amibayes.likelihood.student import StudentNoise, symmetric_whitening
@@ -222,7 +223,7 @@ def test_agreement_of_the_parts(result: SearchResult, num_regression) -> None:
     tested = Significance(30.0, np.arange(100.0), 0.01, (0.0, 0.02), None, 0.05)
     quiet = replace(tested, statistic=5.0, probability=0.4, interval=(0.3, 0.5))
     verdicts = [
-        verdict(result, one, other, splits, structured=kind, shape=0.1)
+        verdict(result, one, other, splits, structured=kind, noise=ExtraNoise())
         for one, other in ((tested, quiet), (quiet, tested), (quiet, quiet))
         for splits in ((), (Consistency("files", ("a", "b"), 9.0, 0.001),))
         for kind in (True, False)
@@ -236,7 +237,7 @@ def test_agreement_of_the_parts(result: SearchResult, num_regression) -> None:
         files=file_residuals(result),
         probability=[
             joint_probability(parts_of_fit(result.likelihood, result.theta, result.ndof, s))
-            for s in (0.0, 0.1)
+            for s in (None, ExtraNoise())
         ],
         verdicts=[(names.index(v.statement), v.p_model) for v in verdicts],
         change=change_by_companion(result),

@@ -12,7 +12,7 @@ import pytest
 from helpers import niriss, simulated
 from interferometer import four_telescopes
 from scipy.special import j0, j1
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
@@ -22,7 +22,6 @@ from amibayes.detection.note import note_of
 from amibayes.detection.splits import Consistency
 from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import (
-    SHAPE,
     SMALL,
     WITHIN,
     Verdict,
@@ -33,7 +32,9 @@ from amibayes.detection.verdict import (
     verdict,
     within_calibration,
 )
+from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.models.binary import BinaryModel
 from amibayes.pipeline.false_alarm import false_alarm, verdict_of
 from amibayes.pipeline.field import search_field
@@ -272,9 +273,24 @@ def test_noise_of_another_shape_may_change_chi2_by_a_tenth(
     noisy = replace(data.vis2, value=1.0 + z * np.sqrt(data.covariance.variance))
     likelihood = Likelihood(replace(data, vis2=noisy), BinaryModel())
     fit = likelihood, np.zeros(3), len(z)
-    assert low <= joint_probability(parts_of_fit(*fit, shape=SHAPE)) <= high
+    assert low <= joint_probability(parts_of_fit(*fit, ExtraNoise())) <= high
     exact = chi2.sf(excess * len(z), len(z))
     assert joint_probability(parts_of_fit(*fit)) == pytest.approx(exact, rel=1e-6)
+
+
+def test_channels_that_are_independent_do_not_refuse_a_star() -> None:
+    """One triangle in six channels tells little of what channels share; 500 stars."""
+    sheet, rng = four_telescopes(1, 6), np.random.default_rng(4)
+    few = [(m.stations < 3).all(axis=1) for m in (sheet.vis2, sheet.closure_phase)]
+    sheet, p = sheet.select(*few), []
+    point = Likelihood(sheet, BinaryModel(companions=0)).predict(np.empty((1, 0)))[:, 0]
+    for errors in sheet.covariance.draw(rng, 500).T:
+        star = Likelihood(sheet.with_data(point + errors), BinaryModel(companions=0))
+        noise, noisy = noise_beside(star, np.empty(0))
+        p.append(joint_probability(parts_of_fit(noisy, np.empty(0), len(errors), noise)))
+    assert binom.sf((np.array(p) < 0.01).sum() - 1, 500, 0.01) > 1e-4
+    assert binom.sf((np.array(p) < 0.05).sum() - 1, 500, 0.05) > 1e-4
+    assert np.median(p) < 0.95
 
 
 @pytest.mark.release
