@@ -19,7 +19,7 @@ from amibayes.comparison.hypotheses import (
 from amibayes.comparison.integral import Effort, integrate
 from amibayes.comparison.verdict import Confusion, ModelVerdict, choose
 from amibayes.data.observables import Observables
-from amibayes.likelihood.chi2 import chi2_survival
+from amibayes.detection.verdict import joint_probability, parts_of_fit
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.parallel import Executor, Journal, Progress
@@ -52,7 +52,8 @@ class Compared:
     method : str
     ndof : int
     p_fit : float
-        Probability of a χ² as large as that of the best fit.
+        Probability that data of the best fit are fitted no better, as in the verdict of a search
+        (`amibayes.detection.verdict.joint_probability`).
     """
 
     fit: ModelFit
@@ -166,7 +167,7 @@ def compare_sky_models(
     asked, streams = hypotheses(models), rng.spawn(4)
     setting = noise or NoiseSetting()
     fits, found = best_fits(asked, result, prior, stated, setting, settings, default_field, streams)
-    compared = _all_compared(fits, streams[1], method)
+    compared = _all_compared(fits, found, streams[1], method)
     log_prior = np.full(len(fits), -np.log(len(fits)))
     wanted = _n_confusion(result.likelihood) if confusion_draws is None else confusion_draws
     confusion = None
@@ -187,7 +188,7 @@ def _n_confusion(likelihood: Likelihood) -> int:
 
 
 def _all_compared(
-    fits: Sequence[ModelFit], rng: np.random.Generator, method: str
+    fits: Sequence[ModelFit], noise: ExtraNoise, rng: np.random.Generator, method: str
 ) -> tuple[Compared, ...]:
     """Evidences of all models, with fewer draws for those that are out of the question."""
     children = rng.spawn(len(fits))
@@ -195,7 +196,8 @@ def _all_compared(
     found: dict[int, Compared] = {}
     for k in np.argsort(-bound, kind="stable").tolist():
         best = max((c.log_z for c in found.values()), default=-np.inf)
-        found[k] = _compared(fits[k], children[k], method, hopeless=bound[k] < best - HOPELESS)
+        hopeless = bool(bound[k] < best - HOPELESS)
+        found[k] = _compared(fits[k], noise, children[k], method, hopeless=hopeless)
     return tuple(found[k] for k in range(len(fits)))
 
 
@@ -206,7 +208,12 @@ def largest_log_prob(fit: ModelFit) -> float:
 
 
 def _compared(
-    fit: ModelFit, rng: np.random.Generator, method: str, *, hopeless: bool = False
+    fit: ModelFit,
+    noise: ExtraNoise,
+    rng: np.random.Generator,
+    method: str,
+    *,
+    hopeless: bool = False,
 ) -> Compared:
     likelihood, model = fit.model.likelihood, fit.model
     if method in SAMPLERS and model.n_dim and not hopeless:
@@ -220,9 +227,10 @@ def _compared(
         )
         how = "importance"
     ndof = likelihood.n_independent - model.n_dim
-    p_fit = chi2_survival(float(fit.chi2[0]), ndof, likelihood.degrees)
+    theta = model.theta(fit.cube[:1])[0]
+    p_fit = joint_probability(parts_of_fit(likelihood, theta, ndof, noise))
     z, error = draws.diagnostics["log_z"], draws.diagnostics["log_z_error"]
-    return Compared(fit, draws, float(z), float(error), how, ndof, float(p_fit))
+    return Compared(fit, draws, float(z), float(error), how, ndof, p_fit)
 
 
 def is_degenerate(model: Compared) -> bool:

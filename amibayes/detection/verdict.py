@@ -214,8 +214,8 @@ SHAPE = 0.1
 noise differs between baselines and channels. It matters from some hundred data on."""
 
 
-LEAST_KNOWN = 1.0
-"""The same by a correlation of channels of which the data tell nothing."""
+SHAPE_NODES, MOST_CORRELATED = 13, 0.99
+"""Nodes of the means over what noise may be, and the largest correlation of channels."""
 
 
 @dataclass(frozen=True)
@@ -248,8 +248,6 @@ def parts_of_fit(
     """
     difference = likelihood.difference(np.atleast_2d(theta))[:, 0]
     covariance, share = likelihood.noise.covariance, ndof / likelihood.n_independent
-    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
-    weights = weights / weights.sum()
     found = []
     for file in files_of(likelihood.observables):
         for kind in NAMES:
@@ -257,23 +255,29 @@ def parts_of_fit(
             if not len(at):
                 continue
             chi2, rank = chi2_of_part(covariance, at, difference)
-            factors = np.exp(_shape(noise, kind, file.source) * nodes)
+            factors, weights = _sizes(noise, kind, file.source)
             each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
             found.append(FitOfPart(kind, file.source, chi2, share * rank, float(weights @ each)))
     return found
 
 
-def _shape(noise: ExtraNoise | None, kind: str, source: str) -> float:
-    """Standard deviation of ln χ² by noise of another shape than the one that was fitted.
+def _sizes(noise: ExtraNoise | None, kind: str, source: str) -> tuple[FloatArray, FloatArray]:
+    """Factors of χ² by noise of another shape than the one that was fitted, and their weights.
 
-    Differences of neighbouring channels have a variance of 1 − r, r their correlation.
+    Where channels are correlated by r, what neighbours differ by has a variance of 1 − r: if they
+    are less correlated than it seems, to nothing at least, that makes χ² larger.
     """
     if noise is None:
-        return 0.0
+        return np.ones(1), np.ones(1)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(SHAPE_NODES)
+    weights /= weights.sum()
     share = share_of(noise.channels, source)
     found = share.vis2 if kind == "vis2" else share.closure_phase
-    unknown = found.error / (1.0 - found.value) if found.value > 0.0 else 0.0
-    return float(np.hypot(SHAPE, min(np.nan_to_num(unknown), LEAST_KNOWN)))
+    known = np.nan_to_num(found.error) * nodes if found.value > 0.0 else np.zeros(1)
+    correlation = np.clip(found.value + known, 0.0, MOST_CORRELATED)
+    factors = np.outer(np.exp(SHAPE * nodes), (1.0 - found.value) / (1.0 - correlation))
+    each = weights if len(known) > 1 else np.ones(1)
+    return factors.ravel(), np.outer(weights, each).ravel()
 
 
 def _misfit_alone(
