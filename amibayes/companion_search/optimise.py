@@ -62,7 +62,7 @@ FINEST_STEP = 0.0025
 """Scale of a star's parameters in their fit, as a part of their ranges."""
 
 
-def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> tuple[FloatArray, float]:
+def fit_single(likelihood: Likelihood, known: FloatArray | None = None) -> Fit:
     """Best fit without a companion: its parameters (n_nuisance,) and deviance.
 
     A ``known`` fit of nearly the same problem, (n_nuisance,), is one of the starting points.
@@ -85,7 +85,7 @@ def fits_single(likelihood: Likelihood, known: FloatArray | None = None) -> list
     rungs = np.linspace(0.0, 1.0, 201)[:, None] ** 2
     parts = [np.where(disc | ~disc.any(), rungs, rest) for rest in STAR_STARTS]
     ladders = [lower + part * width for part in (parts if several else parts[:1])]
-    starts = [_best_of(without.chi2, ladder) for ladder in ladders]
+    starts = [_best_of(without, without.chi2, ladder) for ladder in ladders]
     starts = sorted(starts, key=lambda start: start[1])[:STAR_FITS]
     # Angles go round: a fit that passes the end of their range goes on.
     turn = np.where([p.unit == "deg" for p in without.parameters], width, 0.0)
@@ -95,8 +95,7 @@ def fits_single(likelihood: Likelihood, known: FloatArray | None = None) -> list
         n = np.clip(SPREAD_WORK / len(without.samples), MIN_SPREAD, MAX_SPREAD)
         even = qmc.Sobol(len(bounds), rng=np.random.default_rng(0)).random_base2(int(np.log2(n)))
         ladders.append(lower + even ** _powers(without.parameters) * width)
-        chi2 = [without.chi2(part) for part in without.in_parts(ladders[-1])]
-        best = _apart(even, np.concatenate(chi2))
+        best = _apart(even, _of_each(without, without.chi2, ladders[-1]))
         fits += [_minimise(objective, ladders[-1][k], scale, bounds) for k in best]
     if several and likelihood.observables.n_vis2:
         fits += _across_walls(without, objective, ladders, fits, scale, bounds)
@@ -106,8 +105,17 @@ def fits_single(likelihood: Likelihood, known: FloatArray | None = None) -> list
     return [(np.where(turn > 0.0, lower + (x - lower) % width, x), value) for x, value in fits]
 
 
-def _best_of(chi2: Callable[[FloatArray], FloatArray], thetas: FloatArray) -> Fit:
-    found = chi2(thetas)
+Chi2 = Callable[[FloatArray], FloatArray]
+"""χ² (n,) of parameter sets (n, n_dim)."""
+
+
+def _of_each(star: Likelihood, chi2: Chi2, thetas: FloatArray) -> FloatArray:
+    """χ² (n,) of many parameter sets, as many at once as memory is good for."""
+    return np.concatenate([chi2(part) for part in star.in_parts(thetas)])
+
+
+def _best_of(star: Likelihood, chi2: Chi2, thetas: FloatArray) -> Fit:
+    found = _of_each(star, chi2, thetas)
     return thetas[np.argmin(found)], float(found.min())
 
 
@@ -151,9 +159,9 @@ def _across_walls(
     def of_vis2(x: FloatArray, _: FloatArray) -> float:
         return float(chi2_vis2((x * scale)[None])[0])
 
-    start, _ = min((_best_of(chi2_vis2, ladder) for ladder in ladders), key=lambda f: f[1])
+    start, _ = min((_best_of(star, chi2_vis2, ladder) for ladder in ladders), key=lambda f: f[1])
     first, _ = _without_gradients(of_vis2, start, scale, bounds)
-    nearest, _ = _best_of(star.chi2, _around(first, star.slopes(first)[:n] / sigma, bounds))
+    nearest, _ = _best_of(star, star.chi2, _around(first, star.slopes(first)[:n] / sigma, bounds))
     starts = [first, nearest, min(fits, key=lambda fit: fit[1])[0]]
     return [_without_gradients(objective, start, scale, bounds) for start in starts]
 

@@ -98,6 +98,9 @@ class Statistic(Protocol):
     def signal_of(self, companions: FloatArray) -> FloatArray:
         """Whitened change of the data (n_data, n) by companions (n, 3)."""
 
+    def change_by(self, companions: FloatArray) -> FloatArray:
+        """Change of the data (n_data, n) by companions (n, 3), not whitened."""
+
     def simulated(self, n: int, rng: np.random.Generator, signal: FloatArray | None = None) -> Hits:
         """Draw n data sets with the noise of the data, and a signal in them, and search them."""
 
@@ -323,13 +326,9 @@ def statistic_of(
     if exposures is not None:
         likelihood = likelihood.with_noise(exposures.noise)
     made = make_statistic(
-        likelihood,
-        result.grid,
-        result.single_theta,
-        stated_errors=stated_errors,
-        whitening=whitening,
-        beside=result.theta if beside else None,
-    )
+        likelihood, result.grid, result.single_theta,
+        stated_errors=stated_errors, whitening=whitening, beside=result.theta if beside else None,
+    )  # fmt: skip
     if exposures is None:
         return made
     return replace(made, exposures=exposures.of_bank(made.bank))

@@ -17,7 +17,6 @@ from amibayes.companion_search.grid import Grid
 from amibayes.detection.exposure_noise import exposure_noise
 from amibayes.detection.statistic import Statistic, make_statistic
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
-from amibayes.likelihood.linear_response import companions_beside
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.limits.rings import Rings
 from amibayes.parallel import Executor, Journals, SerialExecutor, run_job
@@ -167,10 +166,8 @@ class _Trial:
     def root(self, log_contrast: float, *, again: bool) -> float:
         """Root of the statistic, with drift as in the data at hand, or fitted ``again``."""
         likelihood, single = self.test.likelihood, self.test.single
-        companion = np.array([[*self.place, np.exp(log_contrast)]])
-        seen = likelihood.observe(companions_beside(likelihood, single, companion))
-        data = (self.star + likelihood.wrapped(seen - self.star))[:, 0] + self.noise
-        sheet = likelihood.observables.with_data(data)
+        change = self.test.change_by(np.array([[*self.place, np.exp(log_contrast)]]))
+        sheet = likelihood.observables.with_data((self.star + change)[:, 0] + self.noise)
         searched = Likelihood(sheet, likelihood.model, likelihood.noise, likelihood.samples)
         found = exposure_noise(searched, single) if again else None
         if found is not None:
