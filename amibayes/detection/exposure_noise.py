@@ -20,6 +20,7 @@ from scipy.special import ndtri
 
 from amibayes.companion_search.reduction import Roots
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.data.observables import Observables
 from amibayes.data.systematics import MIN_EXPOSURES
 from amibayes.likelihood.channel_noise import noise_with_rows
 from amibayes.likelihood.channel_rows import (
@@ -28,7 +29,14 @@ from amibayes.likelihood.channel_rows import (
     channel_layout,
     independent_rows,
 )
-from amibayes.likelihood.exposure_rows import Drift, Series, drift_of, series_of, turned_rows
+from amibayes.likelihood.exposure_rows import (
+    Axes,
+    Drift,
+    Series,
+    drift_of,
+    series_of,
+    turned_rows,
+)
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise import GaussianNoise
 from amibayes.likelihood.noise_fit import MIN_ROWS
@@ -107,6 +115,17 @@ def exposure_noise(
     beside : (n_dim,) float array, optional
         The fit with a companion, in its place: what is left beside one that is known.
     """
+    exposures = exposures_of(likelihood)
+    if exposures is None:
+        return None
+    fit = (single_likelihood(likelihood), single) if beside is None else (likelihood, beside)
+    drifts = exposures.drifts(*fit)
+    turned, axes, each = exposures.turned(*drifts)
+    return ExposureNoise(*drifts, exposures.noise_of(turned), exposures.roots(axes, each))
+
+
+def exposures_of(likelihood: Likelihood) -> Exposures | None:
+    """Rows that exposures may share; None as in `exposure_noise`."""
     data = likelihood.observables.unflagged()
     layout, rows = channel_layout(data), likelihood.noise.rows
     if rows is None and layout.any:
@@ -120,13 +139,91 @@ def exposure_noise(
     sizes = _sizes(rows, layout, DRAWN_OF_FLOORS if many else DRAWN)
     if not (series or np.ptp(sizes, axis=0).any()):
         return None
-    fit = likelihood.with_noise(noise_with_rows(data, rows, floor=floor))
-    fit, theta = (single_likelihood(fit), single) if beside is None else (fit, beside)
-    both = np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)])
-    of_kinds = [[one for one in series if one.vis2 == kind] for kind in (True, False)]
-    vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
-    turned, roots = _turned(rows, sizes, series, vis2, closure)
-    return ExposureNoise(vis2, closure, noise_with_rows(data, turned, floor=floor), roots)
+    return Exposures(data, rows, series, floor, sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Rows of data that exposures may share, and what is known of their size.
+
+    Parameters
+    ----------
+    data : Observables
+        Without what is flagged.
+    rows : ChannelRows
+        As they are where exposures err independently.
+    series : tuple of Series
+    floor : bool
+        Whether calibration errors are known.
+    sizes : (n, rank) float array
+        Standard deviations of rows, of equal probability.
+    """
+
+    data: Observables
+    rows: ChannelRows
+    series: tuple[Series, ...]
+    floor: bool
+    sizes: FloatArray
+
+    def noise(self, likelihood: Likelihood, theta: FloatArray) -> GaussianNoise:
+        """Noise with the mean of the covariance, by the residuals of a fit."""
+        return self.noise_of(self.turned(*self.drifts(likelihood, theta))[0])
+
+    def noise_of(self, rows: ChannelRows) -> GaussianNoise:
+        """Noise whose rows are turned."""
+        return noise_with_rows(self.data, rows, floor=self.floor)
+
+    def drifts(
+        self, likelihood: Likelihood, theta: FloatArray
+    ) -> tuple[Drift | None, Drift | None]:
+        """What exposures share of V² and of closure phases, by the residuals of a fit."""
+        fit = likelihood.with_noise(self.noise_of(self.rows))
+        both = np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)])
+        of_kinds = [[one for one in self.series if one.vis2 == kind] for kind in (True, False)]
+        vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
+        return vis2, closure
+
+    def turned(
+        self, vis2: Drift | None, closure: Drift | None
+    ) -> tuple[ChannelRows, list[Axes], list[FloatArray]]:
+        """Rows turned by the mean of their covariance.
+
+        And the axes of each series, and its covariances (n, len, len) for values of κ and τ and
+        sizes of equal probability.
+        """
+        # The kinds' shares do not depend on each other: those of closure phases come in another
+        # order.
+        n = len(self.sizes)
+        order = {True: np.arange(n), False: np.argsort(evenly(n))}
+        nodes = {
+            kind: drift.nodes(n)[:, order[kind]]
+            for kind, drift in ((True, vis2), (False, closure))
+            if drift is not None
+        }
+        mean = np.sqrt((self.sizes**2).mean(axis=0))
+        each, means = [], []
+        for one in self.series:
+            own = self.sizes[:, one.rows]
+            each.append(one.correlation(*nodes[one.vis2]) * own[:, :, None] * own[:, None])
+            means.append(each[-1].mean(axis=0) / np.outer(mean[one.rows], mean[one.rows]))
+        correlated = list(zip(self.series, means, strict=True))
+        return *turned_rows(replace(self.rows, sigma=mean), correlated), each
+
+    def roots(self, axes: Sequence[Axes], each: Sequence[FloatArray]) -> tuple[Roots, ...]:
+        """Roots of the covariances of rows turned to axes, whitened by their mean."""
+        mean = np.sqrt((self.sizes**2).mean(axis=0))
+        alone = np.ptp(self.sizes, axis=0) > 0.0
+        blocks = []
+        for axis, covariance in zip(axes, each, strict=True):
+            turn = axis.vectors / np.sqrt(axis.values)
+            found = np.linalg.cholesky(turn.T @ covariance @ turn)
+            blocks.append([(axis.rows, root) for root in found])
+            alone[axis.rows] = False
+        few = np.arange(FEW_ROWS, np.count_nonzero(alone), FEW_ROWS)
+        for at in np.split(np.flatnonzero(alone), few):
+            if len(at):
+                blocks.append([(at, np.diag(own)) for own in self.sizes[:, at] / mean[at]])
+        return tuple(zip(*blocks, strict=True))
 
 
 def _sizes(rows: ChannelRows, layout: ChannelLayout, n: int) -> FloatArray:
@@ -152,44 +249,3 @@ def _sizes(rows: ChannelRows, layout: ChannelLayout, n: int) -> FloatArray:
         size = np.random.default_rng(seed).permutation(np.exp(spread * middle))
         variance[:, here] += (size**2 - 1.0)[:, None] * rows.floor[here]
     return np.sqrt(variance)
-
-
-def _turned(
-    rows: ChannelRows,
-    sizes: FloatArray,
-    series: Sequence[Series],
-    vis2: Drift | None,
-    closure: Drift | None,
-) -> tuple[ChannelRows, tuple[Roots, ...]]:
-    """Rows turned by the mean of their covariance, and roots of the covariance of new rows.
-
-    These for κ and τ, and standard deviations of rows (n, rank), of equal probability.
-    """
-    # The kinds' shares do not depend on each other: those of closure phases come in another order.
-    n = len(sizes)
-    mixed = np.argsort(evenly(n))
-    nodes = {
-        kind: [drift.nodes(n)[k] for k in (np.arange(n) if kind else mixed)]
-        for kind, drift in ((True, vis2), (False, closure))
-        if drift is not None
-    }
-    mean = np.sqrt((sizes**2).mean(axis=0))
-    alone = np.ptp(sizes, axis=0) > 0.0
-    each, means = [], []
-    for one in series:
-        correlation = np.array([one.correlation(*node) for node in nodes[one.vis2]])
-        own = sizes[:, one.rows]
-        each.append(correlation * own[:, :, None] * own[:, None])
-        means.append(each[-1].mean(axis=0) / np.outer(mean[one.rows], mean[one.rows]))
-        alone[one.rows] = False
-    turned, axes = turned_rows(replace(rows, sigma=mean), list(zip(series, means, strict=True)))
-    blocks = []
-    for axis, covariance in zip(axes, each, strict=True):
-        turn = axis.vectors / np.sqrt(axis.values)
-        roots = np.linalg.cholesky(turn.T @ covariance @ turn)
-        blocks.append([(axis.rows, root) for root in roots])
-    few = np.arange(FEW_ROWS, np.count_nonzero(alone), FEW_ROWS)
-    for at in np.split(np.flatnonzero(alone), few):
-        if len(at):
-            blocks.append([(at, np.diag(own)) for own in sizes[:, at] / mean[at]])
-    return turned, tuple(zip(*blocks, strict=True))

@@ -330,10 +330,9 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     n_rest = len(whole) - len(along)
     back = layout._back(neighbour)
     log_step = float(np.log1p(-(back**2)).sum())
-    found = []
-    for rho in COMMON:
-        variance = 1.0 - rho + (rho + sure) * length
-        product = rest / (1.0 - rho) + single + (along / variance[:, None]).T @ along
-        logdet = log_step + n_rest * np.log1p(-rho) + np.log(variance).sum()
-        found.append(restricted_loss(product, len(both), logdet))
-    return np.array(found)
+    each = COMMON[:, None]
+    variance = 1.0 - each + (each + sure) * length
+    weighted = along.T / variance[:, None] @ along
+    product = rest / (1.0 - each[:, None]) + single + weighted
+    logdet = log_step + n_rest * np.log1p(-COMMON) + np.log(variance).sum(axis=1)
+    return restricted_loss(product, len(both), logdet)

@@ -112,33 +112,34 @@ def chi2_of_part(covariance: Covariance, at: IntArray, difference: FloatArray) -
     return float((part.whiten(difference[at]) ** 2).sum()), part.rank
 
 
-def restricted_loss(product: FloatArray, n: int, logdet: float) -> float:
+def restricted_loss(product: FloatArray, n: int, logdet: FloatArray) -> FloatArray:
     """−2 ln of the restricted likelihood of n data, the scale of their errors at its best.
 
     0 where a linear fit passes through all of them: they say nothing of their noise then.
 
     Parameters
     ----------
-    product : (1 + n_dim, 1 + n_dim) float array
+    product : (..., 1 + n_dim, 1 + n_dim) float array
         Products of whitened residual and slopes.
     n : int
-    logdet : float
-        Of their covariance.
+    logdet : (...) float array
+        Of their covariances.
     """
     chi2, n_fitted, information = _linear_fit(product)
     count = n - n_fitted
-    if count == 0:
-        return 0.0
-    return float(count * np.log(max(chi2, 1e-300) / count) + logdet + information)
+    loss = count * np.log(np.maximum(chi2, 1e-300) / np.maximum(count, 1)) + logdet + information
+    return np.where(count > 0, loss, 0.0)
 
 
-def _linear_fit(product: FloatArray) -> tuple[float, int, float]:
-    """χ² after a linear fit, number of parameters that it tells, and ln of their information."""
-    slopes = product[1:, 1:]
-    scale = np.sqrt(np.maximum(np.diag(slopes), 1e-300))
-    values, vectors = np.linalg.eigh(slopes / np.outer(scale, scale))
+def _linear_fit(product: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
+    """χ² after linear fits, numbers of parameters that they tell, and ln of their information."""
+    slopes = product[..., 1:, 1:]
+    scale = np.sqrt(np.maximum(np.diagonal(slopes, axis1=-2, axis2=-1), 1e-300))
+    values, vectors = np.linalg.eigh(slopes / (scale[..., :, None] * scale[..., None, :]))
     told = values > 1e-10
-    pull = vectors[:, told].T @ (product[1:, 0] / scale)
-    chi2 = float(product[0, 0] - (pull**2 / values[told]).sum())
-    information = float(np.log(values[told]).sum() + 2.0 * np.log(scale[scale > 1e-140]).sum())
-    return chi2, int(told.sum()), information
+    known = np.where(told, values, 1.0)
+    pull = (vectors.swapaxes(-2, -1) @ (product[..., 1:, 0] / scale)[..., None])[..., 0]
+    chi2 = product[..., 0, 0] - (told * pull**2 / known).sum(axis=-1)
+    length = np.where(scale > 1e-140, scale, 1.0)
+    information = np.log(known).sum(axis=-1) + 2.0 * np.log(length).sum(axis=-1)
+    return chi2, told.sum(axis=-1), information

@@ -58,15 +58,16 @@ class Series:
     source: str
     vis2: bool
 
-    def correlation(self, share: float, tau: float) -> FloatArray:
-        """Correlation (n, n) of exposures for κ and τ, hours."""
+    def correlation(self, share: FloatArray, tau: FloatArray) -> FloatArray:
+        """Correlations (..., n, n) of exposures for κ and τ (...), hours."""
+        share, tau = share[..., None, None], tau[..., None, None]
         apart = np.abs(self.hours[:, None] - self.hours)
         return np.asarray(share * np.exp(-apart / tau) + (1.0 - share) * np.eye(len(self.rows)))
 
     def mean_correlation(self, lasting: Sequence[float]) -> FloatArray:
         """Its mean over a posterior; see `Drift.lasting`."""
-        each = [w * self.correlation(1.0, tau) for w, tau in zip(lasting, HOURS, strict=True)]
-        return np.asarray(np.sum(each, axis=0) + (1.0 - sum(lasting)) * np.eye(len(self.rows)))
+        whole = self.correlation(np.ones(len(HOURS)), HOURS)
+        return np.tensordot(lasting, whole, 1) + (1.0 - sum(lasting)) * np.eye(len(self.rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +100,12 @@ class Drift:
         """Mean share of the variance that lasts for each of `HOURS`."""
         return tuple((self.mass @ SHARES).tolist())
 
-    def nodes(self, n: int) -> list[tuple[float, float]]:
-        """κ and τ of equal probability, n pairs, from the least κ to the largest."""
+    def nodes(self, n: int) -> FloatArray:
+        """κ and τ of equal probability, (2, n), from the least κ to the largest."""
         order = np.argsort(np.tile(SHARES, len(HOURS)), kind="stable")
         cumulative = np.cumsum(self.mass.ravel()[order])
         at = order[np.searchsorted(cumulative, (np.arange(n) + 0.5) / n * cumulative[-1])]
-        return [(float(SHARES[k % len(SHARES)]), float(HOURS[k // len(SHARES)])) for k in at]
+        return np.array([SHARES[at % len(SHARES)], HOURS[at // len(SHARES)]])
 
 
 def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
@@ -179,29 +180,36 @@ def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:
     both : (n_independent, 1 + n_dim) float array
         Whitened residual of a fit, and slopes of its parameters.
     """
-    n = sum(len(one.rows) for one in series)
+    alike, n = _of_lengths(series), sum(len(one.rows) for one in series)
     loss = np.empty((len(HOURS), len(SHARES)))
     for i, tau in enumerate(HOURS):
-        size, along = _along_axes(series, both, tau)
-        for k, share in enumerate(SHARES):
-            variance = 1.0 + share * (size - 1.0)
-            product = (along / variance[:, None]).T @ along
-            loss[i, k] = restricted_loss(product, n, float(np.log(variance).sum()))
+        size, along = _along_axes(alike, both, tau)
+        variance = 1.0 + SHARES[:, None] * (size - 1.0)
+        product = along.T / variance[:, None] @ along
+        loss[i] = restricted_loss(product, n, np.log(variance).sum(axis=1))
     prior = np.full(len(SHARES), (1.0 - PRIOR_INDEPENDENT) / (len(SHARES) - 1))
     prior[0] = PRIOR_INDEPENDENT
     mass = np.exp(-0.5 * (loss - loss.min())) * prior
     return Drift(mass / mass.sum())
 
 
+def _of_lengths(series: Sequence[Series]) -> list[tuple[IntArray, FloatArray]]:
+    """Rows and hours, (n_series, n) each, of series that are as long as each other."""
+    lengths = sorted({len(one.rows) for one in series})
+    alike = [[one for one in series if len(one.rows) == n] for n in lengths]
+    return [(np.array([o.rows for o in few]), np.array([o.hours for o in few])) for few in alike]
+
+
 def _along_axes(
-    series: Sequence[Series], both: FloatArray, tau: float
+    alike: Sequence[tuple[IntArray, FloatArray]], both: FloatArray, tau: float
 ) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (n,) of exp(−Δt/τ), and data (n, …) along its eigenvectors."""
-    parts = [(np.linalg.eigh(one.correlation(1.0, tau)), both[one.rows]) for one in series]
-    return (
-        np.concatenate([values for (values, _), _ in parts]),
-        np.concatenate([vectors.T @ own for (_, vectors), own in parts]),
-    )
+    values, along = [], []
+    for rows, hours in alike:
+        size, vectors = np.linalg.eigh(np.exp(-np.abs(hours[:, :, None] - hours[:, None]) / tau))
+        values.append(size.ravel())
+        along.append((vectors.swapaxes(1, 2) @ both[rows]).reshape(-1, both.shape[1]))
+    return np.concatenate(values), np.concatenate(along)
 
 
 @dataclass(frozen=True, eq=False)

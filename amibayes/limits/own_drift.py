@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from amibayes.companion_search.grid import Grid
-from amibayes.detection.exposure_noise import exposure_noise
+from amibayes.detection.exposure_noise import Exposures, exposures_of
 from amibayes.detection.statistic import Statistic, make_statistic
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.critical import CriticalContrasts
@@ -38,9 +38,9 @@ SMOOTH = 2
 """Degree of the polynomial in 1/separation that means follow: what a companion does changes the
 faster from exposure to exposure the farther it is, and is the less like drift."""
 
-FINER, AROUND = 64, 4
-"""Parts of a step of the field's lattice that places are put at, and steps around a place in which
-it is searched: half a fringe."""
+FINER = 64
+"""Parts of a step of the field's lattice that places are put at. Statistics are those at the place
+itself: a search around it by half a fringe changes the mean factor by 1 %, which is its error."""
 
 
 def with_own_drift(
@@ -76,8 +76,8 @@ def with_own_drift(
     log_error : (n_rings,) float array
         Error of the logarithm of the factor.
     """
-    drift, n_rings = test.exposures, len(rings.separation_mas)
-    if drift is None or (drift.vis2 is None and drift.closure_phase is None):
+    n_rings, exposures = len(rings.separation_mas), exposures_of(test.likelihood)
+    if test.exposures is None or exposures is None or not exposures.series:
         return critical, np.zeros(n_rings)
 
     def changes(each: int, first: int) -> FloatArray:
@@ -85,7 +85,7 @@ def with_own_drift(
         rng = [np.random.default_rng([seed, ring, first]) for ring in range(n_rings)]
         pieces = [_some_places(rings, critical, k, each, own) for k, own in enumerate(rng)]
         journal = journals.of(f"drift from {first}") if journals else None
-        work = partial(_piece, test, threshold)
+        work = partial(_piece, test, exposures, threshold)
         done = run_job(work, pieces, executor or SerialExecutor(), journal=journal)
         return np.stack([piece["change"] for piece in done])
 
@@ -122,15 +122,17 @@ def _some_places(
     return places, float(np.median(known)) if len(known) else 1.0, rng
 
 
-def _piece(test: Statistic, threshold: float, piece: _Piece) -> dict[str, FloatArray]:
+def _piece(
+    test: Statistic, exposures: Exposures, threshold: float, piece: _Piece
+) -> dict[str, FloatArray]:
     """Change of ln of the critical contrasts at places, where drift is fitted again."""
     places, typical, rng = piece
     noise, goal = test.likelihood.noise.draw(len(places), rng).T, float(np.sqrt(threshold))
     change = []
     for place, own in zip(places, noise, strict=True):
-        trial = _Trial(test, place, own)
-        kept = _crossing(partial(trial.root, again=False), goal, float(np.log(typical)))
-        change.append(_crossing(partial(trial.root, again=True), goal, kept) - kept)
+        trial = _Trial(test, exposures, place, own)
+        kept = _crossing(trial.root, goal, float(np.log(typical)))
+        change.append(_crossing(trial.root_by_own_drift, goal, kept) - kept)
     return {"change": np.array(change)}
 
 
@@ -151,25 +153,31 @@ def _crossing(root: Callable[[float], float], goal: float, start: float) -> floa
 class _Trial:
     """A companion at a place with noise of its own, searched there and opposite."""
 
-    def __init__(self, test: Statistic, place: FloatArray, noise: FloatArray) -> None:
-        self.test, self.place, self.noise = test, place, noise
-        self.star = single_likelihood(test.likelihood).predict(np.atleast_2d(test.single))
-        step = test.bank.grid.step_mas / FINER
-        near = FINER * np.arange(-AROUND, AROUND + 1)
-        half = np.rint(place / step).astype(int)[:, None] + np.stack(
-            [x.ravel() for x in np.meshgrid(near, near)]
-        )
-        self.grid = Grid(
-            step, test.bank.grid.inner_mas, test.bank.grid.outer_mas, *np.hstack([half, -half])
-        )
+    def __init__(
+        self, test: Statistic, exposures: Exposures, place: FloatArray, noise: FloatArray
+    ) -> None:
+        self.test, self.exposures, self.place, self.noise = test, exposures, place, noise
+        self.star = single_likelihood(test.likelihood).predict(np.atleast_2d(test.single))[:, 0]
+        grid = test.bank.grid
+        step = grid.step_mas / FINER
+        half = np.rint(place / step).astype(int)[:, None]
+        self.grid = Grid(step, grid.inner_mas, grid.outer_mas, *np.hstack([half, -half]))
+        self.kept = make_statistic(test.likelihood, self.grid, test.single)
 
-    def root(self, log_contrast: float, *, again: bool) -> float:
-        """Root of the statistic, with drift as in the data at hand, or fitted ``again``."""
+    def root(self, log_contrast: float) -> float:
+        """Root of the statistic with drift as in the data at hand."""
+        likelihood = self.test.likelihood
+        residual = likelihood.wrapped((self._change(log_contrast) + self.noise)[:, None])
+        return float(np.sqrt(self.kept.evaluate(likelihood.noise.whiten(residual))[0]))
+
+    def root_by_own_drift(self, log_contrast: float) -> float:
+        """Root of the statistic with drift fitted to residuals that hold the companion."""
         likelihood, single = self.test.likelihood, self.test.single
-        change = self.test.change_by(np.array([[*self.place, np.exp(log_contrast)]]))
-        sheet = likelihood.observables.with_data((self.star + change)[:, 0] + self.noise)
+        data = self.star + self._change(log_contrast) + self.noise
+        sheet = likelihood.observables.with_data(data)
         searched = Likelihood(sheet, likelihood.model, likelihood.noise, likelihood.samples)
-        found = exposure_noise(searched, single) if again else None
-        if found is not None:
-            searched = searched.with_noise(found.noise)
-        return float(np.sqrt(make_statistic(searched, self.grid, single).value))
+        noise = self.exposures.noise(single_likelihood(searched), single)
+        return float(np.sqrt(make_statistic(searched.with_noise(noise), self.grid, single).value))
+
+    def _change(self, log_contrast: float) -> FloatArray:
+        return self.test.change_by(np.array([[*self.place, np.exp(log_contrast)]]))[:, 0]
