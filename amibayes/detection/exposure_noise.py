@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtri
@@ -33,6 +34,7 @@ from amibayes.likelihood.exposure_rows import (
     Axes,
     Drift,
     Series,
+    SeriesAxes,
     drift_of,
     series_of,
     turned_rows,
@@ -179,9 +181,14 @@ class Exposures:
         """What exposures share of V² and of closure phases, by the residuals of a fit."""
         fit = likelihood.with_noise(self.noise_of(self.rows))
         both = np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)])
-        of_kinds = [[one for one in self.series if one.vis2 == kind] for kind in (True, False)]
-        vis2, closure = (drift_of(own, both) if own else None for own in of_kinds)
+        vis2, closure = (None if axes is None else drift_of(axes, both) for axes in self._axes)
         return vis2, closure
+
+    @cached_property
+    def _axes(self) -> list[SeriesAxes | None]:
+        """Of V² and of closure phases."""
+        of_kinds = [[one for one in self.series if one.vis2 == kind] for kind in (True, False)]
+        return [SeriesAxes.of(own) if own else None for own in of_kinds]
 
     def turned(
         self, vis2: Drift | None, closure: Drift | None

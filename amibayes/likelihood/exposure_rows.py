@@ -170,46 +170,62 @@ def _named(data: Observables, table: Measurements, k: int) -> tuple[object, ...]
     return tuple(sorted(own[i] for i in table.stations[k]))
 
 
-def drift_of(series: Sequence[Series], both: FloatArray) -> Drift:
+_Stack = tuple[IntArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesAxes:
+    """Eigenvalues and eigenvectors of exp(−Δt/τ) of some series, at every node of τ.
+
+    Parameters
+    ----------
+    nodes : tuple
+        For each of `HOURS` the rows (m, n), eigenvalues (m, n) and eigenvectors (m, n, n) of
+        series that are as long as each other.
+    """
+
+    nodes: tuple[list[_Stack], ...]
+
+    @classmethod
+    def of(cls, series: Sequence[Series]) -> SeriesAxes:
+        """Find them; of at least one series."""
+        lengths = sorted({len(one.rows) for one in series})
+        alike = [[one for one in series if len(one.rows) == n] for n in lengths]
+        rows = [np.array([one.rows for one in few]) for few in alike]
+        hours = [np.array([one.hours for one in few]) for few in alike]
+        apart = [np.abs(when[:, :, None] - when[:, None]) for when in hours]
+        return cls(
+            tuple(
+                [
+                    (at, *np.linalg.eigh(np.exp(-dt / tau)))
+                    for at, dt in zip(rows, apart, strict=True)
+                ]
+                for tau in HOURS
+            )
+        )
+
+
+def drift_of(axes: SeriesAxes, both: FloatArray) -> Drift:
     """Posterior of κ and τ by restricted likelihood.
 
     Parameters
     ----------
-    series : sequence of Series
-        At least one.
+    axes : SeriesAxes
     both : (n_independent, 1 + n_dim) float array
         Whitened residual of a fit, and slopes of its parameters.
     """
-    alike, n = _of_lengths(series), sum(len(one.rows) for one in series)
     loss = np.empty((len(HOURS), len(SHARES)))
-    for i, tau in enumerate(HOURS):
-        size, along = _along_axes(alike, both, tau)
+    for i, stacks in enumerate(axes.nodes):
+        size = np.concatenate([values.ravel() for _, values, _ in stacks])
+        turned = [vectors.swapaxes(1, 2) @ both[rows] for rows, _, vectors in stacks]
+        along = np.concatenate([part.reshape(-1, both.shape[1]) for part in turned])
         variance = 1.0 + SHARES[:, None] * (size - 1.0)
         product = along.T / variance[:, None] @ along
-        loss[i] = restricted_loss(product, n, np.log(variance).sum(axis=1))
+        loss[i] = restricted_loss(product, len(size), np.log(variance).sum(axis=1))
     prior = np.full(len(SHARES), (1.0 - PRIOR_INDEPENDENT) / (len(SHARES) - 1))
     prior[0] = PRIOR_INDEPENDENT
     mass = np.exp(-0.5 * (loss - loss.min())) * prior
     return Drift(mass / mass.sum())
-
-
-def _of_lengths(series: Sequence[Series]) -> list[tuple[IntArray, FloatArray]]:
-    """Rows and hours, (n_series, n) each, of series that are as long as each other."""
-    lengths = sorted({len(one.rows) for one in series})
-    alike = [[one for one in series if len(one.rows) == n] for n in lengths]
-    return [(np.array([o.rows for o in few]), np.array([o.hours for o in few])) for few in alike]
-
-
-def _along_axes(
-    alike: Sequence[tuple[IntArray, FloatArray]], both: FloatArray, tau: float
-) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues (n,) of exp(−Δt/τ), and data (n, …) along its eigenvectors."""
-    values, along = [], []
-    for rows, hours in alike:
-        size, vectors = np.linalg.eigh(np.exp(-np.abs(hours[:, :, None] - hours[:, None]) / tau))
-        values.append(size.ravel())
-        along.append((vectors.swapaxes(1, 2) @ both[rows]).reshape(-1, both.shape[1]))
-    return np.concatenate(values), np.concatenate(along)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from amibayes.likelihood.channel_rows import (
     channel_layout,
 )
 from amibayes.likelihood.chi2 import chi2_survival
-from amibayes.likelihood.exposure_rows import Series, drift_of, series_of
+from amibayes.likelihood.exposure_rows import SeriesAxes, drift_of, series_of
 from amibayes.likelihood.extra_noise import (
     BOUND,
     UNLIKELY,
@@ -186,9 +186,10 @@ class _Kind:
         return channel_layout(self.data)
 
     @cached_property
-    def _series(self) -> tuple[Series, ...]:
-        """Exposures that may err alike: no amount of noise changes which they are."""
-        return series_of(self.data, self._layout)
+    def _axes(self) -> SeriesAxes | None:
+        """Of exposures that may err alike: no amount of noise changes which they are."""
+        series = series_of(self.data, self._layout)
+        return SeriesAxes.of(series) if series else None
 
     def explained(self, shared: Correlation) -> bool:
         """Whether the stated errors explain the residuals, for any share within 2σ."""
@@ -278,13 +279,13 @@ class _Kind:
 
     def with_exposures(self, amount: float, shared: Correlation) -> Correlation:
         """The same with what exposures that follow each other share, as the residuals show."""
-        if not self._series:
+        if self._axes is None:
             return shared
         alone = replace(shared, lasting=())
         rows = channel_rows(self._layout, [ChannelShare(alone, alone)], self._own_floors)
         noise = ChannelCovariance(self._with(amount), rows)
         white = noise.whiten(np.column_stack([self.residual, self.jacobian]))
-        return replace(shared, lasting=drift_of(self._series, white).lasting)
+        return replace(shared, lasting=drift_of(self._axes, white).lasting)
 
     def _growth(
         self, square: FloatArray, variance: FloatArray, floor: FloatArray, ratio: float

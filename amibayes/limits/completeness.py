@@ -127,7 +127,7 @@ def detection_limit(
         executor=executor, progress=progress, journals=journals,
     )  # fmt: skip
     critical, drift_error = with_own_drift(
-        test, threshold, rings, critical, draws.seed, executor=executor, journals=journals
+        test, threshold, rings, critical, SHARES, draws.seed, executor=executor, journals=journals
     )
     return _summarised(test, null, threshold, rings, critical, drift_error)
 
@@ -271,7 +271,7 @@ def _summarised(
     every, error = pooled.contrast(SHARES)
     every = np.maximum.accumulate(every, axis=1)
     error = np.hypot(error, goal[1] / (goal[0] + stats.norm.ppf(SHARES)))
-    error = np.hypot(error, drift_error[:, None])
+    error = np.hypot(error, drift_error)
     at = [int(np.abs(SHARES - share).argmin()) for share in (COMPLETENESS, 0.5)]
     return DetectionLimit(
         method="injection",

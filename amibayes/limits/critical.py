@@ -79,12 +79,16 @@ class CriticalContrasts:
         each = (np.concatenate(pair, axis=2) for pair in both)
         return replace(self, **dict(zip(names, each, strict=True)))
 
-    def less_sensitive(self, factor: FloatArray) -> CriticalContrasts:
+    def less_sensitive(self, factor: FloatArray, spread: FloatArray) -> CriticalContrasts:
         """The same where detection takes contrasts larger by factors (n_rings,).
 
+        Logarithms of them are spread about a ring's median as many times as wide (n_rings,).
         From which contrast on a companion that is detected is seen at its place does not change.
         """
-        detected = self.detected * factor[:, None, None]
+        middle = np.median(self.detected, axis=(1, 2), keepdims=True)
+        middle = np.where(np.isfinite(middle), middle, 1.0)
+        wider = (self.detected / middle) ** spread[:, None, None]
+        detected = middle * factor[:, None, None] * wider
         return replace(
             self,
             detected=detected,

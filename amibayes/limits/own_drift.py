@@ -8,10 +8,11 @@ searched with the drift of the data at hand: here some of them are searched as r
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
+from scipy.special import ndtri
 
 from amibayes.companion_search.grid import Grid
 from amibayes.detection.exposure_noise import Exposures, exposures_of
@@ -22,10 +23,9 @@ from amibayes.limits.rings import Rings
 from amibayes.parallel import Executor, Journals, SerialExecutor, run_job
 from amibayes.units import FloatArray
 
-LEAST_PER_RING, TRIALS, WANTED = 2, 96, 0.02
-"""Companions on each ring at first, and in all at most: as many as it takes to know the logarithm
-of the mean factor to so much. It differs by 0.3 from one companion to the next where drift is
-large."""
+TRIALS, LEAST, MOST = 128, 3, 32
+"""Companions in all, and on a ring. They go with 1/separation, as drift does: on the innermost ring
+one companion differs by 0.3 of the logarithm from the next, beyond 2 λ/B by 0.05."""
 
 LOOKS, CLOSE, FARTHEST = 5, 0.15, np.log(8.0)
 """Contrasts that are tried of a companion at most, the step of the logarithm that is taken without
@@ -48,6 +48,7 @@ def with_own_drift(
     threshold: float,
     rings: Rings,
     critical: CriticalContrasts,
+    shares: FloatArray,
     seed: int,
     *,
     executor: Executor | None = None,
@@ -55,8 +56,8 @@ def with_own_drift(
 ) -> tuple[CriticalContrasts, FloatArray]:
     """Critical contrasts where what exposures share is fitted with the companion in the data.
 
-    Those of detection are larger by one factor on a ring: quantiles of some hundred trials are
-    alike in it. The same as before where exposures are taken to be independent.
+    Those of detection are larger by a mean factor on each ring, and more different from each
+    other. The same as before where exposures are taken to be independent.
 
     Parameters
     ----------
@@ -66,6 +67,7 @@ def with_own_drift(
     rings : Rings
     critical : CriticalContrasts
         On these rings, with the drift of the data at hand.
+    shares : (n_shares,) float array
     seed : int
     executor, journals : optional
         As in `amibayes.limits.completeness.detection_limit`.
@@ -73,48 +75,70 @@ def with_own_drift(
     Returns
     -------
     critical : CriticalContrasts
-    log_error : (n_rings,) float array
-        Error of the logarithm of the factor.
+    log_error : (n_rings, n_shares) float array
+        Of the logarithms of contrasts at which shares are detected.
     """
     n_rings, exposures = len(rings.separation_mas), exposures_of(test.likelihood)
     if test.exposures is None or exposures is None or not exposures.series:
-        return critical, np.zeros(n_rings)
-
-    def changes(each: int, first: int) -> FloatArray:
-        """Changes (n_rings, each) by companions from number ``first`` of each ring on."""
-        rng = [np.random.default_rng([seed, ring, first]) for ring in range(n_rings)]
-        pieces = [_some_places(rings, critical, k, each, own) for k, own in enumerate(rng)]
-        journal = journals.of(f"drift from {first}") if journals else None
-        work = partial(_piece, test, exposures, threshold)
-        done = run_job(work, pieces, executor or SerialExecutor(), journal=journal)
-        return np.stack([piece["change"] for piece in done])
-
-    found = changes(LEAST_PER_RING, 0)
-    factor, error = _smooth(found, rings.separation_mas)
-    wanted = LEAST_PER_RING * (float(np.median(error)) / WANTED) ** 2
-    if (more := int(min(np.ceil(wanted), TRIALS // n_rings)) - LEAST_PER_RING) > 0:
-        every = np.hstack([found, changes(more, LEAST_PER_RING)])
-        factor, error = _smooth(every, rings.separation_mas)
-    return critical.less_sensitive(np.exp(factor)), error
+        return critical, np.zeros((n_rings, len(shares)))
+    far = rings.separation_mas.max()
+    inverse = far / np.maximum(rings.separation_mas, 1e-3 * far)
+    number = np.clip(TRIALS * inverse / inverse.sum(), LEAST, MOST).astype(int)
+    pieces = [_some_places(rings, critical, k, n, seed) for k, n in enumerate(number)]
+    done = run_job(
+        partial(_piece, test, exposures, threshold), pieces, executor or SerialExecutor(),
+        journal=journals.of("drift") if journals else None,
+    )  # fmt: skip
+    kept, own = zip(*[(piece["kept"], piece["own"]) for piece in done], strict=True)
+    change = [after - before for after, before in zip(own, kept, strict=True)]
+    factor, error = _smooth(change, inverse)
+    width, spread, spread_error = _spread(kept, own, factor)
+    error = np.hypot(error[:, None], spread_error[:, None] * width * ndtri(shares))
+    return critical.less_sensitive(np.exp(factor), spread), error
 
 
-def _smooth(change: FloatArray, separation_mas: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of changes (n_rings, n) that goes smoothly with separation, and its error (n_rings,)."""
-    n_rings, n = change.shape
-    powers = np.vander(separation_mas.min() / separation_mas, min(SMOOTH + 1, n_rings))
-    basis = np.linalg.qr(powers)[0]
-    mean = basis @ (basis.T @ change.mean(axis=1))
-    left = ((change - mean[:, None]) ** 2).sum() / max(change.size - basis.shape[1], 1)
-    return mean, np.sqrt(left / n * (basis**2).sum(axis=1))
+def _smooth(change: Sequence[FloatArray], inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means (n_rings,) of changes that go smoothly with 1/separation, and their errors.
+
+    Least squares with as many changes as a ring has; errors by what each ring scatters.
+    """
+    number = np.array([len(one) for one in change])
+    mean = np.array([one.mean() for one in change])
+    scatter = np.array([one.var(ddof=1) for one in change])
+    powers = np.vander(inverse / inverse.max(), min(SMOOTH + 1, len(change)))
+    hat = powers @ np.linalg.pinv(powers * np.sqrt(number)[:, None]) * np.sqrt(number)
+    return hat @ mean, np.sqrt(hat**2 @ (scatter / number))
+
+
+def _spread(
+    kept: Sequence[FloatArray], own: Sequence[FloatArray], factor: FloatArray
+) -> tuple[float, FloatArray, FloatArray]:
+    """Spread of logarithms of contrasts, and how many times as wide it is, (n_rings,).
+
+    Their variance grows by a part of the square of the mean change, the same for all rings. The
+    last is the error of the ratio.
+    """
+    before, after = (np.concatenate([_off(one) ** 2 for one in values]) for values in (kept, own))
+    square = np.repeat(factor**2, [len(one) for one in own])
+    growth, weight = after - before, max(float(square @ square), 1e-300)
+    part = max(float(growth @ square) / weight, 0.0)
+    error = float(np.sqrt(((growth - part * square) ** 2) @ square**2)) / weight
+    variance = max(float(before.mean()), 1e-300)
+    ratio = np.sqrt(1.0 + part * factor**2 / variance)
+    return float(np.sqrt(variance)), ratio, 0.5 * error * factor**2 / (variance * ratio)
+
+
+def _off(values: FloatArray) -> FloatArray:
+    """Deviations from the mean, their mean square that of the distribution."""
+    return np.asarray((values - values.mean()) * np.sqrt(len(values) / (len(values) - 1)))
 
 
 _Piece = tuple[FloatArray, float, np.random.Generator]
 
 
-def _some_places(
-    rings: Rings, critical: CriticalContrasts, ring: int, n: int, rng: np.random.Generator
-) -> _Piece:
+def _some_places(rings: Rings, critical: CriticalContrasts, ring: int, n: int, seed: int) -> _Piece:
     """Places (n, 2) all around a ring, the typical contrast there, and random numbers."""
+    rng = np.random.default_rng([seed, ring])
     n_angles = rings.east_mas.shape[1]
     angles = ((np.arange(n) + rng.uniform()) * n_angles / n).astype(int) % n_angles
     places = np.column_stack([rings.east_mas[ring, angles], rings.north_mas[ring, angles]])
@@ -125,15 +149,15 @@ def _some_places(
 def _piece(
     test: Statistic, exposures: Exposures, threshold: float, piece: _Piece
 ) -> dict[str, FloatArray]:
-    """Change of ln of the critical contrasts at places, where drift is fitted again."""
+    """Logarithms of critical contrasts at places, with drift as it was and fitted again."""
     places, typical, rng = piece
     noise, goal = test.likelihood.noise.draw(len(places), rng).T, float(np.sqrt(threshold))
-    change = []
+    found = []
     for place, own in zip(places, noise, strict=True):
         trial = _Trial(test, exposures, place, own)
         kept = _crossing(trial.root, goal, float(np.log(typical)))
-        change.append(_crossing(trial.root_by_own_drift, goal, kept) - kept)
-    return {"change": np.array(change)}
+        found.append((kept, _crossing(trial.root_by_own_drift, goal, kept)))
+    return dict(zip(("kept", "own"), np.array(found).T, strict=True))
 
 
 def _crossing(root: Callable[[float], float], goal: float, start: float) -> float:

@@ -21,7 +21,7 @@ from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.channel_rows import OFFSET, SLOPE, ChannelRows, channel_layout
-from amibayes.likelihood.exposure_rows import HOURS, SHARES, Series, drift_of, series_of
+from amibayes.likelihood.exposure_rows import HOURS, SHARES, Series, SeriesAxes, drift_of, series_of
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
@@ -112,7 +112,7 @@ def test_share_and_time_are_found(rng) -> None:
         white = np.sqrt(share) * common + np.sqrt(1.0 - share) * rng.standard_normal(144)
         slopes = rng.standard_normal((144, 2))
         data = white + slopes @ (10.0 * rng.standard_normal(2))
-        found = drift_of(series, np.column_stack([data, slopes]))
+        found = drift_of(SeriesAxes.of(series), np.column_stack([data, slopes]))
         mass = found.mass.sum(axis=0)
         mass[0] = 0.0  # the truth is drawn from the rest of the prior
         mass /= mass.sum()
@@ -124,7 +124,9 @@ def test_share_and_time_are_found(rng) -> None:
 def test_independent_exposures_are_told(rng) -> None:
     hours = np.arange(20) / 3.0
     series = [Series(np.arange(20) + 20 * k, hours, "", vis2=True) for k in range(6)]
-    shares = [drift_of(series, rng.standard_normal((120, 3))).share[0] for _ in range(30)]
+    shares = [
+        drift_of(SeriesAxes.of(series), rng.standard_normal((120, 3))).share[0] for _ in range(30)
+    ]
     assert np.mean(shares) < 0.08
 
 

@@ -27,7 +27,7 @@ from amibayes.likelihood.chi2 import (
     log_peak,
     restricted_loss,
 )
-from amibayes.likelihood.exposure_rows import drift_of, series_of
+from amibayes.likelihood.exposure_rows import SeriesAxes, drift_of, series_of
 from amibayes.likelihood.extra_noise import (
     ExtraNoise,
     FileNoise,
@@ -294,7 +294,9 @@ def test_rows_of_channels_and_exposures(num_regression) -> None:
     alone = noise_with_channels(data, [], FLOORS)
     series = series_of(data, layout)
     both = Likelihood(data).residuals([[10.0, 5.0, 0.0]])
-    drift = drift_of(series, np.hstack([both, np.cos(np.arange(len(both)))[:, None]]))
+    drift = drift_of(
+        SeriesAxes.of(series), np.hstack([both, np.cos(np.arange(len(both)))[:, None]])
+    )
     lasting = replace(share(0.4, 0.3), vis2=replace(share(0.4, 0.3).vis2, lasting=drift.lasting))
     turned = noise_with_channels(data, [lasting])
     basis = smooth_basis(np.linspace(0.5, 1.5, 40))
@@ -314,7 +316,7 @@ def test_rows_of_channels_and_exposures(num_regression) -> None:
         drift=drift,
         share=drift.share,
         drift_hours=drift.hours,
-        nodes=drift.nodes(5),
+        nodes=list(drift.nodes(5).T),
         basis=np.abs(dense[:2]),
         slope_share=basis.slope_share,
     )

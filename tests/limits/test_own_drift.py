@@ -5,16 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amibayes.limits.own_drift import _crossing, _smooth
+from amibayes.limits.critical import CriticalContrasts
+from amibayes.limits.own_drift import _crossing, _smooth, _spread
 
 
 def test_errors_of_mean_changes_are_those_of_many_draws() -> None:
-    """Of rings with a common scatter; a parabola in 1/separation is followed without a bias."""
-    rng, separation = np.random.default_rng(1), np.geomspace(2.0, 30.0, 12)
-    inverse = separation.min() / separation
-    truth = 0.05 + 0.1 * inverse + 0.4 * inverse**2
+    """Of rings with numbers and scatters of their own; a parabola is followed without a bias."""
+    rng, inverse = np.random.default_rng(1), np.geomspace(15.0, 1.0, 12)
+    truth = 0.05 + 0.1 * inverse / 15.0 + 0.4 * (inverse / 15.0) ** 2
+    number, scatter = np.arange(14, 2, -1), np.linspace(0.4, 0.1, 12)
     draws = [
-        _smooth(truth[:, None] + 0.3 * rng.normal(size=(12, 6)), separation) for _ in range(900)
+        _smooth(
+            [m + s * rng.normal(size=n) for m, s, n in zip(truth, scatter, number, strict=True)],
+            inverse,
+        )
+        for _ in range(900)
     ]
     off = np.array([mean - truth for mean, _ in draws])
     error = np.sqrt((np.array([one for _, one in draws]) ** 2).mean(axis=0))
@@ -25,9 +30,42 @@ def test_errors_of_mean_changes_are_those_of_many_draws() -> None:
 @pytest.mark.parametrize("n_rings", [1, 2])
 def test_few_rings_have_their_own_means(n_rings: int) -> None:
     change = np.random.default_rng(2).normal(size=(n_rings, 40))
-    mean, error = _smooth(change, np.array([2.0, 5.0])[:n_rings])
+    mean, error = _smooth(list(change), np.array([5.0, 2.0])[:n_rings])
     assert mean == pytest.approx(change.mean(axis=1))
-    assert error == pytest.approx(np.full(n_rings, 1.0 / np.sqrt(40.0)), rel=0.4)
+    assert error == pytest.approx(change.std(axis=1, ddof=1) / np.sqrt(40.0))
+
+
+def test_the_spread_of_contrasts_is_that_of_many() -> None:
+    """Where the variance of the change goes with the square of its mean; errors by many draws."""
+    rng, factor, number = np.random.default_rng(3), np.linspace(0.6, 0.05, 10), np.arange(24, 4, -2)
+    truth = np.sqrt(1.0 + 0.5 * factor**2 / 0.25**2)
+    draws = []
+    for _ in range(900):
+        kept = [0.25 * rng.normal(size=n) - 5.0 for n in number]
+        own = [
+            k + f + np.sqrt(0.5) * f * rng.normal(size=len(k))
+            for k, f in zip(kept, factor, strict=True)
+        ]
+        draws.append(_spread(kept, own, factor))
+    width, ratio, error = (np.array([one[k] for one in draws]) for k in range(3))
+    assert np.sqrt((width**2).mean()) == pytest.approx(0.25, rel=0.01)
+    assert ratio.mean(axis=0) == pytest.approx(truth, rel=0.03)
+    assert ratio.std(axis=0) == pytest.approx(np.sqrt((error**2).mean(axis=0)), rel=0.25)
+
+
+def test_logarithms_are_spread_about_the_median_of_their_ring() -> None:
+    log = np.random.default_rng(4).normal(-6.0, 0.2, (2, 5, 41))
+    shape = log[:, :, 0]
+    none = CriticalContrasts(
+        np.exp(log), np.exp(log), np.ones_like(shape), log, log, np.zeros(2), np.ones(2, dtype=bool)
+    )
+    wider = none.less_sensitive(np.array([1.5, 1.0]), np.array([1.3, 1.0]))
+    found = np.log(wider.detected)
+    before, after = np.median(log, axis=(1, 2)), np.median(found, axis=(1, 2))
+    assert after - before == pytest.approx([np.log(1.5), 0.0])
+    assert found.std(axis=(1, 2)) / log.std(axis=(1, 2)) == pytest.approx([1.3, 1.0])
+    assert (wider.located >= wider.detected).all()
+    assert wider.sigma[:, 0] == pytest.approx([1.5, 1.0])
 
 
 @pytest.mark.parametrize("start", [-7.0, -4.0, -1.0])
