@@ -179,12 +179,36 @@ def _checked(
     single: FloatArray,
     deviance_single: float,
 ) -> Mode:
-    """Global check by NLopt; of large data with their channels averaged."""
+    """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
+
+    It shares neither the lattice nor the choice of peaks with the search. A field of very
+    many fringes is more than it can cover; what it finds is a lower bound then. ``coarse`` are
+    the same data, or those with their channels averaged.
+    """
     if coarse is not likelihood:
         grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas)
     # Combining the data for some hundred positions would take longer than it saves.
     bank = TemplateBank(coarse, grid, single)
-    return _best_by_direct(likelihood, coarse, bank, box, single, deviance_single)
+    best_at = bank.matched_filter(single_likelihood(coarse).residuals(single)[:, 0])
+
+    def inside(position: FloatArray) -> bool:
+        return box.inner_mas <= math.hypot(*position) <= box.outer_mas
+
+    def loss(position: FloatArray, _: FloatArray) -> float:
+        return -best_at(position)[1] if inside(position) else 0.0
+
+    optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
+    optimiser.set_lower_bounds([-box.outer_mas] * 2)
+    # The box is a little lopsided so that its first trial is not the star itself.
+    optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
+    optimiser.set_min_objective(loss)
+    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
+    wanted = int(EVALUATIONS_PER_FRINGE * patches)
+    optimiser.set_maxeval(min(max(wanted, MIN_EVALUATIONS), MAX_EVALUATIONS))
+    start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
+    position = np.asarray(optimiser.optimize(start))
+    position = position if inside(position) else start
+    return refine_at(likelihood, position, best_at(position)[0], single, box, deviance_single)
 
 
 def _solutions(
@@ -351,39 +375,3 @@ def _warnings(
             "fit as well; the innermost is reported"
         )
     return tuple(warnings)
-
-
-def _best_by_direct(
-    likelihood: Likelihood,
-    coarse: Likelihood,
-    bank: TemplateBank,
-    box: Box,
-    single: FloatArray,
-    deviance_single: float,
-) -> Mode:
-    """Look for the best position with NLopt's DIRECT-L over the whole field, then refine it.
-
-    It shares neither the lattice nor the choice of peaks with the search. A field of very
-    many fringes is more than it can cover; what it finds is a lower bound then. ``bank`` is of
-    ``coarse``, the same data or those with their channels averaged.
-    """
-    best_at = bank.matched_filter(single_likelihood(coarse).residuals(single)[:, 0])
-
-    def inside(position: FloatArray) -> bool:
-        return box.inner_mas <= math.hypot(*position) <= box.outer_mas
-
-    def loss(position: FloatArray, _: FloatArray) -> float:
-        return -best_at(position)[1] if inside(position) else 0.0
-
-    optimiser = nlopt.opt(nlopt.GN_DIRECT_L, 2)
-    optimiser.set_lower_bounds([-box.outer_mas] * 2)
-    # The box is a little lopsided so that its first trial is not the star itself.
-    optimiser.set_upper_bounds([1.03 * box.outer_mas, 1.07 * box.outer_mas])
-    optimiser.set_min_objective(loss)
-    patches = (2.0 * box.outer_mas / box.fringe_mas) ** 2
-    wanted = int(EVALUATIONS_PER_FRINGE * patches)
-    optimiser.set_maxeval(min(max(wanted, MIN_EVALUATIONS), MAX_EVALUATIONS))
-    start = np.array([0.0, 0.5 * (box.inner_mas + box.outer_mas)])
-    position = np.asarray(optimiser.optimize(start))
-    position = position if inside(position) else start
-    return refine_at(likelihood, position, best_at(position)[0], single, box, deviance_single)

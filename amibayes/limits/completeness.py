@@ -117,8 +117,6 @@ def detection_limit(
     DetectionLimit
     """
     in_range("detection_limit", "trials", trials, 1)
-    if separation_mas is not None and not len(separation_mas):
-        raise UsageError("detection_limit: separation_mas is empty", remedy="give one, in mas")
     test, null = _without_companion(result, significance, rng, executor, journals)
     rings, draws = _planned(result, test, n_separations, separation_mas, trials, noise, rng)
     threshold = pareto_quantile(null.null, null.alpha)

@@ -10,6 +10,7 @@ import numpy as np
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.errors import UsageError
 from amibayes.support.arguments import in_range
 from amibayes.support.evenly import evenly
 from amibayes.support.options import LIMITS_SEPARATIONS
@@ -64,6 +65,8 @@ def make_rings(
     most_angles : int
     """
     in_range("limits", "n_separations", n_separations, 1)
+    if separation_mas is not None and not len(separation_mas):
+        raise UsageError("limits: separation_mas is empty", remedy="give one, in mas")
     for one in () if separation_mas is None else separation_mas:
         in_range("limits", "separation_mas", one, 0.0)
     grid = result.grid

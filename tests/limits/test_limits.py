@@ -18,6 +18,7 @@ from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import statistic_of
 from amibayes.errors import UsageError
 from amibayes.likelihood.likelihood import Likelihood
+from amibayes.limits.analytic import analytic_limit
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.injection import recover
 from amibayes.limits.limit import SHARES, DetectionLimit
@@ -368,6 +369,8 @@ def test_limits_at_no_separation_are_refused(setting) -> None:
     result, _, tested, _ = setting
     with pytest.raises(UsageError, match="separation_mas is empty"):
         detection_limit(result, tested, np.random.default_rng(1), separation_mas=[])
+    with pytest.raises(UsageError, match="separation_mas is empty"):
+        analytic_limit(result, "absil", separation_mas=[])
 
 
 def test_shares_between_rings_and_levels_are_interpolated() -> None:
