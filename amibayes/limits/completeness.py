@@ -30,7 +30,7 @@ from amibayes.limits.critical import (
 from amibayes.limits.limit import SHARES, DetectionLimit
 from amibayes.limits.own_drift import with_own_drift
 from amibayes.limits.pooled import Pooled, quantiles
-from amibayes.limits.rings import Rings, make_rings
+from amibayes.limits.rings import Rings, check_separations, make_rings
 from amibayes.parallel import Executor, Journals, Progress, spawn
 from amibayes.support.arguments import checks_arguments, in_range
 from amibayes.support.options import LIMITS_TRIALS
@@ -117,6 +117,7 @@ def detection_limit(
     DetectionLimit
     """
     in_range("detection_limit", "trials", trials, 1)
+    check_separations(separation_mas)
     test, null = _without_companion(result, significance, rng, executor, journals)
     rings, draws = _planned(result, test, n_separations, separation_mas, trials, noise, rng)
     threshold = pareto_quantile(null.null, null.alpha)

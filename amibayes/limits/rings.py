@@ -65,10 +65,7 @@ def make_rings(
     most_angles : int
     """
     in_range("limits", "n_separations", n_separations, 1)
-    if separation_mas is not None and not len(separation_mas):
-        raise UsageError("limits: separation_mas is empty", remedy="give one, in mas")
-    for one in () if separation_mas is None else separation_mas:
-        in_range("limits", "separation_mas", one, 0.0)
+    check_separations(separation_mas)
     grid = result.grid
     rho = np.linspace(grid.inner_mas, grid.outer_mas, n_separations)
     if separation_mas is not None:
@@ -80,3 +77,11 @@ def make_rings(
     turned = evenly(len(rho))[:, None]
     angle = 360.0 * ((np.arange(n)[None] + turned) / n)
     return Rings(rho, *offset(rho[:, None], angle))
+
+
+def check_separations(separation_mas: Sequence[float] | None) -> None:
+    """Refuse an empty list of separations, and what is none."""
+    if separation_mas is not None and not len(separation_mas):
+        raise UsageError("limits: separation_mas is empty", remedy="give one, in mas")
+    for one in () if separation_mas is None else separation_mas:
+        in_range("limits", "separation_mas", one, 0.0)
