@@ -256,7 +256,7 @@ def parts_of_fit(
                 continue
             chi2, rank = chi2_of_part(covariance, at, difference)
             factors, weights = _sizes(noise, kind, file.source)
-            each = [chi2_survival(chi2 * f, share * rank, likelihood.degrees) for f in factors]
+            each = chi2_survival(chi2 * factors, share * rank, likelihood.degrees)
             found.append(FitOfPart(kind, file.source, chi2, share * rank, float(weights @ each)))
     return found
 
@@ -349,7 +349,7 @@ def _worst(parts: Sequence[FitOfPart], degrees: float) -> FitOfPart:
 
     def chance(part: FitOfPart) -> tuple[float, float]:
         """By χ² as it is; probabilities may be 0."""
-        return chi2_survival(part.chi2, part.dof, degrees), -part.chi2 / part.dof
+        return float(chi2_survival(part.chi2, part.dof, degrees)), -part.chi2 / part.dof
 
     return min(parts, key=chance)
 

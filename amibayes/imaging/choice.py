@@ -60,7 +60,7 @@ def as_good(scores: FloatArray, errors: FloatArray) -> BoolArray:
 
 def p_fit(term: DataTerm, chi2: float) -> float:
     """Probability that noise alone gives a χ² as large, all data being degrees of freedom."""
-    return chi2_survival(chi2, term.noise.n_independent, term.noise.degrees)
+    return float(chi2_survival(chi2, term.noise.n_independent, term.noise.degrees))
 
 
 def largest_that_fits(

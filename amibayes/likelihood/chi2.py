@@ -40,15 +40,16 @@ def _log_far_tail(a: float, z: FloatArray) -> FloatArray:
     return np.asarray(a * np.log(z) - z - gammaln(a) - np.log(z + 1 - a + fraction))
 
 
-def chi2_survival(chi2: float, dof: float, degrees: float = np.inf) -> float:
-    """Probability of a χ² as large, of ``dof`` independent data.
+def chi2_survival(chi2: ArrayLike, dof: float, degrees: float = np.inf) -> FloatArray:
+    """Probabilities of a χ² as large (...), of ``dof`` independent data.
 
     With a covariance of ``degrees`` degrees of freedom the data follow a t distribution, and
     χ²/dof, in units of its scale matrix, follows F.
     """
     if not np.isfinite(degrees):
-        return float(stats.chi2.sf(chi2, dof))
-    return float(stats.f.sf(chi2 / dof * degrees / (degrees - 2.0), dof, degrees))
+        return np.asarray(stats.chi2.sf(chi2, dof))
+    by_f = np.asarray(chi2) / dof * degrees / (degrees - 2.0)
+    return np.asarray(stats.f.sf(by_f, dof, degrees))
 
 
 def candid_n_sigma(chi2_single: ArrayLike, chi2_binary: ArrayLike, dof: float) -> FloatArray:

@@ -246,7 +246,7 @@ def _chance(left: Observables, n_others: int) -> float:
     white = _noise(left).whiten(left.data - expected)
     chi2, n = float((white**2).sum()), left.n_independent
     if n_others == 1:
-        return chi2_survival(chi2, n, left.degrees_of_freedom)
+        return float(chi2_survival(chi2, n, left.degrees_of_freedom))
     known = min(left.degrees_of_freedom, n * (n_others - 1))
     return float(stats.f.sf(chi2 / n, n, known))
 

@@ -336,7 +336,7 @@ def test_laws_of_chi2_and_quadrature(num_regression) -> None:
     numbers = numbers_of(
         survival=[log_chi2_survival(x, dof) for dof in (1.0, 30.0, 200.0)],
         n_sigma=candid_n_sigma(x + 50.0, 50.0, 30.0),
-        degrees=[chi2_survival(40.0, 30.0), chi2_survival(40.0, 30.0, 12.0)],
+        degrees=[float(chi2_survival(40.0, 30.0, degrees)) for degrees in (np.inf, 12.0)],
         peak=[log_peak(30, np.inf), log_peak(30, 12.0)],
         part=chi2_of_part(data.covariance, np.arange(5, 20), difference),
         loss=restricted_loss(product, 20, 3.0),
