@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers import simulated
+from interferometer import four_telescopes
 
+from amibayes.companion_search.search import search
+from amibayes.detection.exposure_noise import exposure_noise, exposures_of
+from amibayes.detection.statistic import make_statistic, statistic_of
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.critical import CriticalContrasts
-from amibayes.limits.own_drift import _crossing, _smooth, _spread
+from amibayes.limits.own_drift import _crossing, _piece, _smooth, _spread
 
 
 def test_errors_of_mean_changes_are_those_of_many_draws() -> None:
@@ -78,3 +84,30 @@ def test_the_contrast_of_detection_is_found_from_anywhere(start: float, noise: f
 
 def test_what_is_never_detected_ends_at_equal_stars() -> None:
     assert _crossing(lambda x: float(np.exp(0.5 * x)), 5.0, -3.0) == 0.0
+
+
+def test_contrasts_of_detection_are_those_of_searches_of_real_data(rng) -> None:
+    """Each contrast searched as data of its own, with the noise that a search would take."""
+    sheet = four_telescopes(6, channels=1)
+    likelihood = Likelihood(sheet.with_data(simulated(sheet, [0.0, 0.0, 0.0], rng).data))
+    result = search(likelihood, (2.0, 8.0))
+    test, goal = statistic_of(result), 4.0
+    places = np.array([[3.0, 1.0], [-4.0, 4.0]])
+    found = _piece(
+        test, exposures_of(likelihood), goal**2, (places, 0.02, np.random.default_rng(7))
+    )
+    noise = test.likelihood.noise.draw(2, np.random.default_rng(7)).T
+    contrast = np.geomspace(0.003, 0.3, 40)
+    for place, own, after in zip(places, noise, found["own"], strict=True):
+        changes = test.change_by(np.column_stack([np.tile(place, (40, 1)), contrast]))
+        star = single_likelihood(likelihood).predict(np.atleast_2d(test.single))
+        roots = []
+        for data in (star + changes + own[:, None]).T:
+            one = Likelihood(sheet.with_data(data))
+            noisy = one.with_noise(exposure_noise(one, test.single).noise)
+            there = make_statistic(noisy, test.bank.grid, test.single)
+            contrast_there, _ = there.bank.scan_at(
+                there.bank.reduce(there.observed), *place[:, None]
+            )
+            roots.append(np.sqrt(there.value) if contrast_there[0] > 0.0 else 0.0)
+        assert np.exp(after) == pytest.approx(np.interp(goal, roots, contrast), rel=0.1)
