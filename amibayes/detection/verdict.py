@@ -18,7 +18,7 @@ from amibayes.detection.note import SEE, note_of
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
-from amibayes.likelihood.extra_noise import MAX_ROUNDS, ExtraNoise, NoisePrior
+from amibayes.likelihood.extra_noise import MAX_ROUNDS, UNLIKELY, ExtraNoise, NoisePrior
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.likelihood.residuals import files_of
@@ -113,13 +113,13 @@ def verdict(
     for split in apart:
         if split.split != "observables":
             return Verdict("inconsistent data", _apart(split), p_model)
-    if p_model < alpha:
-        return Verdict(
-            "model rejected", _rejected(parts, result.likelihood.degrees, fit, structure), p_model
-        )
+    misfits = 2.0 * fit < _level(alpha, noise)
+    small = 2.0 * structure.probability < alpha
+    if misfits or (small and structured):
+        worst = _worst(parts, result.likelihood.degrees) if misfits else None
+        return Verdict("model rejected", _rejected(parts, worst, fit, structure), p_model)
     for split in apart:
         return Verdict("inconsistent data", _apart(split), p_model)
-    small = 2.0 * structure.probability < alpha
     left = WITHIN if small and not structured else ""
     if tested.detected:
         return _companion(result, tested, left, p_model, compared=compared)
@@ -280,12 +280,21 @@ def _sizes(noise: ExtraNoise | None, kind: str, source: str) -> tuple[FloatArray
     return factors.ravel(), np.outer(weights, each).ravel()
 
 
+def _level(alpha: float, noise: ExtraNoise | None) -> float:
+    """Probability of χ² below which a model is rejected.
+
+    Noise is only fitted where χ² has a probability below `UNLIKELY`: a larger one, below a larger
+    α, has not been found to be more than noise explains.
+    """
+    return alpha if noise is None else min(alpha, UNLIKELY)
+
+
 def _misfit_alone(
     likelihood: Likelihood, theta: FloatArray, noise: ExtraNoise | None, alpha: float
 ) -> str:
     """Say how a star alone does not fit; empty where it does."""
     parts = parts_of_fit(likelihood, theta, likelihood.n_independent - len(theta), noise)
-    if joint_probability(parts) >= alpha:
+    if joint_probability(parts) >= _level(alpha, noise):
         return ""
     return f"a star alone does not fit: {_misfit(parts, _worst(parts, likelihood.degrees))}"
 
@@ -334,10 +343,11 @@ def _apart(split: Consistency) -> str:
 
 
 def _rejected(
-    parts: Sequence[FitOfPart], degrees: float, fit: float, structure: Significance
+    parts: Sequence[FitOfPart], worst: FitOfPart | None, fit: float, structure: Significance
 ) -> str:
-    if fit <= structure.probability:
-        return _misfit(parts, _worst(parts, degrees), "the best companion and ")
+    """Why; ``worst`` is the part that fits worst, None where the fit itself rejects nothing."""
+    if worst is not None and fit <= structure.probability:
+        return _misfit(parts, worst, "the best companion and ")
     return (
         "what the best fit leaves still holds structure: one more component would gain more than "
         f"in all but {_share(structure.probability)} of data without it"

@@ -322,3 +322,23 @@ def test_structure_within_the_calibration_errors_is_told(p: float, said: bool, r
     assert found.statement == "companion"
     assert (WITHIN in found.because) == said
     assert WITHIN not in verdict(result, tested, replace(left, probability=0.5), ()).because
+
+
+@pytest.mark.parametrize("extra_noise", [True, False])
+@pytest.mark.parametrize("p", [1.5e-3, 1e-6])
+def test_a_misfit_that_no_noise_was_fitted_to_rejects_no_star(p: float, extra_noise: bool) -> None:
+    """Noise is fitted where χ² has a probability below 0.001: α may be larger.
+
+    A few V² with errors that are too small gave probabilities between the two.
+    """
+    rng = np.random.default_rng(3)
+    data = observed(niriss(), star, rng)
+    misfit = data.data.copy()
+    noise = misfit[: data.n_vis2] - 1.0
+    noise *= 0.005 * np.sqrt(chi2.isf(p, data.n_vis2) / (noise**2).sum())
+    misfit[: data.n_vis2] = 1.0 + noise
+    options = replace(OPTIONS, extra_noise=extra_noise, diameter=0.0)
+    found = search_field(data.with_data(misfit), options)
+    tested = Significance(9.0, np.arange(20.0), 0.5, (0.4, 0.6), None, options.alpha)
+    said = verdict_of(found, tested, options, rng)[0]
+    assert said.statement == ("no companion" if extra_noise else "model rejected"), said
