@@ -32,10 +32,13 @@ from amibayes.detection.verdict import (
     without_companion,
 )
 from amibayes.errors import DataError
+from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.likelihood.residuals import files_of
 from amibayes.parallel import Executor, Journal, Progress, spawn
 from amibayes.pipeline.field import FieldSearch, search_field
 from amibayes.pipeline.options import SearchOptions, noise_prior
 from amibayes.support.options import NULL_DRAWS
+from amibayes.units import BoolArray
 
 MAX_RANDOMISED = 5000
 """Randomised data sets: enough for an upper bound of 7e-4 where none is above."""
@@ -199,45 +202,60 @@ def verdict_of(
         said = without_companion(said, other, result, compared=compared)
     if said.statement == "companion" and options.separation_mas is None and on_outer_edge(result):
         said = at_the_edge(said, result)
-    if said.statement == "no companion" and (seen := _seen_in_one_night(stated, options, rng)):
+    if said.statement == "no companion" and (seen := _seen_in_one_part(found, options, rng)):
         said = Verdict("inconsistent data", seen, said.p_model)
     return said, splits
 
 
-def _seen_in_one_night(
-    stated: Observables, options: SearchOptions, rng: np.random.Generator
-) -> str:
-    """Say which night by itself shows a companion; empty where none does, or there is but one.
+def _seen_in_one_part(found: FieldSearch, options: SearchOptions, rng: np.random.Generator) -> str:
+    """Say which night or file by itself shows a companion; empty where none does.
 
-    One that moves from night to night fits all of them together so badly that it passes for
-    noise. Each night is searched and tested as if there were no other, and the nights
-    share the probability of a false alarm.
+    One that moves from night to night, or that a file has and others have not (another star,
+    another orientation), fits all of them together so badly that it passes for noise. Each part
+    is searched and tested as if there were no other, and the parts share the probability of a
+    false alarm. Files are parts where noise was fitted to them: else a star alone explains them.
     """
-    data = stated.only(options.observables).unflagged()
-    masks = by_night(data)
-    if not 1 < len(masks) <= MAX_PARTS:
+    data = found.observables.only(options.observables).unflagged()
+    parts = _nights_and_files(data, found.noise)
+    if not 1 < len(parts) <= 2 * MAX_PARTS:
         return ""
-    own = replace(options, alpha=options.alpha / len(masks), motion=False, null_draws=None)
+    own = replace(options, alpha=options.alpha / len(parts), motion=False, null_draws=None)
     few = replace(own, null_draws=FIRST_DRAWS)
-    for night, mask in masks.items():
+    for name, mask in parts.items():
         try:
-            found = search_field(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), own)
+            part = search_field(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), own)
         except DataError:  # too few data to be searched
             continue
-        if false_alarm(found.result, few, rng).probability > NOT_SMALL:
+        if false_alarm(part.result, few, rng).probability > NOT_SMALL:
             continue
-        tested = beside_bright(false_alarm(found.result, own, rng), found.result, found.noise)
-        if tested.detected and verdict_of(found, tested, own, rng)[0].statement == "companion":
-            return _told(night, found, moves=options.motion)
+        tested = beside_bright(false_alarm(part.result, own, rng), part.result, part.noise)
+        if tested.detected and verdict_of(part, tested, own, rng)[0].statement == "companion":
+            return _told(name, part, moves=options.motion)
     return ""
 
 
-def _told(night: str, found: FieldSearch, *, moves: bool) -> str:
-    """Say where the companion of one night is."""
+def _nights_and_files(data: Observables, noise: ExtraNoise) -> dict[str, BoolArray]:
+    """Masks (n_data,) of parts of data by their names; a file that is a night is one part."""
+    parts = {f"{NIGHT} {name}": mask for name, mask in by_night(data).items()}
+    if noise.any:
+        known = {mask.tobytes() for mask in parts.values()}
+        files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
+        parts |= {name: mask for name, mask in files.items() if mask.tobytes() not in known}
+    return {name: mask for name, mask in parts.items() if not mask.all()}
+
+
+NIGHT = "the night of"
+"""Parts of data that are nights are named so, others by their file."""
+
+
+def _told(part: str, found: FieldSearch, *, moves: bool) -> str:
+    """Say where the companion of one part is."""
     c = found.result.companion
-    why = "--fastest, or another kind of motion" if moves else "a motion (--motion)"
+    why = "another star, orientation or calibration of a file"
+    if part.startswith(NIGHT):
+        why = "--fastest, or another kind of motion" if moves else "a motion (--motion)"
     return (
-        f"the night of {night} shows a companion by itself ({c.delta_mag:.1f} mag at "
-        f"{c.separation_mas:.3g} mas, PA {c.position_angle_deg:.0f} deg), all nights together none "
+        f"{part} shows a companion by itself ({c.delta_mag:.1f} mag at "
+        f"{c.separation_mas:.3g} mas, PA {c.position_angle_deg:.0f} deg), all data together none "
         f"that is as likely; {why} may explain it"
     )

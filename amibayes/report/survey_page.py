@@ -151,7 +151,8 @@ def _statement(content: Json) -> Statement:
     alarms = content.get("false_alarms")
     if not alarms:
         done = f"{content['n_done']} of {content['n_targets']} targets are done"
-        return Statement("open", "NO SEARCH", done, _failed(content))
+        searched = any(entry.get("verdict") for entry in content["targets"])
+        return Statement("open", "UNDECIDED" if searched else "NO SEARCH", done, _failed(content))
     n, level = len(alarms["discovered"]), alarms["false_discovery_level"]
     kind: Kind = "found" if n else "none"
     label = "COMPANIONS" if n else "NO COMPANION"

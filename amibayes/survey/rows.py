@@ -58,6 +58,9 @@ UNITS = (
     | {name: unit for name, unit in FACTS.items() if unit}
 )
 
+UNDECIDED = ("model rejected", "inconsistent data")
+"""Verdicts that neither state a companion nor that there is none."""
+
 CURVE = (
     "method",
     "observables",
@@ -126,6 +129,8 @@ def row_of(content: Json) -> Json:
     row |= _limit_numbers(content)
     if "companion_detected" in content:
         row["detected"] = content["companion_detected"]
+    if row.get("verdict") in UNDECIDED:
+        row["detected"] = None
     row["modes"] = [
         {k: mode[k] for k in ("separation_mas", "position_angle_deg")}
         for mode in content.get("modes") or []

@@ -11,7 +11,7 @@ from amibayes.limits.mass_table import MassTable, read_mass_table
 from amibayes.survey.completeness import StackedCompleteness, stack
 from amibayes.survey.false_alarms import FDR_LEVEL, NULLS_ABOVE, FalseAlarms, false_alarms
 from amibayes.survey.frequency import Box, FrequencyPosterior, frequency_posterior
-from amibayes.survey.rows import Json, Outcome
+from amibayes.survey.rows import UNDECIDED, Json, Outcome
 from amibayes.units import FloatArray
 
 N_SEPARATIONS, N_DEPTHS = 24, 25
@@ -57,8 +57,16 @@ def statistics(outcomes: Sequence[Outcome], level: float = FDR_LEVEL) -> tuple[l
 
 
 def _false_alarms(entries: list[Json], level: float) -> Json | None:
-    """Add the columns that depend on the others to the entries; sum them up."""
-    tested = [e for e in entries if e.get("false_alarm_probability") is not None]
+    """Add the columns that depend on the others to the entries; sum them up.
+
+    What is not like noise may be a disc, or different from file to file: where the verdict says so
+    a small probability lists no companion.
+    """
+    tested = [
+        e
+        for e in entries
+        if e.get("false_alarm_probability") is not None and e.get("verdict") not in UNDECIDED
+    ]
     if not tested:
         return None
     found = false_alarms(np.array([e["false_alarm_probability"] for e in tested]), level)
@@ -148,7 +156,10 @@ def _stacked_json(found: StackedCompleteness, separation: str, depth: str) -> Js
 
 
 def _frequency(measured: Sequence[Outcome]) -> Json | None:
-    """Companion frequency in the box that the survey itself suggests."""
+    """Companion frequency in the box that the survey itself suggests.
+
+    Of targets whose verdict is a companion or none: others count neither way.
+    """
     tested = [o for o in measured if o.row.get("detected") is not None]
     box = suggested_box(tested)
     if box is None:

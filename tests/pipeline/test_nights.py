@@ -42,3 +42,28 @@ def test_a_companion_that_moves_is_not_denied() -> None:
 
 def test_nights_without_a_companion_have_none() -> None:
     assert stated(0.0).statement == "no companion"
+
+
+def of_two_files(contrasts: tuple[float, float]) -> Verdict:
+    """The verdict on two files of one night, whose companions have these contrasts."""
+    rng = np.random.default_rng(5)
+    files = [
+        noisy(
+            epoch(mjd=60000.0 + 0.02 * k, source=f"{k}.oifits", turn_deg=50.0 * k),
+            (150.0, 0.0, contrast),
+            rng,
+        )
+        for k, contrast in enumerate(contrasts)
+    ]
+    found = search_field(join(files), OPTIONS)
+    tested = false_alarm(found.result, OPTIONS, rng)
+    return verdict_of(found, tested, OPTIONS, rng)[0]
+
+
+def test_a_companion_that_one_file_of_a_night_shows_is_not_denied() -> None:
+    """Of another star, say: noise was fitted until neither file showed anything."""
+    said = of_two_files((0.05, 0.0))
+    assert said.statement == "inconsistent data"
+    assert said.because.startswith("0.oifits shows a companion by itself")
+    assert "PA 90 deg" in said.because
+    assert of_two_files((0.0, 0.0)).statement == "no companion"

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from amibayes.report.survey import survey_lines
 from amibayes.survey.completeness import Crossings, DetectionProbability
 from amibayes.survey.rows import Outcome, detection_of, row_of, table_of
 from amibayes.survey.together import suggested_box, survey_json
@@ -60,6 +61,28 @@ def test_a_row_has_what_the_result_has() -> None:
         "false_positive_rate",
     }
     assert row_of({"significance": None})["limits"] is None
+
+
+@pytest.mark.parametrize("statement", ["model rejected", "inconsistent data"])
+def test_a_target_without_an_answer_counts_neither_way(statement: str, tmp_path: Path) -> None:
+    """A disc or a triple is not like noise, and no companion of that place either."""
+    place = {"separation_mas": 100.0, "position_angle_deg": 10.0, "delta_mag": 4.0}
+    found = [
+        result(p, limits=limits(), verdict={"statement": said}, fit=place)
+        for p, said in [(1e-4, statement), (1e-4, "companion"), (0.4, "no companion")]
+    ]
+    rows = [row_of(content) for content in found]
+    assert [row["detected"] for row in rows] == [None, True, False]
+    outcomes = [
+        Outcome(name, "done", row=row, detection=detection_of(content))
+        for name, row, content in zip("abc", rows, found, strict=True)
+    ]
+    survey = survey_json("search", 1, outcomes, whole=True)
+    assert survey["false_alarms"]["discovered"] == ["b"]
+    assert (survey["false_alarms"]["n_tested"], survey["false_alarms"]["n_detected"]) == (2, 1)
+    assert survey["companion_frequency"]["n_targets"] == 2
+    assert survey["companion_frequency"]["n_detected"] == 1
+    assert f"a  {statement}, limits" in "\n".join(survey_lines(survey, tmp_path))
 
 
 def test_detection_goes_through_the_curves_where_counts_are_not_kept() -> None:
