@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +13,12 @@ from amibayes.calibration.transfer import Diameter
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError, UsageError
 from amibayes.scene.disc import uniform_disc
+from amibayes.units import FloatArray
 
 OPTION = "--calibrator-diameters"
+
+BYTE_ORDER_MARK = "\ufeff"
+"""With which spreadsheets begin a table in UTF-8; it is no part of the first column's name."""
 
 
 def diameters_of(
@@ -38,9 +43,8 @@ def diameters_of(
     if Path(given).is_file():
         return _from_table(str(given), calibrators)
     try:
-        pairs = [tuple(float(x) for x in word.split(":")) for word in str(given).split(",")]
-        found = [(p[0], p[1] if len(p) > 1 else 0.0) for p in pairs]
-    except ValueError:
+        found = [_pair(*(float(x) for x in word.split(":"))) for word in str(given).split(",")]
+    except (TypeError, ValueError):
         raise UsageError(
             f"{given!r} is neither a table nor a list of diameters",
             source=OPTION,
@@ -52,7 +56,11 @@ def diameters_of(
             source=OPTION,
             remedy="give one for each, in the order of --cal",
         )
-    return found
+    return [_usable(*pair, OPTION) for pair in found]
+
+
+def _pair(diameter: float, error: float = 0.0) -> Diameter:
+    return diameter, error
 
 
 def _from_table(path: str, calibrators: Sequence[Observables]) -> list[Diameter]:
@@ -60,9 +68,9 @@ def _from_table(path: str, calibrators: Sequence[Observables]) -> list[Diameter]
 
     try:
         table = Table.read(path)
-        columns = {column.casefold(): column for column in table.colnames}
+        columns = {column.lstrip(BYTE_ORDER_MARK).casefold(): column for column in table.colnames}
         names = [_plain_name(str(name)) for name in table[columns["name"]]]
-        sizes = {key: [float(x) for x in table[columns[key]]] for key in columns if _is_size(key)}
+        sizes = {key: _in_mas(table[columns[key]]) for key in columns if _is_size(key)}
         own = "diameter_mas" in sizes
         if not own and not any(key.startswith("udd") for key in sizes):
             raise KeyError("diameter_mas")
@@ -84,9 +92,32 @@ def _from_table(path: str, calibrators: Sequence[Observables]) -> list[Diameter]
                 remedy="name the file or its target",
             )
         size = "diameter_mas" if own else _band_of(calibrator, sizes)
-        sigma = sizes.get("error_mas" if own else "e_ldd")
-        out.append((sizes[size][rows[0]], sigma[rows[0]] if sigma else 0.0))
+        sigma = sizes.get("error_mas" if own else "e_ldd", np.zeros(len(names)))
+        found = {(float(sizes[size][i]), float(np.nan_to_num(sigma[i]))) for i in rows}
+        if len(found) > 1:
+            raise DataError(
+                f"has several diameters of {calibrator.source} ({calibrator.setups[0].target})",
+                source=path,
+                remedy="leave one line for each",
+            )
+        out.append(_usable(*found.pop(), path))
     return out
+
+
+def _in_mas(column: Any) -> FloatArray:
+    """Angles (n,) of a column, mas whatever its unit; NaN where there is none."""
+    values: FloatArray = np.asarray(np.ma.filled(np.ma.asarray(column, dtype=float), np.nan))
+    return values if column.unit is None else values * float(column.unit.to("mas"))
+
+
+def _usable(diameter: float, error: float, source: str) -> Diameter:
+    if not (np.isfinite(diameter) and np.isfinite(error) and min(diameter, error) >= 0.0):
+        raise DataError(
+            f"has a diameter of {diameter:g} mas with an error of {error:g} mas",
+            source=source,
+            remedy="give numbers of zero or more",
+        )
+    return diameter, error
 
 
 JSDC_BANDS_UM = {
@@ -106,7 +137,7 @@ def _plain_name(name: str) -> str:
     return name.strip().casefold().replace(" ", "").replace("_", "")
 
 
-def _band_of(calibrator: Observables, sizes: Mapping[str, Sequence[float]]) -> str:
+def _band_of(calibrator: Observables, sizes: Mapping[str, FloatArray]) -> str:
     """Column of the band nearest to a calibrator's wavelengths."""
     wavelength = 1e6 * float(np.median(np.concatenate([s.wavelength_m for s in calibrator.setups])))
     known = {key: um for key, um in JSDC_BANDS_UM.items() if key in sizes}

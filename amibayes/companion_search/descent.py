@@ -26,6 +26,10 @@ FIRST_DAMPING, MAX_DAMPING = 1e-2, 1e6
 """Marquardt's λ, in units of the squared length of a parameter's derivative: a seed of the map is
 nearly right, and a step damped a millionfold moves nothing that can be seen."""
 
+MIN_DAMPING = 1e-10
+"""Where the data know nothing of a direction (the rate of a motion, in data of one night) the
+damping alone keeps the step from being infinite, and it has to be above rounding."""
+
 LONGEST = 0.3
 """Longest step of a position, in units of λ/B_max: a peak is as wide."""
 
@@ -78,7 +82,7 @@ def _together(likelihood: Likelihood, seeds: FloatArray, box: Box) -> tuple[Floa
         better = gain > 0.0
         theta[k[better]] = tried[better]
         now.take(k[better], there.of(better))
-        damping[k] *= np.where(better, EASED, RAISED)
+        damping[k] = np.maximum(damping[k] * np.where(better, EASED, RAISED), MIN_DAMPING)
         moving[k] = np.where(better, gain > CONVERGED, damping[k] < MAX_DAMPING)
         if not moving.any():
             break

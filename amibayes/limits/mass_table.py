@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from astropy import units
 from astropy.io import ascii as tables
 from astropy.table import Table
 
@@ -17,6 +18,9 @@ DIFFERENCE = ("delta_mag", "dmag", "delta_magnitude")
 ABSOLUTE = ("absolute_mag", "abs_mag", "absolute_magnitude", "magnitude", "mag")
 
 UNITS = {"mass_mjup": "M_Jup", "m_mjup": "M_Jup", "mass_msun": "M_Sun", "m_msun": "M_Sun"}
+
+OWN_NAMES = {"M_Jup": "jupiterMass", "M_Sun": "solMass"}
+"""Units as they are written here, and as astropy knows them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,19 @@ class MassTable:
         inside = np.interp(wanted, self.delta_mag, log_mass, left=np.nan, right=np.nan)
         return np.asarray(np.exp(np.where(np.isnan(wanted), np.nan, inside)))
 
+    def converted_to(self, unit: str) -> MassTable:
+        """Masses in another unit.
+
+        Raises
+        ------
+        ValueError
+            Where one of the two is no unit of mass, and they differ.
+        """
+        if unit == self.unit:
+            return self
+        own, other = (units.Unit(OWN_NAMES.get(name, name)) for name in (self.unit, unit))
+        return replace(self, mass=self.mass * own.to(other), unit=unit)
+
     def delta_mag_at(self, mass: FloatArray) -> FloatArray:
         """Magnitude differences of masses; NaN outside the table."""
         known = np.log(self.mass[::-1])
@@ -70,9 +87,9 @@ def read_mass_table(path: str | Path, primary_magnitude: float | None = None) ->
     name, mass = _column(table, MASS, path)
     unit = UNITS.get(name.lower(), str(table[name].unit or "") or "table's unit")
     if any(c.lower() in DIFFERENCE for c in table.colnames):
-        delta_mag = _column(table, DIFFERENCE, path)[1]
+        delta_mag = _magnitudes(table, DIFFERENCE, path)
     else:
-        magnitude = _column(table, (*DIFFERENCE, *ABSOLUTE), path)[1]
+        magnitude = _magnitudes(table, (*DIFFERENCE, *ABSOLUTE), path)
         if primary_magnitude is None:
             raise DataError(
                 "holds absolute magnitudes, and the star's is not known",
@@ -97,7 +114,7 @@ def read_mass_table(path: str | Path, primary_magnitude: float | None = None) ->
 
 def _read(path: str | Path) -> Table:
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8-sig")  # spreadsheets mark UTF-8
     except (OSError, UnicodeDecodeError) as error:
         what = getattr(error, "strerror", None) or "is no text"
         raise DataError(f"cannot be read: {what}", source=path) from error
@@ -106,6 +123,19 @@ def _read(path: str | Path) -> Table:
         return tables.read([*text.splitlines(), ""], format=form, **options)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError("is neither an ECSV nor a CSV table", source=path) from error
+
+
+def _magnitudes(table: Table, names: tuple[str, ...], path: str | Path) -> FloatArray:
+    """A column of magnitudes, in mag whatever unit the table gives."""
+    name, values = _column(table, names, path)
+    if (unit := table[name].unit) is None:
+        return values
+    try:
+        return values * float(unit.to(units.mag))
+    except (AttributeError, ValueError) as error:
+        raise DataError(
+            f"column {name} is in {unit}, which is no unit of magnitudes", source=path
+        ) from error
 
 
 def _column(table: Table, names: tuple[str, ...], path: str | Path) -> tuple[str, FloatArray]:

@@ -110,7 +110,9 @@ def read_targets(path: str | Path) -> tuple[SurveyTarget, ...]:
         Where it is no such table, is empty, or two targets have one name.
     """
     table = _table(Path(path))
-    columns = {str(c).strip().lower().replace("-", "_"): str(c) for c in table.colnames}
+    # Spreadsheets begin a table in UTF-8 with a mark, which is no part of the first name.
+    names = {str(c): str(c).lstrip("\ufeff").strip() for c in table.colnames}
+    columns = {name.lower().replace("-", "_"): c for c, name in names.items()}
     if FILES not in columns:
         raise DataError(
             f"has no column '{FILES}'",

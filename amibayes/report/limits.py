@@ -83,6 +83,7 @@ def _curve(measured: MeasuredLimit, report: LimitsReport) -> Json:
     if report.options.masses is not None:
         out["mass"] = numbers(report.options.masses.mass_at(limit.delta_mag))
         out["mass_unit"] = report.options.masses.unit
+        out["mass_table_delta_mag"] = report.options.masses.delta_mag[[0, -1]].tolist()
     return out
 
 
@@ -207,10 +208,17 @@ def _curve_line(curve: Json) -> str:
     rho, mag = zip(*usable, strict=True)
     line = f"{name:<11} delta mag {min(mag):.2f} to {max(mag):.2f} at {rho[0]:.0f} to "
     line += f"{rho[-1]:.0f} mas"
-    masses = [m for m in curve.get("mass", []) if m is not None]
-    if masses:
-        line += f", mass {min(masses):.3g} to {max(masses):.3g} {curve['mass_unit']}"
-    return line
+    return line + _mass_words(curve, len(usable)) if "mass" in curve else line
+
+
+def _mass_words(curve: Json, n_limits: int) -> str:
+    """Masses of the limits, and how many of these lie outside the table of masses."""
+    masses = [m for m in curve["mass"] if m is not None]
+    words = f", mass {min(masses):.3g} to {max(masses):.3g} {curve['mass_unit']}" if masses else ""
+    if beyond := n_limits - len(masses):
+        low, high = curve["mass_table_delta_mag"]
+        words += f"; {beyond} of {n_limits} outside the table of masses ({low:.4g} to {high:.4g})"
+    return words
 
 
 def _marked_lines(content: Json) -> list[str]:

@@ -126,8 +126,7 @@ def _physical(measured: Sequence[Outcome]) -> Json | None:
     distance = [float(o.facts["distance_pc"]) for o in near]
     edges = [t.separation_mas[[0, -1]] * d / 1000.0 for t, d in zip(targets, distance, strict=True)]
     au = _separations(min(e[0] for e in edges), max(e[1] for e in edges))
-    if all(o.facts.get("mass_table") for o in near):
-        tables = [mass_table(o) for o in near]
+    if tables := _mass_tables(near):
         mass = np.geomspace(
             min(t.mass.min() for t in tables), max(t.mass.max() for t in tables), N_DEPTHS
         )
@@ -135,6 +134,17 @@ def _physical(measured: Sequence[Outcome]) -> Json | None:
         return _stacked_json(found, "separation_au", "mass") | {"mass_unit": tables[0].unit}
     found = stack(targets, au, _magnitudes(near), distance_pc=distance)
     return _stacked_json(found, "separation_au", "delta_mag")
+
+
+def _mass_tables(near: Sequence[Outcome]) -> list[MassTable]:
+    """Table of masses of each target, in the unit of the first; none where one has none."""
+    if not all(o.facts.get("mass_table") for o in near):
+        return []
+    tables = [mass_table(o) for o in near]
+    try:
+        return [table.converted_to(tables[0].unit) for table in tables]
+    except ValueError:  # a unit that is none of mass: what the tables share is the magnitude
+        return []
 
 
 def mass_table(outcome: Outcome) -> MassTable:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from oi_builders import MaskFile, random_observables
 
 from amibayes.calibration import (
@@ -140,3 +141,32 @@ def test_a_table_of_the_jsdc_gives_the_diameter_in_the_band_of_the_data(path: Pa
     table.write_text("Name,LDD\nHD 100,0.52\n")
     with pytest.raises(DataError, match="or those of the JSDC"):
         diameters_of(table, [star])
+
+
+def test_a_table_of_diameters_has_its_own_units_and_one_line_for_each(path: Path) -> None:
+    """Angles with a unit are converted; an error that is left out is not known, and none."""
+    data = read_oifits(path)
+    setup = replace(data.setups[0], target="HD_100")
+    star = replace(data, setups=(setup,))
+    table = path.with_name("sizes.ecsv")
+    rows = Table({"name": ["HD 100"], "diameter_mas": [0.0005], "error_mas": [0.00003]})
+    rows["diameter_mas"].unit = rows["error_mas"].unit = "arcsec"
+    rows.write(table)
+    np.testing.assert_allclose(diameters_of(table, [star]), [(0.5, 0.03)])
+    table = path.with_name("sizes.csv")
+    text = "name,diameter_mas,error_mas\nHD 100,0.5,0.03\nHD 100,0.5,0.03\nHD 99,0.4,\n"
+    table.write_text(text, encoding="utf-8-sig")  # as spreadsheets do
+    other = replace(data, setups=(replace(setup, target="HD 99"),))
+    assert diameters_of(table, [star, other]) == [(0.5, 0.03), (0.4, 0.0)]
+    table.write_text(text + "HD 100,0.9,0.03\n")
+    with pytest.raises(DataError, match="several diameters"):
+        diameters_of(table, [star])
+
+
+@pytest.mark.parametrize("given", ["nan", "-5", "0.3:-1", "inf", "0.3:nan"])
+def test_a_diameter_is_no_less_than_zero(given: str, path: Path) -> None:
+    star = read_oifits(path)
+    with pytest.raises(DataError, match="calibrator_diameters: has a diameter of"):
+        diameters_of(given, [star])
+    with pytest.raises(UsageError, match="neither a table nor a list"):
+        diameters_of("0.3:0.01:7", [star])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from epochs import epoch, noisy
 from helpers import niriss, simulated
 from scipy import optimize
 
@@ -77,3 +78,19 @@ def test_fringes_of_one_place_are_those_of_many(smearing: bool) -> None:
     cosine, sine = np.empty((2, len(samples), 1))
     fringes_into(cosine, sine, samples, np.array([130.0]), np.array([-420.0]), smearing)
     np.testing.assert_allclose(out, np.concatenate([cosine, sine])[:, 0], atol=1e-14)
+
+
+def test_data_of_one_night_that_know_no_rate_have_a_fit() -> None:
+    """Any rate fits them with a place to match, and steps along it are damped, not infinite."""
+    model = BinaryModel(1, fastest_mas_yr=100.0, reference_mjd=60000.0)
+    at_rest = Likelihood(epoch(mjd=59000.0))
+    rng = np.random.default_rng(2)
+    night = noisy(at_rest.observables, (150.0, -80.0, 0.02), rng)
+    box = Box(50.0, 400.0, resolution_mas(at_rest))
+    seeds = np.tile([150.0, -80.0, 0.02, 0.0, 0.0], (24, 1))
+    seeds += rng.uniform(-1, 1, seeds.shape) * [20.0, 20.0, 0.005, 60.0, 60.0]
+    moving, resting = Likelihood(night, model), Likelihood(night)
+    _, chi2 = descend(moving, seeds, box)
+    least = descend(resting, np.array([[150.0, -80.0, 0.02]]), box)[1]
+    assert chi2.min() == pytest.approx(least[0], abs=0.01)
+    assert (chi2 <= moving.chi2(seeds)).all()

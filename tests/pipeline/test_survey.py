@@ -141,7 +141,8 @@ def test_cells_hold_several_files_and_options_of_any_type(tmp_path: Path) -> Non
     path.write_text(
         "target,cal,diameter,keep_all,null_draws\n"
         "a?.fits,,0.8,True,\n"
-        "b c.fits;a1.fits,a1.fits a2.fits,free,False,500\n"
+        "b c.fits;a1.fits,a1.fits a2.fits,free,False,500\n",
+        encoding="utf-8-sig",  # as spreadsheets do
     )
     first, second = read_targets(path)
     assert first.files(first.target) == [str(tmp_path / "a1.fits"), str(tmp_path / "a2.fits")]

@@ -97,3 +97,24 @@ def test_masses_have_the_unit_of_their_tables(n: int, tmp_path: Path) -> None:
     found = statistics(outcomes)[1]["completeness_au"]
     assert found["mass_unit"] == "M_Jup"
     assert (found["mass"][0], found["mass"][-1]) == pytest.approx((11.0 - n, 99.0 + n))
+
+
+@pytest.mark.parametrize(("second", "unit"), [("mass_msun", "M_Jup"), ("mass", None)])
+def test_tables_of_several_units_are_brought_to_one(
+    second: str, unit: str | None, tmp_path: Path
+) -> None:
+    """Where one has no known unit, targets share magnitudes and no masses."""
+    rng, outcomes, scale = np.random.default_rng(4), [], {"mass_msun": 1047.57}
+    for k, name in enumerate(("mass_mjup", second)):
+        rows = [f"{m / scale.get(name, 1.0)},{mag}" for m, mag in ((100, 8), (30, 10), (10, 14))]
+        table = tmp_path / f"{k}.csv"
+        table.write_text("\n".join([f"{name},absolute_mag", *rows]))
+        facts = {"mass_table": str(table), "primary_magnitude": 4.0, "distance_pc": 10.0}
+        row = {"limit_delta_mag_best": 6.0}
+        outcomes.append(Outcome(name, "done", row=row, detection=target(rng), facts=facts))
+    found = statistics(outcomes)[1]["completeness_au"]
+    assert found.get("mass_unit") == unit
+    if unit is None:
+        assert "mass" not in found
+    else:
+        assert (found["mass"][0], found["mass"][-1]) == pytest.approx((10.0, 100.0), rel=1e-5)
