@@ -302,7 +302,8 @@ def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
         notes.append(
             f"the pixels are too large for the fringes of {coarse} of {len(view.frequency_px)} "
             "baselines: what is measured of light off the axis depends on the star's place in a "
-            "pixel, by some percent of a faint companion's light and more of a bright one's"
+            "pixel, by some percent of a companion's light, and its separation may be off by 4 %, "
+            "several times the stated error (take another filter for places)"
         )
     lost = int((~frames.used).sum())
     if lost:
