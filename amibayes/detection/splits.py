@@ -47,3 +47,8 @@ def gain_of(fisher: FloatArray, slope: FloatArray, scale: FloatArray) -> FloatAr
     inverse = np.linalg.pinv(fisher / np.outer(scale, scale), rcond=SINGULAR, hermitian=True)
     unit = slope / scale[:, None]
     return np.asarray((unit * (inverse @ unit)).sum(axis=0))
+
+
+def motion_words(*, moves: bool) -> str:
+    """What may explain nights that disagree, with a motion in the model or without one."""
+    return "--fastest, or another kind of motion" if moves else "a motion (--motion)"
