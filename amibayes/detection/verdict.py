@@ -15,7 +15,7 @@ from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import SEE, note_of
-from amibayes.detection.splits import Consistency, motion_words
+from amibayes.detection.splits import Consistency, most_telling, motion_words
 from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
 from amibayes.likelihood.extra_noise import MAX_ROUNDS, UNLIKELY, ExtraNoise, NoisePrior
@@ -111,10 +111,8 @@ def verdict(
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
     moves = result.likelihood.model.moves
-    if others := [s for s in apart if s.split != "observables"]:
-        # Where each file is a night both splits are the same, and nights tell more.
-        same = [s for s in others if s.split == "epochs" and len(s.parts) == len(others[0].parts)]
-        return Verdict("inconsistent data", _apart((same or others)[0], moves=moves), p_model)
+    if split := most_telling(apart):
+        return Verdict("inconsistent data", _apart(split, moves=moves), p_model)
     misfits = 2.0 * fit < _level(alpha, noise)
     small = 2.0 * structure.probability < alpha
     if misfits or (small and structured):
