@@ -11,6 +11,7 @@ import numpy as np
 
 from amibayes.calibration.transfer import Diameter
 from amibayes.data.observables import Observables
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import DataError, UsageError
 from amibayes.scene.disc import uniform_disc
 from amibayes.units import FloatArray
@@ -144,25 +145,45 @@ def _band_of(calibrator: Observables, sizes: Mapping[str, FloatArray]) -> str:
     return min(known, key=lambda key: abs(np.log(known[key] / wavelength)))
 
 
-def without_disc(calibrator: Observables, diameter_mas: float) -> Observables:
+def without_disc(
+    calibrator: Observables, diameter_mas: float, error_mas: float = 0.0
+) -> Observables:
     """The squared visibilities of a calibrator over those of its disc: a point remains.
 
     Parameters
     ----------
     diameter_mas : float
-        Uniform disc; its error is not in the covariance.
+        Uniform disc.
+    error_mas : float
+        Of the diameter, which makes all V² err together.
     """
     if diameter_mas == 0.0:
         return calibrator
     m = calibrator.vis2
-    amplitude, _ = uniform_disc(np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m, diameter_mas)
+    frequency = np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m
+    amplitude, slope = uniform_disc(frequency, diameter_mas)
     factor = 1.0 / amplitude**2
     every = np.concatenate([factor[~m.flag], np.ones(calibrator.n_closure_phases)])
     scatter = calibrator.scatter
-    return replace(
+    point = replace(
         calibrator,
         vis2=replace(m, value=np.where(m.flag, m.value, m.value * factor)),
         covariance=calibrator.covariance.scaled(every),
         scatter=None if scatter is None else (scatter * every[:, None] * every[None]).tocsr(),
         shared=None if calibrator.shared is None else calibrator.shared.scaled(every),
     )
+    return _with_error(point, -2.0 * error_mas * (slope / amplitude)[~m.flag])
+
+
+def _with_error(point: Observables, relative: FloatArray) -> Observables:
+    """Data whose V² err together by these parts (n_vis2,) of them."""
+    if not relative.any():
+        return point
+    changes = np.zeros((len(point.data), 1))
+    changes[: point.n_vis2, 0] = relative * point.data[: point.n_vis2]
+    own, before = SharedErrors((f"diameter of {point.source}",), changes), point.shared
+    every = own
+    if before is not None:
+        names = (*before.names, *own.names)
+        every = SharedErrors(names, np.hstack([before.changes, changes]))
+    return replace(point.with_shared_errors(own), shared=every)

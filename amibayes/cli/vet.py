@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
     data = [reduce_data(each, **data_options.reduction_of(arguments)) for each in data]
     diameters = diameters_of(arguments.calibrator_diameters, data)
     if diameters is not None:
-        data = [without_disc(d, size) for d, (size, _) in zip(data, diameters, strict=True)]
+        data = [without_disc(d, *size) for d, size in zip(data, diameters, strict=True)]
     vetting = vet(
         data,
         calibrated=arguments.calibrated,

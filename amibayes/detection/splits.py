@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,3 +48,18 @@ def gain_of(fisher: FloatArray, slope: FloatArray, scale: FloatArray) -> FloatAr
     inverse = np.linalg.pinv(fisher / np.outer(scale, scale), rcond=SINGULAR, hermitian=True)
     unit = slope / scale[:, None]
     return np.asarray((unit * (inverse @ unit)).sum(axis=0))
+
+
+def motion_words(*, moves: bool) -> str:
+    """What may explain nights that disagree, with a motion in the model or without one."""
+    return "--fastest, or another kind of motion" if moves else "a motion (--motion)"
+
+
+def most_telling(apart: Sequence[Consistency]) -> Consistency | None:
+    """Of splits that go apart, the one that is stated; none of V² against closure phases.
+
+    Where each file is a night both splits are the same, and nights tell more.
+    """
+    others = [s for s in apart if s.split != "observables"]
+    nights = [s for s in others if s.split == "epochs" and len(s.parts) == len(others[0].parts)]
+    return next(iter(nights or others), None)

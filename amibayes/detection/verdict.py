@@ -15,7 +15,7 @@ from amibayes.data.systematics import calibration_errors
 from amibayes.detection.alternatives import Alternative
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.note import SEE, note_of
-from amibayes.detection.splits import Consistency
+from amibayes.detection.splits import Consistency, most_telling, motion_words
 from amibayes.likelihood.channel_noise import share_of
 from amibayes.likelihood.chi2 import chi2_of_part, chi2_survival
 from amibayes.likelihood.extra_noise import MAX_ROUNDS, UNLIKELY, ExtraNoise, NoisePrior
@@ -110,16 +110,16 @@ def verdict(
     fit = joint_probability(parts)
     p_model = min(1.0, 2.0 * min(fit, structure.probability if structured else 1.0))
     apart = [s for s in splits if s.p * len(splits) < alpha]
-    for split in apart:
-        if split.split != "observables":
-            return Verdict("inconsistent data", _apart(split), p_model)
+    moves = result.likelihood.model.moves
+    if split := most_telling(apart):
+        return Verdict("inconsistent data", _apart(split, moves=moves), p_model)
     misfits = 2.0 * fit < _level(alpha, noise)
     small = 2.0 * structure.probability < alpha
     if misfits or (small and structured):
         worst = _worst(parts, result.likelihood.degrees) if misfits else None
         return Verdict("model rejected", _rejected(parts, worst, fit, structure), p_model)
     for split in apart:
-        return Verdict("inconsistent data", _apart(split), p_model)
+        return Verdict("inconsistent data", _apart(split, moves=moves), p_model)
     left = WITHIN if small and not structured else ""
     if tested.detected:
         return _companion(result, tested, left, p_model, compared=compared)
@@ -325,7 +325,7 @@ def change_by_companion(result: SearchResult) -> FloatArray:
     return likelihood.wrapped(likelihood.predict(np.atleast_2d(result.theta))[:, 0] - star)
 
 
-def _apart(split: Consistency) -> str:
+def _apart(split: Consistency, *, moves: bool) -> str:
     if split.split == "calibrators":
         one, other = split.parts
         return (
@@ -335,7 +335,7 @@ def _apart(split: Consistency) -> str:
         )
     parts = " and ".join(NAMES.get(part, part) for part in split.parts[:3])
     more = f" and {len(split.parts) - 3} more" if len(split.parts) > 3 else ""
-    motion = "; a motion (--motion) may explain it" if split.split == "epochs" else ""
+    motion = f"; {motion_words(moves=moves)} may explain it" if split.split == "epochs" else ""
     return (
         f"{parts}{more} disagree on the companion by Δχ² {split.delta_chi2:.3g}, which "
         f"{_share(split.p)} of consistent data exceed{motion}"

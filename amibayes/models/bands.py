@@ -16,6 +16,9 @@ from amibayes.units import IntArray
 GAP = 0.02
 """Setups are of one band where their channels overlap or stand nearer than this part of λ."""
 
+LATEST_MJD = 1e6
+"""Of the year 4596: Julian dates, which files hold by mistake, are later."""
+
 
 @dataclass(frozen=True)
 class Band:
@@ -112,7 +115,7 @@ def dates(observables: Observables) -> tuple[float, float, float]:
     Raises
     ------
     DataError
-        Where a date is missing.
+        Where a date is missing, or is no MJD.
     """
     data = observables.unflagged()
     parts: tuple[Measurements, ...] = (data.vis2, data.closure_phase)
@@ -128,6 +131,12 @@ def dates(observables: Observables) -> tuple[float, float, float]:
     weight = 1.0 / data.covariance.variance
     for kind in (slice(0, data.n_vis2), slice(data.n_vis2, None)):
         weight[kind] /= weight[kind].mean() if weight[kind].size else 1.0
+    if mjd.max() >= LATEST_MJD:
+        raise DataError(
+            f"has dates that are no MJD, such as {mjd.max():.1f}, and a motion needs dates",
+            source=data.source,
+            remedy="take 2400000.5 from Julian dates in the MJD column",
+        )
     # Summed about the first date, so that the order of the data does not show.
     mean = mjd.min() + float(np.sum(np.sort(weight * (mjd - mjd.min()))) / np.sum(np.sort(weight)))
     return float(mjd.min()), float(mjd.max()), mean

@@ -21,7 +21,7 @@ from amibayes.detection.false_alarm import (
 )
 from amibayes.detection.randomised import Randomised, randomised
 from amibayes.detection.residuals import correlated
-from amibayes.detection.splits import Consistency
+from amibayes.detection.splits import Consistency, motion_words
 from amibayes.detection.statistic import BankStatistic, statistic_of
 from amibayes.detection.verdict import (
     Verdict,
@@ -253,7 +253,7 @@ def _told(part: str, found: FieldSearch, *, moves: bool) -> str:
     c = found.result.companion
     why = "another star, orientation or calibration of a file"
     if part.startswith(NIGHT):
-        why = "--fastest, or another kind of motion" if moves else "a motion (--motion)"
+        why = motion_words(moves=moves)
     return (
         f"{part} shows a companion by itself ({c.delta_mag:.1f} mag at "
         f"{c.separation_mas:.3g} mas, PA {c.position_angle_deg:.0f} deg), all data together none "

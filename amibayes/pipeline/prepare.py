@@ -165,7 +165,7 @@ def _calibrated(
     sizes = diameters or [(0.0, 0.0)] * len(references)
     if len(references) >= MIN_TO_VET and not options.keep_all:
         with run.stage("vet"):
-            vetting = _vetted(references, [size for size, _ in sizes], options)
+            vetting = _vetted(references, sizes, options)
             serving = _kept(references, vetting)
     kept = {id(reference) for reference in serving}
     sizes = [d for r, d in zip(references, sizes, strict=True) if id(r) in kept]
@@ -188,10 +188,10 @@ def _calibrated(
 
 
 def _vetted(
-    references: list[Observables], sizes_mas: list[float], options: SearchOptions
+    references: list[Observables], sizes_mas: list[Diameter], options: SearchOptions
 ) -> Vetting:
     """Vet the calibrators, once for all targets of a survey that have the same ones."""
-    points = [without_disc(r, size) for r, size in zip(references, sizes_mas, strict=True)]
+    points = [without_disc(r, *size) for r, size in zip(references, sizes_mas, strict=True)]
     vetted = partial(
         vet,
         points,

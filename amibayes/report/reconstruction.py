@@ -64,11 +64,7 @@ def _number(value: float) -> float | None:
 def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
     """Sum the result up in at most 20 lines."""
     data = content["data"]
-    around = (
-        f"{content['flux']:.3g} of the star's flux{_disc(content)}"
-        if content["star"]
-        else "no star apart"
-    )
+    around = f"{_light(content)}{_disc(content)}" if content["star"] else "no star apart"
     tried = content["cross_validation"]
     chosen = "given" if not tried else "by cross-validation"
     lines = [
@@ -87,6 +83,21 @@ def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"left out    chi2 {best:.2f} per datum that the image was not made of")
     lines += [f"WARNING     {w}" for w in content["warnings"][: 18 - len(lines)]]
     return [*lines, f"written to  {folder}"]
+
+
+TOLD_APART = 0.01
+"""Share of an image's light beside the star from which on it is told apart from the rest."""
+
+
+def _light(content: dict[str, Any]) -> str:
+    """Flux of the image; what may be the star's own by itself."""
+    flux, beside = content["flux"], content["flux_beside_star"]
+    if beside <= TOLD_APART * flux:
+        return f"{flux:.3g} of the star's flux"
+    return (
+        f"{flux - beside:.3g} of the star's flux, and {beside:.2g} within λ/4B of the star, which "
+        "may be its own"
+    )
 
 
 def _disc(content: dict[str, Any]) -> str:

@@ -52,7 +52,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"detection   delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
         f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
     ]
-    lines += [*joint_lines(report), *_nuisance_lines(report)]
+    lines += [*joint_lines(report), *_shape_lines(report), *_nuisance_lines(report)]
     lines += _noise_lines(report)
     if report.posterior is not None:
         lines += _posterior_lines(report.posterior)
@@ -214,6 +214,26 @@ def _power(probability: float) -> str:
 def three_digits(value: float) -> str:
     """A reduced χ²: three digits that count, more only where it is large."""
     return f"{value:.0f}" if value >= 100.0 else f"{value:#.3g}"
+
+
+def _shape_lines(report: SearchReport) -> list[str]:
+    """Disc and colour of the companion that is stated, where these are free."""
+    result, lines, found = report.result, [], report.verdict
+    if found is not None and found.statement in ("no companion", "model rejected"):
+        return []
+    parameters = result.likelihood.parameters
+    for k in parameters.columns("shape"):
+        value, error = float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k]))
+        if parameters[k].unit != "mas":
+            at = 1e6 * result.likelihood.model.reference_wavelength_m
+            shown = f"{with_error(value, error)} (exponent; contrast of {at:.3f} um)"
+            lines.append(row("slope", shown))
+        elif value < UNRESOLVED * error:
+            bound = value + UNRESOLVED * error
+            lines.append(row("disc", f"companion not resolved: below {bound:.2g} mas (2 sigma)"))
+        else:
+            lines.append(row("disc", f"of the companion {with_error(value, error, ' mas')}"))
+    return lines
 
 
 def _nuisance_lines(report: SearchReport) -> list[str]:

@@ -64,6 +64,14 @@ def test_a_calibrator_freed_of_its_disc_is_a_point(rng: np.random.Generator) -> 
     np.testing.assert_allclose(found.data, point.data)
     np.testing.assert_allclose(found.errors[0], point.errors[0] / squared)
     assert without_disc(resolved, 0.0) is resolved
+    # The error of the diameter: half of the difference that both ends of it make.
+    unsure = without_disc(without_disc(resolved, 20.0, 1.0), 34.0, 0.02)
+    ends = [without_disc(without_disc(resolved, 20.0), d).data for d in (34.02, 33.98)]
+    assert unsure.shared is not None
+    np.testing.assert_allclose(unsure.shared.changes[:, 1], (ends[0] - ends[1]) / 2, rtol=1e-4)
+    own = unsure.without_shared_errors().covariance.dense()
+    every = unsure.shared.changes @ unsure.shared.changes.T
+    np.testing.assert_allclose(unsure.covariance.dense(), own + every, atol=1e-12)
 
 
 def test_reduction_is_its_steps_in_their_order(path: Path) -> None:

@@ -476,6 +476,9 @@ def test_motion_needs_two_dates_and_all_of_them() -> None:
     one = replace(once, vis2=replace(once.vis2, mjd=mjd))
     with pytest.raises(DataError, match="has data without a date"):
         dates(one)
+    julian = epoch(mjd=2400000.5 + MJD[1], source="julian.oifits")
+    with pytest.raises(DataError, match=r"no MJD, such as 2460200.5.*take 2400000.5 from"):
+        dates(join([once, julian]))
     first, last, mean = dates(three_epochs(None))
     assert (first, last) == (MJD[0], MJD[2])
     assert mean == pytest.approx(np.mean(MJD))

@@ -16,6 +16,7 @@ from epochs import F430M, F480M, MJD, epoch, noisy
 from amibayes.calibration import calibrate
 from amibayes.data.joining import in_order, refuse_twice, unused
 from amibayes.data.observables import join
+from amibayes.detection.verdict import Verdict
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.pipeline.options import SearchOptions
@@ -129,6 +130,15 @@ def test_one_calibrator_of_each_filter_tells_no_scatter(files, tmp_path) -> None
         calibrate(targets, cals, method="hierarchical")
 
 
+def test_a_free_slope_and_disc_of_the_companion_are_told(files, tmp_path) -> None:
+    """Contrasts of 1 and 2 % at 4.29 and 4.82 µm: a slope of ln 2 / ln (4.82 / 4.29) = 5.9."""
+    options = {"contrast": "tied", "contrast_slope": "free", "companion_diameter": "free"}
+    lines = summary(found(files[:2], null_draws=0, **options), tmp_path)
+    (slope,) = [line.split() for line in lines if line.startswith("slope")]
+    assert abs(float(slope[1]) - 5.9) < 4.0 * float(slope[3])
+    assert any(line.startswith("disc ") and " companion" in line for line in lines)
+
+
 def test_tied_contrast_and_summary(files, tmp_path) -> None:
     tied = found(files[:2], contrast="tied", file_noise=False)
     assert any(
@@ -136,6 +146,8 @@ def test_tied_contrast_and_summary(files, tmp_path) -> None:
     )
     moving = found(files[1:], motion=True, null_draws=0)
     assert any(line.startswith("motion      E ") for line in summary(moving, tmp_path))
+    rejected = replace(moving, verdict=Verdict("model rejected", "", 0.0))
+    assert not any(line.startswith("motion") for line in summary(rejected, tmp_path))
     result = result_json(tied)
     assert result["fit"]["contrast_kind"] == "tied"
     assert {c["contrast"] for c in result["fit"]["contrasts"]} == {result["fit"]["contrast"]}

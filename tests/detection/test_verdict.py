@@ -9,6 +9,7 @@ from dataclasses import replace
 import interferometer
 import numpy as np
 import pytest
+from epochs import epoch
 from helpers import niriss, simulated
 from interferometer import four_telescopes
 from scipy.special import j0, j1
@@ -218,6 +219,23 @@ def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:
     found, splits = told(join(parts), rng)
     assert found.statement == "inconsistent data", found
     assert {"files"} <= {s.split for s in splits}
+
+
+@pytest.mark.parametrize(("fastest", "words"), [(0.0, "; a motion (--m"), (50.0, "; --fastest")])
+def test_files_of_other_nights_that_disagree_may_be_a_motion(fastest: float, words: str) -> None:
+    """Where each file is a night, and one linear motion explains nothing where it is free."""
+    nights = [epoch(mjd=60000.0), epoch(mjd=60100.0, source="b.oifits")]
+    model = BinaryModel(fastest_mas_yr=fastest, reference_mjd=60050.0)
+    result = search(Likelihood(join(nights), model), (100.0, 200.0))
+    tested = Significance(9.0, np.arange(20.0), 1e-4, (0.0, 1e-3), None, 0.01)
+    nothing = Significance(1.0, np.arange(20.0), 0.9, (0.8, 1.0), None, 0.01)
+    splits = [
+        Consistency("files", ("a.oifits", "b.oifits"), 50.0, 1e-5),
+        Consistency("epochs", ("MJD 60000.000", "MJD 60100.000"), 50.0, 1e-5),
+    ]
+    found = verdict(result, tested, nothing, splits)
+    assert found.because.startswith("MJD 60000.000 and MJD 60100.000 disagree")
+    assert words in found.because
 
 
 @pytest.mark.parametrize(

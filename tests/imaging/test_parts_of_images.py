@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,6 +26,8 @@ from amibayes.imaging.result import ReconstructedImage
 from amibayes.imaging.warnings import warnings_of
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.uv_points import uv_points_of
+from amibayes.pipeline.imaging import ImagingOptions, ImagingReport
+from amibayes.report.reconstruction import imaging_json, imaging_summary
 from amibayes.scene.disc import disc_visibility
 from amibayes.units import MAS
 
@@ -297,3 +300,20 @@ def test_what_images_are_refused() -> None:
     assert _diameter(Likelihood(four_telescopes(1)), None, False) == 0.0
     assert _diameter(likelihood, 3.0, True) == 3.0
     assert _diameter(likelihood, "free", True) == "free"
+
+
+@pytest.mark.parametrize(
+    ("beside", "told"),
+    [
+        (0.0005, "light       0.157 of the star's flux"),
+        (0.0505, "light       0.106 of the star's flux, and 0.051 within λ/4B of the star, which"),
+    ],
+)
+def test_what_may_be_the_star_is_no_light_around_it(
+    image: ReconstructedImage, beside: float, told: str
+) -> None:
+    """The least share of the star that an image took made its light half as much again."""
+    report = ImagingReport(image, ImagingOptions(), (), (), (), {})
+    content = imaging_json(report, "") | {"flux": 0.1568, "flux_beside_star": beside}
+    (line,) = [x for x in imaging_summary(content, Path("out")) if x.startswith("light")]
+    assert line.startswith(told)

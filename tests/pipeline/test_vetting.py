@@ -13,6 +13,7 @@ from helpers import niriss, simulated
 from interferometer import darkened_disc, four_telescopes, observed
 from scipy import stats
 
+from amibayes.calibration import without_disc
 from amibayes.cli import main
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
@@ -52,6 +53,18 @@ def test_companion_of_one_among_four_is_found_and_only_that_one_is_dropped(rng) 
     assert bad.agreement < 1e-6
     assert bad.companion is not None
     assert bad.companion.companion.separation_mas == pytest.approx(134.0, abs=15.0)
+
+
+def test_a_diameter_that_is_off_by_its_error_is_no_reason_to_drop(rng) -> None:
+    """Of 60 mas, and told to be 45 ± 15: what is left of its disc is what that error allows."""
+    data = [calibrator(rng, name=f"good{k}") for k in range(3)]
+    data.append(calibrator(rng, name="big", model=BinaryModel(diameter_mas=60.0)))
+    kept = {}
+    for error in (0.0, 15.0):
+        points = [*data[:3], without_disc(data[3], 45.0, error)]
+        vetting = vet(points, separation_mas=FIELD, limits=False, null_draws=1000)
+        kept[error] = [v.kept for v in vetting.calibrators]
+    assert kept == {0.0: [True, True, True, False], 15.0: [True] * 4}
 
 
 @pytest.mark.slow

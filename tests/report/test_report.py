@@ -292,6 +292,13 @@ def test_noise_and_outliers_are_told(content) -> None:
     noisy["robust"] = {"degrees_of_freedom": 4.0, "outliers": [outlier] * 25}
     said = Reader(page_html(search_page(noisy))).said
     assert "noise of 0.012 in V² and 0° in closure phase was added" in said
+    noisy["noise"]["files"] = [
+        {"path": f"x/{name}.fits", "extra_vis2": v, "extra_closure_phase_deg": 0.0}
+        for name, v in (("a", 0.02), ("b", 0.0))
+    ]
+    each = Reader(page_html(search_page(noisy))).said
+    assert "noise of 0.02 in V² and 0° in closure phase to a.fits was added" in each
+    assert "0.012 in V²" not in each
     assert "0.005 to 0.02" in said
     assert "25 data lost most of it" in said
     assert said.count("A1-B2-C3") == 20
@@ -300,6 +307,24 @@ def test_noise_and_outliers_are_told(content) -> None:
     assert "−7.2" in said
     quiet = copy.deepcopy(content) | {"robust": None}
     assert "no noise was added" in Reader(page_html(search_page(quiet))).said
+
+
+def test_every_free_parameter_is_shown_by_a_name(content) -> None:
+    """Disc and colour of a companion beside the fit, rates in the table of the posterior."""
+    rich = copy.deepcopy(content)
+    rich["fit"] |= {
+        "companion_diameter_mas": 12.5, "contrast_slope": -2.5, "reference_wavelength_um": 4.5,
+    }  # fmt: skip
+    rich["fit"]["errors"] |= {"companion_diameter_mas": 1.5, "contrast_slope": 0.5}
+    width = rich["posterior"]["east_mas"]
+    rich["posterior"] |= {"contrast_slope": width, "east_rate_mas_yr": width}
+    said = " ".join(Reader(page_html(search_page(rich))).said.split())
+    assert "Diameter of the companion12.5 ± 1.5mas" in said
+    assert "Slope of the contrast (exponent of the wavelength)−2.50 ± 0.50" in said
+    assert "Contrast (flux ratio) at 4.500 µm" in said
+    assert "East rate (mas/yr)" in said
+    assert "contrast_slope" not in said
+    assert "Slope of the contrast" not in Reader(page_html(search_page(content))).said
 
 
 def test_any_command_can_make_a_page() -> None:

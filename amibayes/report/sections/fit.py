@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from amibayes.models.bands import band_name
+from amibayes.models.parameters import parameter_words
 from amibayes.report.page import Column, Fact, Section, Table
 from amibayes.report.sections.joint import joint_tables
 from amibayes.report.statement import companion_stated, false_alarm, field
 from amibayes.report.words import (
     FARTHEST_TOLD,
     NONE,
+    capital,
     chance,
     count,
     fixed,
@@ -31,6 +33,13 @@ UNITS = {
     "diameter_mas": ("Diameter of the star", "mas"),
     "background": ("Over-resolved flux (star = 1)", ""),
 }
+
+FURTHER = {
+    "limb_darkening": ("Limb darkening of the star (exponent)", ""),
+    "companion_diameter_mas": ("Diameter of the companion", "mas"),
+    "contrast_slope": ("Slope of the contrast (exponent of the wavelength)", ""),
+}
+"""Shown where they are free, or fixed at something else than nothing."""
 
 MAX_MODES = 8
 """Rows of the table of positions."""
@@ -57,9 +66,12 @@ def search(content: Json) -> Section:
 
 def _fit(fit: Json) -> Table:
     rows = []
-    for key, (name, unit) in UNITS.items():
+    further = {k: v for k, v in FURTHER.items() if fit["errors"].get(k) or fit.get(k)}
+    for key, (name, unit) in (UNITS | further).items():
         error = fit["errors"].get(key)
-        if key in ("diameter_mas", "background") and error is None:
+        if key == "contrast" and (at := fit.get("reference_wavelength_um")):
+            name = f"{name} at {fixed(at, 3)} µm"
+        if key in ("diameter_mas", "background", *FURTHER) and error is None:
             rows.append((name, f"{plain(fit[key])} (fixed)", unit))
         else:
             rows.append((name, measured(fit[key], error), unit))
@@ -219,7 +231,7 @@ def _intervals(p: Json, fit: Json) -> Table:
 def _named(key: str, fit: Json) -> tuple[str, str]:
     """What a quantity of the posterior is called, and its unit; a contrast with its band."""
     key, _, band = key.partition("[")
-    name, unit = UNITS.get(key, (key, ""))
+    name, unit = (UNITS | FURTHER).get(key) or (capital(parameter_words(key)), "")
     if fit.get("contrast_kind") == "per-filter" and key in ("contrast", "delta_mag") and not band:
         band = fit["contrasts"][0]["band"]
     return (f"{name}, {band_name(band.rstrip(']'))}" if band else name), unit

@@ -7,6 +7,7 @@ from typing import Any
 
 from amibayes.report.page import Column, Section, Table
 from amibayes.report.words import chance, count, fixed, plain
+from amibayes.support.atomic_files import short_names
 
 Json = dict[str, Any]
 
@@ -29,11 +30,20 @@ def _added(found: Json) -> str:
     vis2, closure = found["extra_vis2"], found["extra_closure_phase_deg"]
     if not vis2 and not closure:
         return "The stated errors explain the residuals: no noise was added."
+    kinds = "extra_vis2", "extra_closure_phase_deg"
+    own = [f for f in found.get("files", ()) if any(f[kind] for kind in kinds)]
+    names = short_names([f["path"] for f in own])
+    amounts = [_amount(f, f" to {name}") for name, f in zip(names, own, strict=True)]
     return (
-        f"The stated errors do not explain the residuals: noise of {plain(vis2, 2)} in V² and "
-        f"{plain(closure, 2)}° in closure phase was added in quadrature, and every χ² and error "
+        f"The stated errors do not explain the residuals: noise of "
+        f"{'; '.join(amounts or [_amount(found)])} was added in quadrature, and every χ² and error "
         "on this page includes it."
     )
+
+
+def _amount(found: Json, to: str = "") -> str:
+    vis2, closure = found["extra_vis2"], found["extra_closure_phase_deg"]
+    return f"{plain(vis2, 2)} in V² and {plain(closure, 2)}° in closure phase{to}"
 
 
 def _charge_migration(found: Json | None) -> tuple[str, ...]:
