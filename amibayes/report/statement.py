@@ -133,6 +133,8 @@ def place(content: Json) -> str:
     """Where the best fit is, and how bright, with errors."""
     separation, angle, magnitude = numbers_of_place(content, "\u00a0mas", "\u00a0mag")
     text = f"{separation}, position angle {angle}, {magnitude} fainter than the star"
+    if "reference_mjd" in content["fit"]:
+        text += f" (at MJD\u00a0{fixed(content['fit']['reference_mjd'], 2)})"
     return text.replace(" ±", "\u00a0±")
 
 

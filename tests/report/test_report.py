@@ -244,6 +244,13 @@ def test_what_the_data_leave_open_has_no_error(content) -> None:
     assert facts["Separation"].endswith(" mas (undetermined)")
 
 
+def test_the_place_of_a_companion_that_moves_has_a_date(content) -> None:
+    moving = copy.deepcopy(content)
+    moving["fit"]["reference_mjd"] = 60000.25
+    still, dated = (statement_of(one).headline.replace("\u00a0", " ") for one in (content, moving))
+    assert dated == still.replace("the star", "the star (at MJD 60000.25)", 1)
+
+
 def test_a_posterior_without_a_detection_is_no_measurement(content) -> None:
     none = copy.deepcopy(content)
     none["significance"]["detected"] = False
