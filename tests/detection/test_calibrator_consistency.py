@@ -84,7 +84,9 @@ def test_a_calibrator_with_a_companion_is_named(rng) -> None:
     assert found[0].p == 1e-3
     assert found[0].delta_chi2 > 50.0
     assert all(one.p > 0.01 for one in found[1:])
-    assert "calibrated with cal0.fits and with the other calibrators" in _apart(found[0], moves=False)
+    assert "calibrated with cal0.fits and with the other calibrators" in _apart(
+        found[0], moves=False
+    )
     (warning,) = consistency_warnings(found)
     assert "cal0.fits" in warning
     assert not consistency_warnings(found[1:])
