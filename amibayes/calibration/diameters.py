@@ -12,14 +12,12 @@ import numpy as np
 from amibayes.calibration.transfer import Diameter
 from amibayes.data.observables import Observables
 from amibayes.data.shared_errors import SharedErrors
+from amibayes.data.tables import BYTE_ORDER_MARK
 from amibayes.errors import DataError, UsageError
 from amibayes.scene.disc import uniform_disc
 from amibayes.units import FloatArray
 
 OPTION = "--calibrator-diameters"
-
-BYTE_ORDER_MARK = "\ufeff"
-"""With which spreadsheets begin a table in UTF-8; it is no part of the first column's name."""
 
 
 def diameters_of(

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.hypotheses import FAMILIES, Hypothesis
 from amibayes.comparison.verdict import UNDECIDED
-from amibayes.detection.verdict import Statement, Verdict
+from amibayes.detection.verdict import REFUSED, Statement, Verdict
 from amibayes.likelihood.chi2 import REJECTED
 from amibayes.support.options import SKY_MODELS
 
-REFUSED = ("model rejected", "inconsistent data")
 OF_ONE = ("star", "companion")
 """Models that the verdict is about, and what it says where neither is right."""
 

@@ -11,6 +11,9 @@ from amibayes.data.measurements import Measurements
 from amibayes.data.setup import Setup
 from amibayes.units import FloatArray
 
+BYTE_ORDER_MARK = "\ufeff"
+"""With which spreadsheets begin a table in UTF-8; it is no part of the first column's name."""
+
 
 def quantity_table(
     columns: Mapping[str, Any], units: Mapping[str, str], meta: Mapping[str, Any] | None = None

@@ -167,6 +167,11 @@ class Exposures:
     floor: bool
     sizes: FloatArray
 
+    @cached_property
+    def _mean(self) -> FloatArray:
+        """Standard deviations (rank,) of the mean covariance."""
+        return np.asarray(np.sqrt((self.sizes**2).mean(axis=0)))
+
     def noise(self, likelihood: Likelihood, theta: FloatArray) -> GaussianNoise:
         """Noise with the mean of the covariance, by the residuals of a fit."""
         return self.noise_of(self.turned(*self.drifts(likelihood, theta))[0])
@@ -207,8 +212,7 @@ class Exposures:
             for kind, drift in ((True, vis2), (False, closure))
             if drift is not None
         }
-        mean = np.sqrt((self.sizes**2).mean(axis=0))
-        each, means = [], []
+        mean, each, means = self._mean, [], []
         for one in self.series:
             own = self.sizes[:, one.rows]
             each.append(one.correlation(*nodes[one.vis2]) * own[:, :, None] * own[:, None])
@@ -218,7 +222,6 @@ class Exposures:
 
     def roots(self, axes: Sequence[Axes], each: Sequence[FloatArray]) -> tuple[Roots, ...]:
         """Roots of the covariances of rows turned to axes, whitened by their mean."""
-        mean = np.sqrt((self.sizes**2).mean(axis=0))
         alone = np.ptp(self.sizes, axis=0) > 0.0
         blocks = []
         for axis, covariance in zip(axes, each, strict=True):
@@ -229,7 +232,7 @@ class Exposures:
         few = np.arange(FEW_ROWS, np.count_nonzero(alone), FEW_ROWS)
         for at in np.split(np.flatnonzero(alone), few):
             if len(at):
-                blocks.append([(at, np.diag(own)) for own in self.sizes[:, at] / mean[at]])
+                blocks.append([(at, np.diag(own)) for own in self.sizes[:, at] / self._mean[at]])
         return tuple(zip(*blocks, strict=True))
 
 

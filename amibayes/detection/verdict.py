@@ -29,6 +29,9 @@ Statement = Literal["companion", "no companion", "model rejected", "inconsistent
 STATEMENTS: tuple[Statement, ...] = get_args(Statement)
 """All of them, in that order."""
 
+REFUSED: tuple[Statement, ...] = ("model rejected", "inconsistent data")
+"""Those that neither state a companion nor that there is none."""
+
 NAMES = {"vis2": "V²", "cp": "closure phases"}
 
 

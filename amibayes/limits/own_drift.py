@@ -78,9 +78,9 @@ def with_own_drift(
     log_error : (n_rings, n_shares) float array
         Of the logarithms of contrasts at which shares are detected.
     """
-    n_rings, exposures = len(rings.separation_mas), exposures_of(test.likelihood)
-    if test.exposures is None or exposures is None or not exposures.series:
-        return critical, np.zeros((n_rings, len(shares)))
+    exposures = None if test.exposures is None else exposures_of(test.likelihood)
+    if exposures is None or not exposures.series:
+        return critical, np.zeros((len(rings.separation_mas), len(shares)))
     far = rings.separation_mas.max()
     inverse = far / np.maximum(rings.separation_mas, 1e-3 * far)
     number = np.clip(TRIALS * inverse / inverse.sum(), LEAST, MOST).astype(int)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Row, Table
 
+from amibayes.data.tables import BYTE_ORDER_MARK
 from amibayes.errors import DataError
 
 FILES, CALIBRATORS, NAME = "target", "cal", "name"
@@ -110,8 +111,7 @@ def read_targets(path: str | Path) -> tuple[SurveyTarget, ...]:
         Where it is no such table, is empty, or two targets have one name.
     """
     table = _table(Path(path))
-    # Spreadsheets begin a table in UTF-8 with a mark, which is no part of the first name.
-    names = {str(c): str(c).lstrip("\ufeff").strip() for c in table.colnames}
+    names = {str(c): str(c).lstrip(BYTE_ORDER_MARK).strip() for c in table.colnames}
     columns = {name.lower().replace("-", "_"): c for c, name in names.items()}
     if FILES not in columns:
         raise DataError(

@@ -228,12 +228,16 @@ def _shape_lines(report: SearchReport) -> list[str]:
             at = 1e6 * result.likelihood.model.reference_wavelength_m
             shown = f"{with_error(value, error)} (exponent; contrast of {at:.3f} um)"
             lines.append(row("slope", shown))
-        elif value < UNRESOLVED * error:
-            bound = value + UNRESOLVED * error
+        elif (bound := _upper_limit(value, error)) is not None:
             lines.append(row("disc", f"companion not resolved: below {bound:.2g} mas (2 sigma)"))
         else:
             lines.append(row("disc", f"of the companion {with_error(value, error, ' mas')}"))
     return lines
+
+
+def _upper_limit(diameter: float, error: float) -> float | None:
+    """Of a disc that is not resolved; None where it is."""
+    return diameter + UNRESOLVED * error if diameter < UNRESOLVED * error else None
 
 
 def _nuisance_lines(report: SearchReport) -> list[str]:
@@ -248,8 +252,7 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
     for name, (value, error) in (result.star_alone() if alone else star).items():
         label = name.removesuffix("_mas").replace("limb_darkening", "limb dark.")
         unit = " mas" if name.endswith("_mas") else ""
-        if name == "diameter_mas" and value < UNRESOLVED * error:
-            bound = value + UNRESOLVED * error
+        if name == "diameter_mas" and (bound := _upper_limit(value, error)) is not None:
             shown = f"not resolved: below {bound:.2g} mas (2 sigma, without its prior)"
             if not bound < result.grid.outer_mas:
                 shown = "undetermined"

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from amibayes.detection.verdict import REFUSED
 from amibayes.support.atomic_files import atomic_path, write_json
 from amibayes.support.terminal import row, shortened
-from amibayes.survey.rows import UNDECIDED, table_of
+from amibayes.survey.rows import table_of
 
 Json = dict[str, Any]
 
@@ -70,7 +71,7 @@ def _outcome(entry: Json) -> str:
 
 
 def _verdict(entry: Json) -> str:
-    if entry.get("verdict") in UNDECIDED:
+    if entry.get("verdict") in REFUSED:
         return str(entry["verdict"])
     verdict = {True: "DETECTED", False: "not detected", None: "not tested"}[entry["detected"]]
     if entry["detected"] is False or entry.get("separation_mas") is None:

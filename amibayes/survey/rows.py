@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from astropy.table import MaskedColumn, Table
 
+from amibayes.detection.verdict import REFUSED
 from amibayes.survey.completeness import Crossings, DetectionProbability, from_counts
 from amibayes.units import delta_mag_to_contrast
 
@@ -57,9 +58,6 @@ UNITS = (
     }
     | {name: unit for name, unit in FACTS.items() if unit}
 )
-
-UNDECIDED = ("model rejected", "inconsistent data")
-"""Verdicts that neither state a companion nor that there is none."""
 
 CURVE = (
     "method",
@@ -129,7 +127,7 @@ def row_of(content: Json) -> Json:
     row |= _limit_numbers(content)
     if "companion_detected" in content:
         row["detected"] = content["companion_detected"]
-    if row.get("verdict") in UNDECIDED:
+    if row.get("verdict") in REFUSED:
         row["detected"] = None
     row["modes"] = [
         {k: mode[k] for k in ("separation_mas", "position_angle_deg")}

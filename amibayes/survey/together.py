@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from amibayes.detection.verdict import REFUSED
 from amibayes.limits.mass_table import MassTable, read_mass_table
 from amibayes.survey.completeness import StackedCompleteness, stack
 from amibayes.survey.false_alarms import FDR_LEVEL, NULLS_ABOVE, FalseAlarms, false_alarms
 from amibayes.survey.frequency import Box, FrequencyPosterior, frequency_posterior
-from amibayes.survey.rows import UNDECIDED, Json, Outcome
+from amibayes.survey.rows import Json, Outcome
 from amibayes.units import FloatArray
 
 N_SEPARATIONS, N_DEPTHS = 24, 25
@@ -65,7 +66,7 @@ def _false_alarms(entries: list[Json], level: float) -> Json | None:
     tested = [
         e
         for e in entries
-        if e.get("false_alarm_probability") is not None and e.get("verdict") not in UNDECIDED
+        if e.get("false_alarm_probability") is not None and e.get("verdict") not in REFUSED
     ]
     if not tested:
         return None

@@ -15,20 +15,25 @@ OPTIONS = SearchOptions(observables=("cp",), separation_mas=(60.0, 300.0), null_
 PLACES = [(150.0, 0.0), (-60.0, 140.0), (-80.0, -150.0)]
 
 
+def verdict_on(
+    companions: list[tuple[float, float, float]], days: float, rng: np.random.Generator
+) -> Verdict:
+    """The verdict on files that follow each other by so many days, each with its companion."""
+    files = [
+        noisy(
+            epoch(mjd=60000.0 + days * k, source=f"{k}.oifits", turn_deg=50.0 * k), companion, rng
+        )
+        for k, companion in enumerate(companions)
+    ]
+    found = search_field(join(files), OPTIONS)
+    tested = false_alarm(found.result, OPTIONS, rng)
+    return verdict_of(found, tested, OPTIONS, rng)[0]
+
+
 def stated(contrast: float) -> Verdict:
     """The verdict on three nights of a companion that is elsewhere in each."""
     rng = np.random.default_rng(3)
-    nights = [
-        noisy(
-            epoch(mjd=60000.0 + 100.0 * k, source=f"{k}.oifits", turn_deg=50.0 * k),
-            (*place, contrast),
-            rng,
-        )
-        for k, place in enumerate(PLACES)
-    ]
-    found = search_field(join(nights), OPTIONS)
-    tested = false_alarm(found.result, OPTIONS, rng)
-    return verdict_of(found, tested, OPTIONS, rng)[0]
+    return verdict_on([(*place, contrast) for place in PLACES], 100.0, rng)
 
 
 def test_a_companion_that_moves_is_not_denied() -> None:
@@ -47,17 +52,7 @@ def test_nights_without_a_companion_have_none() -> None:
 def of_two_files(contrasts: tuple[float, float]) -> Verdict:
     """The verdict on two files of one night, whose companions have these contrasts."""
     rng = np.random.default_rng(5)
-    files = [
-        noisy(
-            epoch(mjd=60000.0 + 0.02 * k, source=f"{k}.oifits", turn_deg=50.0 * k),
-            (150.0, 0.0, contrast),
-            rng,
-        )
-        for k, contrast in enumerate(contrasts)
-    ]
-    found = search_field(join(files), OPTIONS)
-    tested = false_alarm(found.result, OPTIONS, rng)
-    return verdict_of(found, tested, OPTIONS, rng)[0]
+    return verdict_on([(150.0, 0.0, contrast) for contrast in contrasts], 0.02, rng)
 
 
 def test_a_companion_that_one_file_of_a_night_shows_is_not_denied() -> None:
