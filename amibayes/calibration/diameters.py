@@ -179,9 +179,4 @@ def _with_error(point: Observables, relative: FloatArray) -> Observables:
         return point
     changes = np.zeros((len(point.data), 1))
     changes[: point.n_vis2, 0] = relative * point.data[: point.n_vis2]
-    own, before = SharedErrors((f"diameter of {point.source}",), changes), point.shared
-    every = own
-    if before is not None:
-        names = (*before.names, *own.names)
-        every = SharedErrors(names, np.hstack([before.changes, changes]))
-    return replace(point.with_shared_errors(own), shared=every)
+    return point.with_shared_errors(SharedErrors((f"diameter of {point.source}",), changes))

@@ -178,17 +178,22 @@ class Observables:
             closure_phase=replace(self.closure_phase, value=closure),
         )
 
-    def with_shared_errors(self, shared: SharedErrors | None, sign: float = 1.0) -> Observables:
-        """Data with errors in common with others put into the covariance, or taken out of it."""
+    def with_shared_errors(self, shared: SharedErrors | None) -> Observables:
+        """Data with errors in common with others put into the covariance, beside those it holds."""
         if shared is None:
             return self
-        scatter = None if self.scatter is None else shared.added(self.scatter, sign)
-        whole = with_shared(self.covariance, shared, sign)
-        return replace(self, covariance=whole, scatter=scatter, shared=shared)
+        every = shared if self.shared is None else self.shared.beside(shared)
+        return replace(self._covariance_moved(shared, 1.0), shared=every)
 
     def without_shared_errors(self) -> Observables:
         """Data with the covariance of their own errors only."""
-        return replace(self.with_shared_errors(self.shared, -1.0), shared=None)
+        if self.shared is None:
+            return self
+        return replace(self._covariance_moved(self.shared, -1.0), shared=None)
+
+    def _covariance_moved(self, shared: SharedErrors, sign: float) -> Observables:
+        scatter = None if self.scatter is None else shared.added(self.scatter, sign)
+        return replace(self, covariance=with_shared(self.covariance, shared, sign), scatter=scatter)
 
     def only(self, kinds: Sequence[str]) -> Observables:
         """The data of the given kinds, out of ``vis2`` and ``cp``.

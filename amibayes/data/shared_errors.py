@@ -17,6 +17,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from amibayes.data.blocks import Block, BlockCovariance
+from amibayes.errors import UsageError
 from amibayes.units import BoolArray, FloatArray, IntArray, read_only
 
 
@@ -44,6 +45,20 @@ class SharedErrors:
     def scaled(self, factors: FloatArray) -> SharedErrors:
         """Those of data that are multiplied by numbers (size,)."""
         return SharedErrors(self.names, self.changes * factors[:, None])
+
+    def beside(self, other: SharedErrors) -> SharedErrors:
+        """These and others of the same data, whose names differ.
+
+        Raises
+        ------
+        UsageError
+            Where a name is in both: the covariance holds no product of two changes by one error.
+        """
+        twice = sorted({*self.names} & {*other.names})
+        if twice:
+            raise UsageError(f"the data share the error {twice[0]!r} already")
+        changes = np.hstack([self.changes, other.changes])
+        return SharedErrors((*self.names, *other.names), changes)
 
     def added(self, matrix: csr_array, sign: float = 1.0) -> csr_array:
         """A sparse covariance with these put in, or taken out."""

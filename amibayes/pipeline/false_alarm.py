@@ -216,12 +216,12 @@ def _seen_in_one_part(found: FieldSearch, options: SearchOptions, rng: np.random
     false alarm. Files are parts where noise was fitted to them: else a star alone explains them.
     """
     data = found.observables.only(options.observables).unflagged()
-    parts = _nights_and_files(data, found.noise)
+    parts = _nights_and_files(data, found.noise, moves=options.motion)
     if not 1 < len(parts) <= 2 * MAX_PARTS:
         return ""
     own = replace(options, alpha=options.alpha / len(parts), motion=False, null_draws=None)
     few = replace(own, null_draws=FIRST_DRAWS)
-    for name, mask in parts.items():
+    for name, mask, why in parts:
         try:
             part = search_field(data.select(mask[: data.n_vis2], mask[data.n_vis2 :]), own)
         except DataError:  # too few data to be searched
@@ -230,30 +230,27 @@ def _seen_in_one_part(found: FieldSearch, options: SearchOptions, rng: np.random
             continue
         tested = beside_bright(false_alarm(part.result, own, rng), part.result, part.noise)
         if tested.detected and verdict_of(part, tested, own, rng)[0].statement == "companion":
-            return _told(name, part, moves=options.motion)
+            return _told(name, part, why)
     return ""
 
 
-def _nights_and_files(data: Observables, noise: ExtraNoise) -> dict[str, BoolArray]:
-    """Masks (n_data,) of parts of data by their names; a file that is a night is one part."""
-    parts = {f"{NIGHT} {name}": mask for name, mask in by_night(data).items()}
+def _nights_and_files(
+    data: Observables, noise: ExtraNoise, *, moves: bool
+) -> list[tuple[str, BoolArray, str]]:
+    """Name, mask (n_data,) and what may set it apart of each part; a file may be a night."""
+    apart = "another star, orientation or calibration of a file"
+    nights = by_night(data)
+    parts = [(f"the night of {n}", mask, motion_words(moves=moves)) for n, mask in nights.items()]
     if noise.any:
-        known = {mask.tobytes() for mask in parts.values()}
+        known = {mask.tobytes() for mask in nights.values()}
         files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
-        parts |= {name: mask for name, mask in files.items() if mask.tobytes() not in known}
-    return {name: mask for name, mask in parts.items() if not mask.all()}
+        parts += [(n, mask, apart) for n, mask in files.items() if mask.tobytes() not in known]
+    return [part for part in parts if not part[1].all()]
 
 
-NIGHT = "the night of"
-"""Parts of data that are nights are named so, others by their file."""
-
-
-def _told(part: str, found: FieldSearch, *, moves: bool) -> str:
+def _told(part: str, found: FieldSearch, why: str) -> str:
     """Say where the companion of one part is."""
     c = found.result.companion
-    why = "another star, orientation or calibration of a file"
-    if part.startswith(NIGHT):
-        why = motion_words(moves=moves)
     return (
         f"{part} shows a companion by itself ({c.delta_mag:.1f} mag at "
         f"{c.separation_mas:.3g} mas, PA {c.position_angle_deg:.0f} deg), all data together none "

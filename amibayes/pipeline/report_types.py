@@ -13,7 +13,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.false_alarm import Significance
 from amibayes.detection.outlying_rows import OutlyingRow
 from amibayes.detection.splits import Consistency
-from amibayes.detection.verdict import Verdict
+from amibayes.detection.verdict import Statement, Verdict
 from amibayes.extraction.charge import CubeMigration
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -57,6 +57,11 @@ class SearchReport(Shown):
     left_out: tuple[OutlyingRow, ...] = ()
     timing_s: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def statement(self) -> Statement | None:
+        """What the verdict says; None where nothing was tested."""
+        return None if self.verdict is None else self.verdict.statement
+
     def rows(self) -> Rows:
         """What an interpreter shows."""
         stages = ("significance", "posterior", "limits", "evidence", "models")
@@ -65,7 +70,7 @@ class SearchReport(Shown):
         return [
             ("targets", ", ".join(self.targets)),
             ("calibrators", ", ".join(self.calibrators) or "none"),
-            ("statement", "not tested" if self.verdict is None else self.verdict.statement),
+            ("statement", self.statement or "not tested"),
             *([] if self.models is None else [("models", self.models.verdict.statement)]),
             ("best fit", repr(self.result).strip("<>").removeprefix("SearchResult: ")),
             ("false alarm", "not tested" if chance is None else f"{chance.probability:.3g}"),

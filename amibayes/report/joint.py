@@ -117,7 +117,7 @@ def joint_lines(report: SearchReport) -> list[str]:
             f"files       {len(report.targets)} fitted together; worst reduced chi2 "
             f"{_largest(worst):.2f} ({Path(worst.source).name})"
         )
-    if report.verdict is not None and report.verdict.statement == "model rejected":
+    if report.statement == "model rejected":
         return lines  # of which no number is stated
     if len(bands) > 1 and model.bands:
         each = [f"{b} {c:.5f} +/- {e:.5f}" for b, (c, e) in result.contrasts.items()]

@@ -54,7 +54,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     ]
     lines += [*joint_lines(report), *_shape_lines(report), *_nuisance_lines(report)]
     lines += _noise_lines(report)
-    if report.posterior is not None:
+    if report.posterior is not None and report.statement != "model rejected":
         lines += _posterior_lines(report.posterior)
     lines += _upper_limit_lines(report)
     if report.evidence is not None:
@@ -82,10 +82,10 @@ def _beside(report: SearchReport) -> Agreement | None:
 
 def _best_fit(report: SearchReport) -> list[str]:
     """Place and contrast; not those of a model that was rejected."""
-    c, found = report.result.companion, report.verdict
+    c = report.result.companion
     beside = _beside(report)
     apart = beside is not None and beside.agrees is False
-    if found is not None and found.statement == "model rejected":
+    if report.statement == "model rejected":
         why = "see the models" if apart else "the model is rejected (amibayes export, for images)"
         return [row("best fit", f"not stated: {why}")]
     contrast = row(
@@ -104,7 +104,7 @@ def _best_fit(report: SearchReport) -> list[str]:
         f"{with_error(c.separation_mas, c.separation_error_mas, ' mas', c.separation_mas)}, "
         f"PA {angle} (E {c.east_mas:.{places}f}, N {c.north_mas:.{places}f} mas)"
     )
-    if found is not None and found.statement == "no companion":
+    if report.statement == "no companion":
         noise = tested is None or not tested.detected
         place += ": no more than noise gives" if noise else ": needless, see the verdict"
     if apart:
@@ -218,8 +218,8 @@ def three_digits(value: float) -> str:
 
 def _shape_lines(report: SearchReport) -> list[str]:
     """Disc and colour of the companion that is stated, where these are free."""
-    result, lines, found = report.result, [], report.verdict
-    if found is not None and found.statement in ("no companion", "model rejected"):
+    result, lines = report.result, []
+    if report.statement in ("no companion", "model rejected"):
         return []
     parameters = result.likelihood.parameters
     for k in parameters.columns("shape"):
@@ -244,7 +244,7 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
     """The star's own parameters: of the fit without a companion, where there is none."""
     result, lines = report.result, []
     parameters = result.likelihood.parameters
-    alone = report.verdict is not None and report.verdict.statement == "no companion"
+    alone = report.statement == "no companion"
     star = {
         parameters[k].name: (float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k])))
         for k in parameters.nuisance

@@ -22,6 +22,7 @@ from amibayes.calibration import (
 )
 from amibayes.cli.main import build_parser
 from amibayes.cli.options import data_options
+from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import DataError, UsageError
 from amibayes.oifits import read_oifits
 from amibayes.pipeline.options import SearchOptions
@@ -65,9 +66,12 @@ def test_a_calibrator_freed_of_its_disc_is_a_point(rng: np.random.Generator) -> 
     np.testing.assert_allclose(found.errors[0], point.errors[0] / squared)
     assert without_disc(resolved, 0.0) is resolved
     # The error of the diameter: half of the difference that both ends of it make.
-    unsure = without_disc(without_disc(resolved, 20.0, 1.0), 34.0, 0.02)
+    charge = SharedErrors(("charge",), 0.01 * point.data[:, None])
+    unsure = without_disc(without_disc(resolved.with_shared_errors(charge), 20.0), 34.0, 0.02)
     ends = [without_disc(without_disc(resolved, 20.0), d).data for d in (34.02, 33.98)]
     assert unsure.shared is not None
+    with pytest.raises(UsageError, match="already"):
+        without_disc(unsure, 5.0, 0.01)
     np.testing.assert_allclose(unsure.shared.changes[:, 1], (ends[0] - ends[1]) / 2, rtol=1e-4)
     own = unsure.without_shared_errors().covariance.dense()
     every = unsure.shared.changes @ unsure.shared.changes.T

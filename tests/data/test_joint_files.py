@@ -144,10 +144,11 @@ def test_tied_contrast_and_summary(files, tmp_path) -> None:
     assert any(
         "one contrast for NIRISS_4.29um, NIRISS_4.82um" in x for x in summary(tied, tmp_path)
     )
-    moving = found(files[1:], motion=True, null_draws=0)
-    assert any(line.startswith("motion      E ") for line in summary(moving, tmp_path))
+    moving = found(files[1:], motion=True, null_draws=0, posterior=True)
     rejected = replace(moving, verdict=Verdict("model rejected", "", 0.0))
-    assert not any(line.startswith("motion") for line in summary(rejected, tmp_path))
+    for start in ("motion      E ", "posterior ", "chain "):
+        assert any(line.startswith(start) for line in summary(moving, tmp_path)), start
+        assert not any(line.startswith(start) for line in summary(rejected, tmp_path)), start
     result = result_json(tied)
     assert result["fit"]["contrast_kind"] == "tied"
     assert {c["contrast"] for c in result["fit"]["contrasts"]} == {result["fit"]["contrast"]}

@@ -12,6 +12,7 @@ from helpers import niriss
 from amibayes.calibration import calibrate
 from amibayes.data.observables import Observables, join
 from amibayes.data.shared_errors import SharedErrors
+from amibayes.errors import UsageError
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.units import FloatArray
 
@@ -42,6 +43,25 @@ def test_they_are_put_in_and_taken_out() -> None:
     scale = bare.covariance.variance.max()
     np.testing.assert_allclose(again.covariance.dense(), bare.covariance.dense(), atol=1e-9 * scale)
     assert found.n_independent == bare.n_independent
+
+
+def test_more_of_them_stand_beside_those_before() -> None:
+    """Both are in the covariance and known by name, and both can be taken out again."""
+    before, bare = sharing(1), plain()
+    assert before.shared is not None
+    more = SharedErrors(("third",), before.shared.changes[:, :1] * 0.3)
+    found = before.with_shared_errors(more)
+    assert found.shared is not None
+    assert found.shared.names == ("one", "other", "third")
+    changes = found.shared.changes
+    np.testing.assert_allclose(
+        found.covariance.dense(), bare.covariance.dense() + changes @ changes.T
+    )
+    scale = bare.covariance.variance.max()
+    again = found.without_shared_errors().covariance.dense()
+    np.testing.assert_allclose(again, bare.covariance.dense(), atol=1e-9 * scale)
+    with pytest.raises(UsageError, match="'other' already"):
+        before.with_shared_errors(SharedErrors(("other",), more.changes))
 
 
 def test_data_laid_together_are_correlated_by_them() -> None:
