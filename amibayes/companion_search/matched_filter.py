@@ -90,7 +90,7 @@ class CompanionFringes:
             sine *= self.disc
         if self.samples.off_axis is None:
             return
-        fringe, flux = self.samples.off_axis.at((east_mas, north_mas))
+        fringe, flux = self.samples.off_axis.symmetrised.at((east_mas, north_mas))
         turned = (cosine - 1j * sine) * fringe
         cosine[...] = turned.real - (flux - 1.0) * self.star[:, None]
         sine[...] = -turned.imag

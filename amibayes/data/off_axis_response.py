@@ -5,12 +5,15 @@ measured, smeared over the filter's width, to exp(−2πi(uα + vδ)). It is smo
 little of the other baselines' fringes, which turn with the place: known on a lattice of
 places nearly three times finer than a fringe of the longest baseline, and by cubic B-splines
 between (Unser 1999).
-Opposite places have conjugate responses, as has a baseline taken the other way round.
+A baseline taken the other way round has the conjugate response, and so have opposite places,
+unless pixels are too large for the fringes: which others these look like depends on where in a
+pixel the star is.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +61,12 @@ class OffAxisResponse:
     def n_nodes(self) -> int:
         """Coefficients along each axis."""
         return int(self.coefficients.shape[-1])
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """Whether opposite places have conjugate responses, to rounding."""
+        opposite = self.coefficients[..., ::-1, ::-1].conj()
+        return bool(np.abs(self.coefficients - opposite).max() < 1e-5)
 
     def reach(self) -> float:
         """Distance from the axis, in radians, to which it was measured in every direction."""

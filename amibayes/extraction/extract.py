@@ -38,7 +38,12 @@ from amibayes.extraction.mask_map import MaskMap, far_from_stated
 from amibayes.extraction.operator import ExtractionOperator
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.preparation import make_operator
-from amibayes.extraction.response import off_axis_response, pointing_response, star_image
+from amibayes.extraction.response import (
+    mean_response,
+    off_axis_response,
+    pointing_response,
+    star_image,
+)
 from amibayes.extraction.table import Extraction, independent_basis, observables_of, target_of
 from amibayes.extraction.view import View
 from amibayes.extraction.visits import exposures, visit_maps
@@ -47,9 +52,6 @@ from amibayes.ramps.correction import MigrationFree
 from amibayes.support.arguments import checks_arguments
 from amibayes.support.options import EXTRACTION_METHODS
 from amibayes.units import ComplexArray, FloatArray
-
-NYQUIST = 0.5
-"""Cycles per pixel beyond which fringes look like others."""
 
 TIMES = ("EXPMID", "MJD-AVG", "MJD-OBS")
 """Keywords that tell when an exposure was made, the best first."""
@@ -205,7 +207,9 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     notes = _unnamed(parts) + _of_headers(parts) + _notes(view, frames, shrunk)
     notes += tuple(dict.fromkeys(note for p in parts for note in p.charge.notes))
     sources = tuple(p.template.source for p in parts)
-    observables = _tabled(parts[0], frames, mean, shrunk, basis, notes, sources)
+    count = [float(np.count_nonzero(frames.used & (frames.file == k))) for k in range(len(parts))]
+    response = mean_response([p.response for p in parts], count)
+    observables = _tabled(parts[0], response, frames, mean, shrunk, basis, notes, sources)
     observables = _sharing(observables, parts, frames)
     operators = tuple(p.operator for p in parts)
     return Extraction(
@@ -244,6 +248,7 @@ def _together(parts: list[_Part], options: ExtractOptions) -> tuple[Frames, Aver
 
 def _tabled(
     part: _Part,
+    response: OffAxisResponse,
     frames: Frames,
     mean: Average,
     shrunk: Shrunk,
@@ -262,7 +267,7 @@ def _tabled(
         kind="estimated" if n > 1 else "given",
         freedom=shrunk.carried,
         scatter=scatter,
-        response=part.response,
+        response=response,
         mjd=_mjd(frames),
         integration_s=n * (part.template.integration_time_s or 0.0),
         notes=notes,
@@ -297,13 +302,11 @@ def _of_headers(parts: list[_Part]) -> tuple[str, ...]:
 
 def _notes(view: View, frames: Frames, shrunk: Shrunk) -> tuple[str, ...]:
     notes = []
-    coarse = int((np.abs(view.frequency_px).max(axis=1) > NYQUIST).sum())
-    if coarse:
+    if view.unsampled.any():
         notes.append(
-            f"the pixels are too large for the fringes of {coarse} of {len(view.frequency_px)} "
-            "baselines: what is measured of light off the axis depends on the star's place in a "
-            "pixel, by some percent of a companion's light, and its separation may be off by 4 %, "
-            "several times the stated error (take another filter for places)"
+            f"the pixels are too large for the fringes of {view.unsampled.sum()} of "
+            f"{len(view.unsampled)} baselines: the response to light off the axis is that of the "
+            "star's place within a pixel"
         )
     lost = int((~frames.used).sum())
     if lost:

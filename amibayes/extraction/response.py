@@ -8,6 +8,7 @@ baseline.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -71,8 +72,10 @@ def off_axis_response(
     """
     view, pixel = star.view, star.view.instrument.pixel_scale_rad
     cell = pixel / star.oversample
+    aliased = bool(view.unsampled.any())
     fringe = view.wavelength_m / float(np.hypot(*view.uv_m.T).max())
-    step = max(int(fringe / (NODES_PER_FRINGE * cell)), 1)
+    # Fringes that look like others turn against these once in a pixel.
+    step = max(int(min(fringe, pixel if aliased else np.inf) / (NODES_PER_FRINGE * cell)), 1)
     half = int(FARTHEST * view.instrument.field_rad / (step * cell))
     axis = step * cell * np.arange(-half, half + 1)
     seen = star.on_lattice(sampling.for_fringes, step, half)
@@ -81,6 +84,9 @@ def off_axis_response(
     x, y = np.exp(2j * np.pi / view.wavelength_m * np.multiply.outer(view.uv_m.T, axis))
     ratio[1:] *= x[:, :, None] * y[:, None, :]
     spline = _interpolating(ratio / ratio[:, half, half, None, None])
+    if not aliased:
+        # A pixel grid is not quite symmetric about the star: 1e-4 of the response.
+        spline = 0.5 * (spline + spline[:, ::-1, ::-1].conj())
     n = view.instrument.mask.n_holes
     between = np.empty((n, n, *spline.shape[1:]), dtype=np.complex64)
     between[np.arange(n), np.arange(n)] = spline[0]
@@ -94,15 +100,24 @@ def off_axis_response(
 def _interpolating(values: ComplexArray) -> ComplexArray:
     """Coefficients (n, m + 2, m + 2) of the cubic splines through values (n, m, m).
 
-    Bent at the ends by nothing. A pixel grid is not quite symmetric about the star; what
-    is kept of a response is the part of it that is.
+    Bent at the ends by nothing.
     """
     side = [(RUN_OUT, RUN_OUT)] * 2
     padded = np.pad(values, [(0, 0), *side], mode="reflect", reflect_type="odd")
     for axis in (1, 2):
         padded = spline_filter1d(padded, order=3, axis=axis, output=complex, mode="mirror")
-    kept = padded[:, RUN_OUT - 1 : 1 - RUN_OUT, RUN_OUT - 1 : 1 - RUN_OUT]
-    return np.asarray(0.5 * (kept + kept[:, ::-1, ::-1].conj()))
+    return np.asarray(padded[:, RUN_OUT - 1 : 1 - RUN_OUT, RUN_OUT - 1 : 1 - RUN_OUT])
+
+
+def mean_response(
+    responses: Sequence[OffAxisResponse], weights: Sequence[float]
+) -> OffAxisResponse:
+    """Response of the mean of several files; of the first one where their lattices differ."""
+    first = responses[0]
+    if any(r.n_nodes != first.n_nodes for r in responses):
+        return first
+    mean = np.average([r.coefficients for r in responses], axis=0, weights=weights)
+    return replace(first, coefficients=mean)
 
 
 def pointing_response(star: FineImage, sampling: Sampling, shift_px: FloatArray) -> ComplexArray:

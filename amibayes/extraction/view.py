@@ -14,10 +14,13 @@ from amibayes.extraction.options import ExtractOptions
 from amibayes.instrument import Channels, Instrument, Mask, load_instrument
 from amibayes.optics import FringeBasis, fringe_field, fringe_image
 from amibayes.scene.spectrum import Blackbody
-from amibayes.units import FloatArray
+from amibayes.units import BoolArray, FloatArray
 
 LARGEST = 1.25
 """Images wider than this many times the instrument's usual subarray are cropped to it."""
+
+NYQUIST = 0.5
+"""Cycles per pixel beyond which fringes look like others."""
 
 CONVERGED_PX = 5e-3
 """Centres are no better known than this: integrations point by more to either side."""
@@ -78,6 +81,11 @@ class View:
     def frequency_px(self) -> FloatArray:
         """(n_baselines, 2) fringe frequencies, cycles per pixel."""
         return np.asarray(self.uv_m * (self.instrument.pixel_scale_rad / self.wavelength_m))
+
+    @cached_property
+    def unsampled(self) -> BoolArray:
+        """(n_baselines,) whose fringes the pixels do not sample."""
+        return np.asarray(np.abs(self.frequency_px).max(axis=1) > NYQUIST)
 
     def moved(self, by_px: FloatArray) -> View:
         """The same with the star elsewhere, by (x, y)."""

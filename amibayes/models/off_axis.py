@@ -7,7 +7,7 @@ pulls that place towards itself, and is itself seen from there: nearer than it i
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,6 +44,8 @@ class Exposure:
         Times east and north in mas: steps of the lattice.
     pointing : (2,) array
         East and north of the centre of light from the axis, mas.
+    symmetric : bool
+        Whether opposite places have conjugate responses.
     """
 
     rows: IntArray
@@ -52,9 +54,18 @@ class Exposure:
     n_nodes: int
     to_node: FloatArray
     pointing: FloatArray
+    symmetric: bool = True
 
     def __post_init__(self) -> None:
         read_only(self, "uv", "coefficients", "to_node", "pointing")
+
+    def symmetrised(self) -> Exposure:
+        """The same with the part of the response that is conjugate at opposite places."""
+        if self.symmetric:
+            return self
+        m, opposite = len(self.rows), self.coefficients[::-1].copy()
+        opposite[:, m : 2 * m] *= -1.0
+        return replace(self, coefficients=0.5 * (self.coefficients + opposite), symmetric=True)
 
     def seen(self, place: Place, *, slopes: bool = False) -> FloatArray:
         """Real parts, imaginary parts and flux at places, (1, 2·m + 1, n).
@@ -83,6 +94,11 @@ class OffAxis:
 
     n_samples: int
     exposures: tuple[Exposure, ...]
+
+    @cached_property
+    def symmetrised(self) -> OffAxis:
+        """What templates take for the response, which opposite places share."""
+        return replace(self, exposures=tuple(e.symmetrised() for e in self.exposures))
 
     @cached_property
     def start(self) -> Place:
@@ -200,6 +216,7 @@ def off_axis_of(
                 response.n_nodes,
                 response.to_node * MAS,
                 response.pointing / MAS,
+                response.symmetric,
             )
         )
     return OffAxis(len(first), tuple(exposures))

@@ -33,12 +33,13 @@ def response_tables(layout: Layout, setups: tuple[Setup, ...]) -> list[Any]:
         first, second = np.triu_indices(n)
         index = np.asarray(layout.station_index(number))
         pairs = np.stack([index[first], index[second]], axis=1)
-        half = setup.response.coefficients[first, second].reshape(len(first), size)
-        half = half[:, : size // 2 + 1]
+        kept = setup.response.coefficients[first, second].reshape(len(first), size)
+        if setup.response.symmetric:
+            kept = kept[:, : size // 2 + 1]
         table = fits.BinTableHDU.from_columns(
             [
                 fits.Column("STA_INDEX", "2I", array=pairs),
-                fits.Column("COEFF", f"{half.shape[1]}C", array=half),
+                fits.Column("COEFF", f"{kept.shape[1]}C", array=kept),
             ],
             name=RESPONSE,
         )
@@ -48,6 +49,7 @@ def response_tables(layout: Layout, setups: tuple[Setup, ...]) -> list[Any]:
         numbers = (*setup.response.to_node.ravel(), *setup.response.pointing)
         for key, value in zip(LATTICE, numbers, strict=True):
             table.header[f"HIERARCH {OWN_KEY} {key}"] = float(value)
+        table.header[f"HIERARCH {OWN_KEY} SYMMETRIC"] = setup.response.symmetric
         table.header[f"HIERARCH {OWN_KEY} SINGLE"] = setup.response.single
         table.header[f"HIERARCH {OWN_KEY} METHOD"] = setup.response.method
         _explain(table, setup.response.n_nodes)
@@ -59,8 +61,8 @@ def _explain(table: Any, n_nodes: int) -> None:
     for line in (
         "Response to light off the axis: visibility of a pair of stations, and flux",
         "(a station with itself). COEFF are coefficients of cubic B-splines on a square",
-        f"lattice of {n_nodes} x {n_nodes} places (x, y), y running faster, up to the middle",
-        "one, which is the axis; opposite ones are conjugate. x and y are steps:",
+        f"lattice of {n_nodes} x {n_nodes} places (x, y), y running faster; the middle one is the",
+        "axis. With SYMMETRIC, up to there: opposite ones are conjugate. x and y are steps:",
         "x = XE east + XN north, y = YE east + YN north, from east and north in radians.",
         "The light of the star and its companions had its centre at POINT_E, POINT_N.",
         "SINGLE is F where V2 sums the powers of several samples.",
@@ -74,20 +76,21 @@ def with_response(oifits: OIFits, setup: Setup, own: int) -> Setup:
     found = [t for t in found if own and t.header.get(f"{OWN_KEY} SETUP", 0) == own]
     if not found or not {"STA_INDEX", "COEFF"} <= set(found[0].columns):
         return setup
-    index, half = found[0].columns["STA_INDEX"], found[0].columns["COEFF"]
+    index, whole = found[0].columns["STA_INDEX"], found[0].columns["COEFF"]
     lattice = _lattice(found[0].header)
-    n_nodes = round(np.sqrt(2 * half.shape[-1] - 1)) if half.ndim == 2 else 0
-    if lattice is None or n_nodes <= BSPLINE_NODES or n_nodes**2 != 2 * half.shape[1] - 1:
+    if lattice is None or whole.ndim != 2 or not np.iscomplexobj(whole):
         return setup
-    if not np.isfinite(half).all() or not np.iscomplexobj(half):
+    if found[0].header.get(f"{OWN_KEY} SYMMETRIC", True):
+        whole = np.concatenate([whole, whole[:, -2::-1].conj()], axis=1)
+    n_nodes = round(np.sqrt(whole.shape[1]))
+    if n_nodes <= BSPLINE_NODES or n_nodes**2 != whole.shape[1] or not np.isfinite(whole).all():
         return setup
     single = bool(found[0].header.get(f"{OWN_KEY} SINGLE", True))
     method = str(found[0].header.get(f"{OWN_KEY} METHOD", ""))
     place = {int(k): i for i, k in enumerate(setup.station_index)}
     n = len(setup.stations)
     response = np.zeros((n, n, n_nodes, n_nodes), dtype=np.complex64)
-    whole = np.concatenate([half, half[:, -2::-1].conj()], axis=1).reshape(-1, n_nodes, n_nodes)
-    for (a, b), row in zip(index, whole, strict=True):
+    for (a, b), row in zip(index, whole.reshape(-1, n_nodes, n_nodes), strict=True):
         if int(a) in place and int(b) in place:
             i, j = place[int(a)], place[int(b)]
             response[j, i] = row.conj()
