@@ -40,9 +40,6 @@ MAX_STEPS = 4
 SMALLEST, SIGNIFICANT = 2.5e-4, 4.0
 """Differences from the stated geometry below this, or so many standard deviations, are left."""
 
-COMPANION = 0.02
-"""A companion's light looks like another scale, by up to this times the rms of |V − 1|."""
-
 ROUNDED = 1e-4
 """Others are multiples of this."""
 
@@ -129,7 +126,8 @@ def solve_geometry(
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:2]
     if not 0.0 < error.min() <= error.max() < CONSTRAINED:
         return None
-    limit = np.maximum(SIGNIFICANT * error, max(SMALLEST, COMPANION * _unlike_a_star(fit, image)))
+    unlike = view.unlike_a_star(fit.solve(pixels)[0, :-1])
+    limit = np.maximum(SIGNIFICANT * error, max(SMALLEST, unlike))
     adopted = np.zeros(2)
     for _ in range(MAX_STEPS):
         residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]
@@ -145,13 +143,6 @@ def solve_geometry(
         adopted, basis = rounded, _moved(view, rounded).basis()
         fit = weighted_fit(FringeModel.of(basis), fit.weight)
     return Solution(value, error, adopted, basis)
-
-
-def _unlike_a_star(fit: FringeFit, image: FloatArray) -> float:
-    """How far the visibilities of an image are from 1, rms of |V − 1|."""
-    numbers = fit.solve(image.reshape(1, -1))[0, :-1]
-    real, imaginary = numbers[1:].reshape(2, -1) / numbers[0]
-    return float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
 
 
 def geometry_slopes(view: View, coefficients: FloatArray) -> FloatArray:

@@ -36,9 +36,6 @@ LARGEST = 0.05
 FAR = 0.01
 """Larger changes of the mask's image than an optical train's: pixels or filter are others."""
 
-COMPANION = 0.02
-"""A companion's light looks like another map, by up to this times the rms of |V − 1|."""
-
 
 @dataclass(frozen=True, eq=False)
 class MapEstimate:
@@ -115,10 +112,8 @@ def estimate_map(view: View, image: FloatArray, fit: FringeFit) -> MapEstimate |
         fit = weighted_fit(FringeModel.of(view.basis()), fit.weight)
         if np.abs(step[:4]).max() < CONVERGED:
             break
-    numbers = coefficients[0, :-1]
-    real, imaginary = numbers[1:].reshape(2, -1) / numbers[0]
-    unlike = float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
-    known = covariance[:4, :4] + (COMPANION * unlike) ** 2 * np.eye(4)
+    unlike = view.unlike_a_star(coefficients[0, :-1])
+    known = covariance[:4, :4] + unlike**2 * np.eye(4)
     return MapEstimate(matrix.ravel(), known)
 
 

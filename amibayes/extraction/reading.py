@@ -24,8 +24,9 @@ from amibayes.extraction.extract import extract_all
 from amibayes.extraction.mask_map import MaskMap
 from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.response import pipeline_response, seen_at_pointing
+from amibayes.extraction.view import plain_view
 from amibayes.extraction.visits import visit_maps
-from amibayes.instrument import load_instrument
+from amibayes.instrument import Instrument, load_instrument
 from amibayes.kpfits import is_kpfits, kernel_observables
 from amibayes.oifits import observables_of, open_oifits
 from amibayes.oifits.audit import errors_in
@@ -166,8 +167,14 @@ def _with_response(found: Observables) -> Observables:
     setups = tuple(replace(s, response=_pipeline_response(s)) for s in found.setups)
     if all(s.response is None for s in setups):
         return found
-    note = "light off the axis taken as let through by the pipeline's fit of the fringes"
-    return _centred(replace(found, setups=setups, notes=(*found.notes, note)))
+    notes = ["light off the axis taken as let through by the pipeline's fit of the fringes"]
+    known = [plain_view(*_instrument_of(s)) for s in setups if s.response is not None]
+    if any(view.unsampled.any() for view in known):
+        notes.append(
+            "the pixels are too large for the longest fringes, and the product does not tell where "
+            "in a pixel the star is: separations may be off by 4 % (search the images instead)"
+        )
+    return _centred(replace(found, setups=setups, notes=(*found.notes, *notes)))
 
 
 def _centred(found: Observables) -> Observables:
@@ -187,22 +194,28 @@ def _centred(found: Observables) -> Observables:
 
 
 def _pipeline_response(setup: Setup) -> OffAxisResponse | None:
-    header = contents_of(setup.source.split(SEPARATOR)[0]).header
     if setup.station_xyz_m is None:
         return None
     try:
-        drawn = load_instrument(str(header.get("INSTRUME")), str(header.get("FILTER")))
-        instrument = drawn.as_built()  # as the pipeline's model of the fringes is
+        seen = _instrument_of(setup)
+        header = contents_of(setup.source.split(SEPARATOR)[0]).header
         orientation = orientation_of(header, setup.source)
     except (UsageError, DataError):
         return None
-    side = header.get("SUBSIZE1")
-    size = min(side if isinstance(side, int) else instrument.n_pixels, instrument.n_pixels)
-    found = pipeline_response(instrument, size, orientation, setup.station_xyz_m[:, :2])
+    found = pipeline_response(*seen, orientation, setup.station_xyz_m[:, :2])
     if found is None:
         return None
     pointings = [pointing_of(p) for p in open_products(setup.source.split(SEPARATOR))]
     return replace(found, pointing=np.mean(pointings, axis=0))
+
+
+def _instrument_of(setup: Setup) -> tuple[Instrument, int]:
+    """Instrument as the pipeline's model of the fringes has it, and the side of its images."""
+    header = contents_of(setup.source.split(SEPARATOR)[0]).header
+    drawn = load_instrument(str(header.get("INSTRUME")), str(header.get("FILTER")))
+    side = header.get("SUBSIZE1")
+    size = min(side if isinstance(side, int) else drawn.n_pixels, drawn.n_pixels)
+    return drawn.as_built(), size
 
 
 def _is_fitted_image(contents: Contents) -> bool:

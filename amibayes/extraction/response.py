@@ -18,7 +18,7 @@ from amibayes.data.off_axis_response import OffAxisResponse, bspline_weights
 from amibayes.extraction.fourier.fine_image import FARTHEST, FineImage, fine_image
 from amibayes.extraction.fourier.sampling import Sampling, split
 from amibayes.extraction.image_plane import FringeModel, fringe_sampling, weighted_fit
-from amibayes.extraction.view import View
+from amibayes.extraction.view import View, plain_view
 from amibayes.instrument import Instrument
 from amibayes.scene.orientation import Orientation
 from amibayes.units import ComplexArray, FloatArray, IntArray
@@ -187,8 +187,8 @@ def pipeline_response(
     found = [(s, o) for s in (1, -1) if (o := _same_holes(stations_m, s * holes, near)) is not None]
     if not found:
         return None
-    (sign, order), size = found[0], slice(0, n_pixels)
-    view = View(instrument, instrument.bandpass.channels(), size, size)
+    sign, order = found[0]
+    view = plain_view(instrument, n_pixels)
     basis = view.basis()
     fit = weighted_fit(FringeModel.of(basis), np.ones(n_pixels**2))
     sampling = fringe_sampling(view, basis, fit)

@@ -22,6 +22,10 @@ LARGEST = 1.25
 NYQUIST = 0.5
 """Cycles per pixel beyond which fringes look like others."""
 
+COMPANION, COMPANION_UNSAMPLED = 0.02, 0.1
+"""A companion's light looks like another scale, or map of the mask, by up to this times the rms of
+|V − 1|; the latter where pixels do not sample the fringes (up to 0.07 at 390 mas in F277W)."""
+
 CONVERGED_PX = 5e-3
 """Centres are no better known than this: integrations point by more to either side."""
 
@@ -87,6 +91,18 @@ class View:
         """(n_baselines,) whose fringes the pixels do not sample."""
         return np.asarray(np.abs(self.frequency_px).max(axis=1) > NYQUIST)
 
+    def unlike_a_star(self, coefficients: FloatArray) -> float:
+        """How large an error of the geometry a companion may cause.
+
+        Parameters
+        ----------
+        coefficients : (1 + 2·n_baselines,) array
+            Of the fringe model.
+        """
+        real, imaginary = coefficients[1:].reshape(2, -1) / coefficients[0]
+        share = COMPANION_UNSAMPLED if self.unsampled.any() else COMPANION
+        return share * float(np.sqrt(np.mean((real - 1.0) ** 2 + imaginary**2)))
+
     def moved(self, by_px: FloatArray) -> View:
         """The same with the star elsewhere, by (x, y)."""
         x, y = (float(c) for c in self.centre_px + by_px)
@@ -112,6 +128,12 @@ class View:
         x = np.arange(nx) - 0.5 * (nx - 1) - self.centre_px[0]
         y = np.arange(ny) - 0.5 * (ny - 1) - self.centre_px[1]
         return np.asarray(x), np.asarray(y)
+
+
+def plain_view(instrument: Instrument, n_pixels: int) -> View:
+    """Make that of a square image with the star in its middle."""
+    side = slice(0, n_pixels)
+    return View(instrument, instrument.bandpass.channels(), side, side)
 
 
 def instrument_of(cube: Cube) -> Instrument:

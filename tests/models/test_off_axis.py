@@ -138,14 +138,44 @@ def test_exposures_have_centres_of_their_own(rng: np.random.Generator) -> None:
     assert np.abs(alone[0] - alone[1]).max() > 1e-3
 
 
-def test_file_keeps_the_response(tmp_path, rng: np.random.Generator) -> None:
+def of_no_symmetry(rng: np.random.Generator) -> Observables:
+    """A response of which nothing is alike at opposite places."""
     data = with_lattice(rng)
+    lattice = data.setups[0].response
+    assert lattice is not None
+    more = 0.1 * rng.normal(size=(7, 7, 25, 25)) * (1.0 + 1.0j)
+    more[np.arange(7), np.arange(7)] = more[np.arange(7), np.arange(7)].real
+    lower = np.tril_indices(7, -1)
+    more[lower] = more.conj()[lower[::-1]]
+    changed = replace(lattice, coefficients=lattice.coefficients + more)
+    return replace(data, setups=(replace(data.setups[0], response=changed),))
+
+
+def test_templates_take_what_opposite_places_share(rng: np.random.Generator) -> None:
+    """The mean of a response and of the conjugate of that at the opposite place."""
+    samples = Likelihood(of_no_symmetry(rng)).samples
+    assert samples.off_axis is not None
+    east, north = rng.uniform(-300.0, 300.0, (2, 40))
+    (fringe, flux), (other, dark) = (samples.off_axis.at((s * east, s * north)) for s in (1, -1))
+    found, light = samples.off_axis.symmetrised.at((east, north))
+    np.testing.assert_allclose(found, 0.5 * (fringe + other.conj()), atol=1e-12)
+    np.testing.assert_allclose(light, 0.5 * (flux + dark), atol=1e-12)
+    assert np.abs(fringe - found).max() > 0.05
+    alike = Likelihood(with_lattice(rng)).samples.off_axis
+    assert alike is not None
+    assert alike.symmetrised.exposures == alike.exposures
+
+
+@pytest.mark.parametrize("made", [with_lattice, of_no_symmetry])
+def test_file_keeps_the_response(made, tmp_path, rng: np.random.Generator) -> None:
+    data = made(rng)
     write_oifits(tmp_path / "x.oifits", data)
     after = read_oifits(tmp_path / "x.oifits").setups[0].response
     before = data.setups[0].response
     assert after is not None
     assert before is not None
-    # Opposite places are conjugate, to rounding; half of them are written.
+    assert after.symmetric == before.symmetric == (made is with_lattice)
+    # Where opposite places are conjugate, to rounding, half of them are written.
     np.testing.assert_allclose(after.coefficients, before.coefficients, rtol=1e-6)
     np.testing.assert_allclose(after.to_node, before.to_node, rtol=1e-12)
     np.testing.assert_allclose(after.pointing, before.pointing, rtol=1e-12)
