@@ -242,7 +242,7 @@ def population_response(
 def _covariance(transfer: Transfer) -> FloatArray:
     covariance = transfer.covariance
     if transfer.shared is not None:  # one constant of the detector for all: part of the errors
-        covariance = transfer.shared.added(covariance)
+        covariance = transfer.shared.added(covariance, 1.0)
     return np.asarray(covariance.toarray())
 
 

@@ -60,7 +60,7 @@ class SharedErrors:
         changes = np.hstack([self.changes, other.changes])
         return SharedErrors((*self.names, *other.names), changes)
 
-    def added(self, matrix: csr_array, sign: float = 1.0) -> csr_array:
+    def added(self, matrix: csr_array, sign: float) -> csr_array:
         """A sparse covariance with these put in, or taken out."""
         return csr_array(matrix + csr_array(sign * self.changes @ self.changes.T))
 
@@ -94,14 +94,12 @@ def vis2_first(counts: Sequence[tuple[int, int]]) -> IntArray:
     return np.concatenate(vis2 + closure).astype(np.intp)
 
 
-def with_shared(
-    covariance: BlockCovariance, shared: SharedErrors | None, sign: float = 1.0
-) -> BlockCovariance:
+def with_shared(covariance: BlockCovariance, shared: SharedErrors, sign: float) -> BlockCovariance:
     """Covariance with shared errors put in, or taken out (``sign`` −1).
 
     Groups of data that have an error in common become one.
     """
-    if shared is None or not np.any(shared.changes):
+    if not np.any(shared.changes):
         return covariance
     g = shared.changes
     blocks = covariance.blocks

@@ -296,7 +296,7 @@ def _j2_over_square(x: FloatArray) -> FloatArray:
     small = x < 0.03
     safe = np.where(small, 1.0, x)
     closed = (2.0 * j1(safe) / safe - j0(safe)) / safe**2
-    return np.where(small, 0.125 - x * x / 96.0 + x**4 / 3072.0, closed)
+    return np.where(small, 0.125 - x * x / 96.0, closed)
 
 
 PROFILES = {"gaussian": _gaussian, "uniform": _uniform, "ring": _ring}

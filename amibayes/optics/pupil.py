@@ -85,7 +85,7 @@ class PupilMap(Shown):
         """
         edges = self.edges_m
         centres = 0.5 * (edges[1:] + edges[:-1])
-        half = np.abs(mask.corners_m).max(axis=0)
+        half = mask.corners_m.max(axis=0)  # opposite corners are alike
         for hole in mask.holes_m:
             low = np.searchsorted(edges, hole - half, side="right") - 1
             high = np.searchsorted(edges, hole + half, side="left")

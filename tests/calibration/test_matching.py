@@ -179,6 +179,13 @@ def test_only_unflagged_numbers_of_the_epoch_serve() -> None:
     np.testing.assert_array_equal(found.key[np.argsort(found.entry)], keys_of(one).key[kept])
 
 
+def test_one_number_is_enough_to_serve() -> None:
+    one = star()
+    last = np.arange(len(one.vis2)) < len(one.vis2) - 1
+    single = one.flagged(last, np.ones(len(one.closure_phase), dtype=bool))
+    assert sharing([one, single]).all()
+
+
 def test_names_of_instruments() -> None:
     """Setups of the target's instrument serve, and where there are none all of them."""
     one, other = star(1, "A"), star(1, "B")

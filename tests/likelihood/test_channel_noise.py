@@ -18,6 +18,7 @@ from amibayes.data.systematics import Systematics
 from amibayes.detection.statistic import make_statistic
 from amibayes.likelihood.channel_noise import (
     ChannelShare,
+    Correlation,
     correlation_of,
     noise_with_channels,
 )
@@ -80,6 +81,27 @@ def test_covariance_is_the_stated_matrix(covariance, rng) -> None:
     assert found.logdet() == pytest.approx(np.log(values[values > 1e-10]).sum(), abs=1e-6)
     at = np.array([0, 3, n2 + 1])
     np.testing.assert_allclose(found.select(at).dense(), expected[np.ix_(at, at)], atol=1e-12)
+
+
+@pytest.mark.parametrize("common", [1e-9, 0.4])
+def test_amount_of_noise_is_by_the_likelihood_of_the_matrix(common: float, rng) -> None:
+    """−2 ln L of the covariance written out; with next to no common noise, of channels alone."""
+    data = pionier(2, "diagonal").only(["vis2"])
+    residual, share_left = rng.normal(0.0, 0.05, len(data.data)), 0.9
+    one = _Kind(data, residual, np.empty((len(residual), 0)), share_left, "vis2", ())
+    shared = Correlation(common=common)
+    found = []
+    for amount in (0.01, 0.03, 0.08):
+        matrix = one.covariance(amount, shared).dense()
+        chi2 = residual @ np.linalg.solve(matrix, residual)
+        expected = chi2 + share_left * np.linalg.slogdet(matrix)[1]
+        found.append(
+            [f(amount) - expected for f in (one._misfit(shared), one._misfit_of_independent)]
+        )
+    shared_off, alone_off = np.array(found).T
+    np.testing.assert_allclose(shared_off, shared_off[0], atol=1e-6)
+    if common < 0.1:
+        np.testing.assert_allclose(alone_off, alone_off[0], atol=1e-4)
 
 
 @pytest.mark.parametrize("phi", [0.3, 0.8])

@@ -321,6 +321,10 @@ def test_missing_correlation_table(made: HandMade, tmp_path: Path) -> None:
     made.more.clear()
     with pytest.raises(DataError, match="no OI_CORR has that CORRNAME"):
         read_oifits(made.write(tmp_path / "a.fits"))
+    # Of one kind of data alone it is missed as well.
+    del made.tables["OI_T3"]["CORRINDX_T3PHI"]
+    with pytest.raises(DataError, match="no OI_CORR has that CORRNAME"):
+        read_oifits(made.write(tmp_path / "a.fits"))
 
 
 @pytest.mark.parametrize("order", ["channels", "baselines"])
