@@ -57,6 +57,15 @@ class SearchReport(Shown):
     left_out: tuple[OutlyingRow, ...] = ()
     timing_s: dict[str, float] = field(default_factory=dict)
 
+    def star_alone(self) -> dict[str, tuple[float, float]]:
+        """Value and error of each free parameter of the star without a companion.
+
+        Where there is none, with the noise that the star leaves: a companion takes for its light
+        what a star alone, and its diameter, has as noise.
+        """
+        said = self.verdict
+        return said.star if said is not None and said.star else self.result.star_alone()
+
     def rows(self) -> Rows:
         """What an interpreter shows."""
         stages = ("significance", "posterior", "limits", "evidence", "models")
