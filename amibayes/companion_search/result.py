@@ -339,10 +339,11 @@ def null_likelihood(result: SearchResult) -> tuple[Likelihood, SymmetricWhitenin
 
 
 def stated_parameters(likelihood: Likelihood, theta: FloatArray) -> dict[str, tuple[float, float]]:
-    """Value and error of each free parameter of a fit (n_dim,)."""
+    """Value and error of each free parameter of a fit (n_dim,); infinite where no data tell it."""
     if not len(theta):
         return {}
     errors = np.sqrt(np.diag(likelihood.errors(theta)))
+    errors[errors == 0.0] = np.inf
     both = zip(theta.tolist(), errors.tolist(), strict=True)
     return dict(zip(likelihood.parameters.names, both, strict=True))
 

@@ -279,17 +279,31 @@ def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihoo
 def _with_disc_of_star(
     likelihood: Likelihood, point: SearchResult
 ) -> tuple[Likelihood, SearchResult]:
-    """Take a disc of the star in where closure phases alone show one, beside a sure companion.
+    """Take a disc of the star in where closure phases alone need one, beside a sure companion.
 
     They tell nothing of a star alone, but how far it is resolved decides how much a companion
-    turns them: that of two bright, resolved stars would be rejected.
+    turns them: that of two bright, resolved stars would be rejected, and the contrast beside a
+    point is too large. A disc that they do not show is free too where it decides the contrast.
     """
     if likelihood.observables.n_vis2 or point.delta_chi2 < SURELY_NOT_NOISE:
         return likelihood, point
     disc = likelihood.with_model(replace(likelihood.model, diameter_mas="free"))
     found = search(disc, (point.grid.inner_mas, point.grid.outer_mas), check=False)
     sure = _surely_better(likelihood.n_independent, point.chi2_binary, found.chi2_binary)
-    return (disc, found) if sure else (likelihood, point)
+    return (disc, found) if sure or _disc_decides(likelihood, point) else (likelihood, point)
+
+
+def _disc_decides(likelihood: Likelihood, point: SearchResult) -> bool:
+    """Whether the contrast beside a disc differs from that beside a point by its error."""
+    model = replace(likelihood.model, diameter_mas=USUAL_DISC_MAS)
+    box = Box(point.grid.inner_mas, point.grid.outer_mas, resolution_mas(likelihood))
+    fit = refine(likelihood.with_model(model), np.array(point.theta), box, 0.0)
+    change = abs(fit.companion.contrast - point.companion.contrast)
+    return bool(change > point.companion.contrast_error)
+
+
+USUAL_DISC_MAS = 1.0
+"""Half of all stars are larger by the prior, half-Cauchy with 1 mas."""
 
 
 def _surely_better(n: int, point: float, disc: float) -> bool:
