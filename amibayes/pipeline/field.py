@@ -149,7 +149,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
 def _with_its_disc(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> SearchResult:
-    """The search with a free disc of the companion, where V² show one and none was asked for."""
+    """The search with a free disc of the companion, where data show one and none was asked for."""
     if options.companion_diameter is not None:
         return first
     if shows_disc(likelihood, first):
@@ -316,13 +316,12 @@ LIKELY_DISC_MAS = 4.0
 
 
 def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
-    """Whether V² shows that the companion is a disc, by a fit with the stated errors.
+    """Whether the data show that the companion is a disc, by a fit with the stated errors.
 
     With their scale free as well, so that errors that are too small make no disc.
     """
-    data = likelihood.observables
     sure = result.delta_chi2 > SURELY_NOT_NOISE and result.companion.contrast > DISC_CONTRAST
-    if not data.n_vis2 or not sure or likelihood.model.companion_diameter_mas != 0.0:
+    if not sure or likelihood.model.companion_diameter_mas != 0.0:
         return False
     disc = likelihood.with_model(replace(likelihood.model, companion_diameter_mas="free"))
     grid = result.grid

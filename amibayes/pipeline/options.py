@@ -62,7 +62,7 @@ class SearchOptions:
         Exponent α of the brightness μ^α of the primary's disc. None: 0, and free where V²
         reaches past the first null of a free disc.
     companion_diameter : float, "free" or None
-        Uniform-disc diameter of companions, mas. None: 0, or free where V² shows the disc of
+        Uniform-disc diameter of companions, mas. None: 0, or free where data show the disc of
         the companion that is found.
     contrast_slope : float or "free"
         Exponent of the flux ratio with wavelength.

@@ -152,6 +152,24 @@ def test_closure_phases_alone_leave_the_contrast_to_the_disc_of_the_star(
         assert point.contrast - 0.15 > 4.0 * point.contrast_error
 
 
+def test_closure_phases_alone_show_the_disc_of_a_companion(rng) -> None:
+    """λ/B is 3.1 mas: a companion of 1.8 mas counted as a fainter point.
+
+    They tell how much larger it is than the star, and hardly what either is.
+    """
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (9.0 * u + 5.0 * v))
+        star, second = (darkened_disc(d, 0.0, u, v) for d in (0.6, 1.8))
+        return (star + 0.3 * fringe * second) / 1.3
+
+    data = observed(four_telescopes(6, closure_error_deg=0.5), binary, rng).only(["cp"])
+    result = search_field(data, SearchOptions()).result
+    discs = [result.nuisance(name) for name in ("companion_diameter_mas", "diameter_mas")]
+    assert discs[0] ** 2 - discs[1] ** 2 == pytest.approx(1.8**2 - 0.6**2, rel=0.15)
+    assert abs(result.companion.contrast - 0.3) < 4.0 * result.companion.contrast_error < 0.1
+
+
 def test_a_mask_has_no_disc_of_the_star_in_its_closure_phases(rng) -> None:
     """λ/B is 0.15 arcsec: a star of a likely size is a point to it."""
     data = simulated(niriss(), [0.0, 150.0, 0.02], rng).only(["cp"])

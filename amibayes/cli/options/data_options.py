@@ -195,8 +195,8 @@ def add_model(group: argparse._ActionsContainer) -> None:
         "--companion-diameter",
         type=common.number_or_free,
         metavar="MAS|free",
-        help="uniform-disc diameter of companions (default: 0; free where V2 shows the disc of the "
-        "companion that is found)",
+        help="uniform-disc diameter of companions (default: 0; free where data show the disc "
+        "of the companion that is found)",
     )
     group.add_argument(
         "--contrast-slope",
