@@ -24,7 +24,7 @@ from amibayes.companion_search.field import (
 from amibayes.companion_search.optimise import SHAPE_START, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
-from amibayes.companion_search.search import search, with_global_check
+from amibayes.companion_search.search import farthest_searched, search, with_global_check
 from amibayes.companion_search.seeds import MAX_COARSE_DATA
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
@@ -192,9 +192,11 @@ def _in_wider_field(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
-    fields = wider_fields(first)
+    fields, outer = wider_fields(first), first.grid.outer_mas
     if not fields:
         return first, []
+    capped = [(inner, farthest_searched(likelihood, inner, edge)) for inner, edge in fields]
+    fields = [(inner, edge) for inner, edge in dict.fromkeys(capped) if edge >= outer]
     score = _score(first, options)
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
@@ -217,6 +219,7 @@ def _past_the_edge(
     """The search in a field a little wider, with a warning, where the fit ended on the edge."""
     grid = first.grid
     edge = min(PAST_EDGE * grid.outer_mas, outermost(likelihood))
+    edge = farthest_searched(likelihood, grid.inner_mas, edge)
     wide = edge > grid.outer_mas + grid.step_mas
     if not wide or first.delta_chi2 < SURELY_NOT_NOISE or not on_outer_edge(first):
         return first, []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -175,6 +177,26 @@ def test_a_mask_has_no_disc_of_the_star_in_its_closure_phases(rng) -> None:
     data = simulated(niriss(), [0.0, 150.0, 0.02], rng).only(["cp"])
     result = search_field(data, SearchOptions()).result
     assert "diameter_mas" not in result.likelihood.parameters.names
+
+
+def test_a_field_that_is_widened_is_none_that_is_refused(rng, monkeypatch) -> None:
+    """A motion is tried at many rates: of three nights of a month the wider field was too large."""
+    monkeypatch.setattr("amibayes.companion_search.search.MAX_POSITIONS", 300_000)
+    nights = []
+    for k, day in enumerate((0.0, 10.0, 31.0)):
+        sheet = four_telescopes(2, turn_deg=20.0 + 10.0 * k)
+        tables = (replace(t, mjd=t.mjd + day) for t in (sheet.vis2, sheet.closure_phase))
+        sheet = replace(sheet, **dict(zip(("vis2", "closure_phase"), tables, strict=True)))
+        east, north = 7.0 + 0.15 * day, 6.0 + 0.1 * day
+
+        def binary(u, v, _, east=east, north=north):
+            return (1.0 + 0.1 * np.exp(-2j * np.pi * MAS * (east * u + north * v))) / 1.1
+
+        nights.append(observed(sheet, binary, rng))
+    options = SearchOptions(motion=True, fastest_mas_yr=60.0)
+    found = search_field(join(nights), options).result
+    rates = found.theta[found.likelihood.parameters.rates]
+    np.testing.assert_allclose(rates, [54.8, 36.5], atol=5.0)
 
 
 def test_baselines_without_length_are_refused_by_their_columns() -> None:
