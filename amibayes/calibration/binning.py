@@ -7,7 +7,6 @@ averages then still close, whatever the errors of the single triangles.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,13 +19,12 @@ from amibayes.data.observables import Observables
 from amibayes.data.setup import Setup
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
+from amibayes.oifits.columns import without_polarisation
 from amibayes.oifits.correlations import Pairs, given_covariance
 from amibayes.units import FloatArray, IntArray
 
 MOVED = 0.02
 """Exposures are merged while (u, v) stays within this part of the baseline."""
-
-_POLARISATION = re.compile(r"[_ -]?(?:P|POL)[12]$", re.IGNORECASE)
 
 
 def bin_channels(observables: Observables, size: int) -> Observables:
@@ -66,7 +64,7 @@ def average_polarisations(observables: Observables) -> Observables:
     UsageError
         Where there are no two such setups.
     """
-    names = [_POLARISATION.sub("", s.insname) for s in observables.setups]
+    names = [without_polarisation(s.insname) for s in observables.setups]
     first: dict[tuple[object, ...], int] = {}
     home = np.empty(len(names), dtype=np.intp)
     for i, (name, setup) in enumerate(zip(names, observables.setups, strict=True)):

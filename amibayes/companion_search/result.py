@@ -273,13 +273,11 @@ class SearchResult:
         return float(getattr(model, name))
 
     def star_alone(self) -> dict[str, tuple[float, float]]:
-        """Each free parameter of the fit without a companion: its value and error."""
-        alone = single_likelihood(self.likelihood)
-        if not len(self.single_theta):
-            return {}
-        errors = np.sqrt(np.diag(alone.errors(self.single_theta)))
-        both = zip(self.single_theta.tolist(), errors.tolist(), strict=True)
-        return dict(zip(alone.parameters.names, both, strict=True))
+        """Each free parameter of the fit without a companion: its value and error.
+
+        The noise is that beside the best companion; `Verdict.star` has that beside the star.
+        """
+        return stated_parameters(single_likelihood(self.likelihood), self.single_theta)
 
     def to_table(self) -> QTable:
         """Every distinct solution, best first, as an astropy table with units."""
@@ -338,6 +336,16 @@ def null_likelihood(result: SearchResult) -> tuple[Likelihood, SymmetricWhitenin
     noise = result.likelihood.noise.without_companion()
     symmetric = noise.symmetric if isinstance(noise, StudentNoise) else None
     return result.likelihood.with_noise(noise), symmetric
+
+
+def stated_parameters(likelihood: Likelihood, theta: FloatArray) -> dict[str, tuple[float, float]]:
+    """Value and error of each free parameter of a fit (n_dim,); infinite where no data tell it."""
+    if not len(theta):
+        return {}
+    errors = np.sqrt(np.diag(likelihood.errors(theta)))
+    errors[errors == 0.0] = np.inf
+    both = zip(theta.tolist(), errors.tolist(), strict=True)
+    return dict(zip(likelihood.parameters.names, both, strict=True))
 
 
 def mode_of(parameters: Parameters, theta: FloatArray, delta_chi2: float) -> Mode:

@@ -238,13 +238,36 @@ def _refuse_underdetermined(likelihood: Likelihood) -> None:
         )
 
 
-def _grid(likelihood: Likelihood, box: Box) -> Grid:
-    """Positions of the field, as many per fringe as can be afforded."""
+def farthest_searched(likelihood: Likelihood, inner: float, outer: float) -> float:
+    """Outer edge, mas, up to ``outer``, of a field that is not refused as too large.
+
+    Each rate of a motion is a position more: a field that channels allow may be too large then.
+    """
+    while inner < outer < np.inf:
+        step = _step(likelihood, Box(inner, outer, resolution_mas(likelihood)))
+        if _positions(inner, outer, step / rates_per_axis(likelihood)) <= MAX_POSITIONS:
+            break
+        outer *= 0.9
+    return outer
+
+
+def _step(likelihood: Likelihood, box: Box) -> float:
+    """Distance of positions, mas: as many per fringe as can be afforded."""
     with np.errstate(all="ignore"):  # a damaged baseline may be of any length
-        edges = np.array([box.inner_mas, box.outer_mas]) / box.fringe_mas
-        patches = np.pi * (edges[1] ** 2 - edges[0] ** 2)
+        patches = _positions(box.inner_mas, box.outer_mas, box.fringe_mas)
         steps = np.sqrt(AFFORDABLE_WORK / likelihood.n_independent / patches)
-    step = box.fringe_mas / float(np.clip(np.nan_to_num(steps), MIN_STEPS, MAX_STEPS))
+    return box.fringe_mas / float(np.clip(np.nan_to_num(steps), MIN_STEPS, MAX_STEPS))
+
+
+def _positions(inner: float, outer: float, step: float) -> float:
+    """Number of positions of a field."""
+    with np.errstate(all="ignore"):  # a damaged baseline may be of any length
+        return np.pi * float(np.diff((np.array([inner, outer]) / step) ** 2)[0])
+
+
+def _grid(likelihood: Likelihood, box: Box) -> Grid:
+    """Positions of the field."""
+    step = _step(likelihood, box)
     finest = step / rates_per_axis(likelihood)
     _refuse_huge(box.inner_mas, box.outer_mas, finest, likelihood.observables.source)
     grid = make_grid(box.inner_mas, box.outer_mas, step)
@@ -272,8 +295,7 @@ def _refuse_huge(inner: float, outer: float, step: float, source: str) -> None:
             source=source,
             remedy="check UCOORD and VCOORD",
         )
-    with np.errstate(all="ignore"):  # a damaged baseline may be of any length
-        positions = np.pi * float(np.diff((np.array([inner, outer]) / step) ** 2)[0])
+    positions = _positions(inner, outer, step)
     if not positions <= MAX_POSITIONS:
         raise UsageError(
             f"{positions:.2g} positions between {inner:.4g} and {outer:.4g} mas",

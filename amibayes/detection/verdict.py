@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -34,7 +34,6 @@ REFUSED: tuple[Statement, ...] = ("model rejected", "inconsistent data")
 
 NAMES = {"vis2": "V²", "cp": "closure phases"}
 
-
 WITHIN = (
     "; what the fit leaves holds structure, smaller than the calibration errors known of the "
     "instrument"
@@ -61,12 +60,15 @@ class Verdict:
         structure within the errors of the calibration does not count.
     note : str
         Of a companion: what else may look like it, see `note_of`; also part of the reason.
+    star : dict
+        Without a companion: the star's parameters and errors, with the noise beside it.
     """
 
     statement: Statement
     because: str
     p_model: float
     note: str = ""
+    star: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def verdict(
@@ -215,7 +217,6 @@ def without_companion(
 SHAPE = 0.1
 """Relative error of a χ² by extra noise, which is fitted with one size for all data of a kind: real
 noise differs between baselines and channels. It matters from some hundred data on."""
-
 
 SHAPE_NODES, MOST_CORRELATED = 13, 0.99
 """Nodes of the means over what noise may be, and the largest correlation of channels."""

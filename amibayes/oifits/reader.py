@@ -11,7 +11,7 @@ from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
 from amibayes.data.setup import Setup
 from amibayes.errors import DataError
-from amibayes.oifits.columns import integers, listing, same
+from amibayes.oifits.columns import integers, listing, same, without_polarisation
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import Rows, channel_count, read_rows
@@ -92,7 +92,11 @@ def _data_tables(oifits: OIFits, insname: str | None) -> list[OITable]:
             source=oifits.path,
             remedy="give a file with OI_VIS2 or OI_T3",
         )
-    kept = [t for t in tables if insname is None or same(t.keyword("INSNAME"), insname)]
+    if insname is None:
+        return tables
+    kept = [t for t in tables if same(t.keyword("INSNAME"), insname)]
+    if not kept:  # the name of a combiner is that of both of its polarisations
+        kept = [t for t in tables if same(without_polarisation(t.keyword("INSNAME")), insname)]
     if not kept:
         there = listing([t.keyword("INSNAME") for t in tables])
         raise DataError(f"has no INSNAME {insname!r}", source=oifits.path, remedy=f"it has {there}")

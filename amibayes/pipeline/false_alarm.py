@@ -9,7 +9,7 @@ import numpy as np
 
 from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.field import on_outer_edge
-from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.result import SearchResult, stated_parameters
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import alternative
 from amibayes.detection.consistency import MAX_PARTS, by_night, consistency
@@ -204,6 +204,8 @@ def verdict_of(
         said = at_the_edge(said, result)
     if said.statement == "no companion" and (seen := _seen_in_one_part(found, options, rng)):
         said = Verdict("inconsistent data", seen, said.p_model)
+    if said.statement == "no companion" and options.extra_noise and alone is not None:
+        said = replace(said, star=stated_parameters(*alone))
     return said, splits
 
 

@@ -24,7 +24,7 @@ from amibayes.companion_search.field import (
 from amibayes.companion_search.optimise import SHAPE_START, refine, with_disc
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.robust import search_robust
-from amibayes.companion_search.search import search, with_global_check
+from amibayes.companion_search.search import farthest_searched, search, with_global_check
 from amibayes.companion_search.seeds import MAX_COARSE_DATA
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
@@ -149,7 +149,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
 def _with_its_disc(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> SearchResult:
-    """The search with a free disc of the companion, where V² show one and none was asked for."""
+    """The search with a free disc of the companion, where data show one and none was asked for."""
     if options.companion_diameter is not None:
         return first
     if shows_disc(likelihood, first):
@@ -192,9 +192,11 @@ def _in_wider_field(
     likelihood: Likelihood, first: SearchResult, options: SearchOptions
 ) -> tuple[SearchResult, list[str]]:
     """The search in a wider field, with a warning, where a companion there explains the data."""
-    fields = wider_fields(first)
+    fields, outer = wider_fields(first), first.grid.outer_mas
     if not fields:
         return first, []
+    capped = [(inner, farthest_searched(likelihood, inner, edge)) for inner, edge in fields]
+    fields = [(inner, edge) for inner, edge in dict.fromkeys(capped) if edge >= outer]
     score = _score(first, options)
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
@@ -217,6 +219,7 @@ def _past_the_edge(
     """The search in a field a little wider, with a warning, where the fit ended on the edge."""
     grid = first.grid
     edge = min(PAST_EDGE * grid.outer_mas, outermost(likelihood))
+    edge = farthest_searched(likelihood, grid.inner_mas, edge)
     wide = edge > grid.outer_mas + grid.step_mas
     if not wide or first.delta_chi2 < SURELY_NOT_NOISE or not on_outer_edge(first):
         return first, []
@@ -279,17 +282,31 @@ def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihoo
 def _with_disc_of_star(
     likelihood: Likelihood, point: SearchResult
 ) -> tuple[Likelihood, SearchResult]:
-    """Take a disc of the star in where closure phases alone show one, beside a sure companion.
+    """Take a disc of the star in where closure phases alone need one, beside a sure companion.
 
     They tell nothing of a star alone, but how far it is resolved decides how much a companion
-    turns them: that of two bright, resolved stars would be rejected.
+    turns them: that of two bright, resolved stars would be rejected, and the contrast beside a
+    point is too large. A disc that they do not show is free too where it decides the contrast.
     """
     if likelihood.observables.n_vis2 or point.delta_chi2 < SURELY_NOT_NOISE:
         return likelihood, point
     disc = likelihood.with_model(replace(likelihood.model, diameter_mas="free"))
     found = search(disc, (point.grid.inner_mas, point.grid.outer_mas), check=False)
     sure = _surely_better(likelihood.n_independent, point.chi2_binary, found.chi2_binary)
-    return (disc, found) if sure else (likelihood, point)
+    return (disc, found) if sure or _disc_decides(likelihood, point) else (likelihood, point)
+
+
+def _disc_decides(likelihood: Likelihood, point: SearchResult) -> bool:
+    """Whether the contrast beside a disc differs from that beside a point by its error."""
+    model = replace(likelihood.model, diameter_mas=USUAL_DISC_MAS)
+    box = Box(point.grid.inner_mas, point.grid.outer_mas, resolution_mas(likelihood))
+    fit = refine(likelihood.with_model(model), np.array(point.theta), box, 0.0)
+    change = abs(fit.companion.contrast - point.companion.contrast)
+    return bool(change > point.companion.contrast_error)
+
+
+USUAL_DISC_MAS = 1.0
+"""Half of all stars are larger by the prior, half-Cauchy with 1 mas."""
 
 
 def _surely_better(n: int, point: float, disc: float) -> bool:
@@ -302,13 +319,12 @@ LIKELY_DISC_MAS = 4.0
 
 
 def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
-    """Whether V² shows that the companion is a disc, by a fit with the stated errors.
+    """Whether the data show that the companion is a disc, by a fit with the stated errors.
 
     With their scale free as well, so that errors that are too small make no disc.
     """
-    data = likelihood.observables
     sure = result.delta_chi2 > SURELY_NOT_NOISE and result.companion.contrast > DISC_CONTRAST
-    if not data.n_vis2 or not sure or likelihood.model.companion_diameter_mas != 0.0:
+    if not sure or likelihood.model.companion_diameter_mas != 0.0:
         return False
     disc = likelihood.with_model(replace(likelihood.model, companion_diameter_mas="free"))
     grid = result.grid

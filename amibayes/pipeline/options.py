@@ -56,12 +56,13 @@ class SearchOptions:
         By default λ/2B_max to λ/B_min of the data.
     observables : tuple of {"vis2", "cp"}
     diameter : float, "free" or None
-        Diameter of the primary, mas. None: free where V² is used, else 0.
+        Diameter of the primary, mas. None: free where V² is used, or where the contrast that
+        closure phases alone give depends on it, else 0.
     limb_darkening : float, "free" or None
         Exponent α of the brightness μ^α of the primary's disc. None: 0, and free where V²
         reaches past the first null of a free disc.
     companion_diameter : float, "free" or None
-        Uniform-disc diameter of companions, mas. None: 0, or free where V² shows the disc of
+        Uniform-disc diameter of companions, mas. None: 0, or free where data show the disc of
         the companion that is found.
     contrast_slope : float or "free"
         Exponent of the flux ratio with wavelength.

@@ -12,6 +12,7 @@ from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
@@ -49,7 +50,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
     result = report.result
     return {
         "amibayes": __version__,
-        "verdict": None if report.verdict is None else asdict(report.verdict),
+        "verdict": _verdict(report.verdict),
         "consistency": [
             asdict(split) | {"parts": list(split.parts)} for split in report.consistency
         ],
@@ -58,7 +59,7 @@ def result_json(report: SearchReport, request: str = "") -> Json:
         "options": report.options.to_json(),
         "inputs": inputs_json(report.targets, report.calibrators),
         "data": data_json(report.result, report.left_out),
-        "fit": _fit(result),
+        "fit": _fit(report),
         "significance": _significance(result, report.significance, report.options.alpha),
         "modes": _modes(report),
         "posterior": None if report.posterior is None else _posterior(report, report.posterior),
@@ -90,7 +91,13 @@ def _robust(result: SearchResult) -> Json | None:
     }
 
 
-def _fit(result: SearchResult) -> Json:
+def _verdict(found: Verdict | None) -> Json | None:
+    names = ("statement", "because", "p_model", "note")
+    return None if found is None else {name: getattr(found, name) for name in names}
+
+
+def _fit(report: SearchReport) -> Json:
+    result = report.result
     c = result.companion
     return {
         **{name: number(getattr(c, name)) for name in QUANTITIES},
@@ -108,7 +115,7 @@ def _fit(result: SearchResult) -> Json:
         **joint_fit_json(result),
         "star_alone": {
             name: {"value": value, "error": number(error)}
-            for name, (value, error) in result.star_alone().items()
+            for name, (value, error) in report.star_alone().items()
         },
         "errors": _errors(c, result),
     }

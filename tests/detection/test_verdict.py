@@ -360,3 +360,24 @@ def test_a_misfit_that_no_noise_was_fitted_to_rejects_no_star(p: float, extra_no
     tested = Significance(9.0, np.arange(20.0), 0.5, (0.4, 0.6), None, options.alpha)
     said = verdict_of(found, tested, options, rng)[0]
     assert said.statement == ("no companion" if extra_noise else "model rejected"), said
+
+
+def test_the_star_that_is_alone_has_the_noise_that_it_leaves(rng: np.random.Generator) -> None:
+    """A halo of 10 % around a star of 0.8 mas is noise to a star alone, and light to a companion.
+
+    With the noise beside the best companion, which has the halo, the star's disc has to make it.
+    """
+
+    def visibility(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return disc(0.8)(u, v) / 1.1
+
+    data = observed(four_telescopes(10, 6, vis2_error=0.015), visibility, rng)
+    options = replace(OPTIONS, separation_mas=None, alpha=0.0013, null_draws=3000)
+    found = search_field(data, options)
+    tested = false_alarm(found.result, options, rng)
+    said = verdict_of(found, tested, options, rng)[0]
+    assert said.statement == "no companion"
+    taken, error = found.result.star_alone()["diameter_mas"]
+    assert taken - 0.8 > 10.0 * error
+    value, error = said.star["diameter_mas"]
+    assert abs(value - 0.8) < 4.0 * error

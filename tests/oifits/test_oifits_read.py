@@ -235,6 +235,24 @@ def test_several_instruments(made: HandMade, rng: np.random.Generator, tmp_path:
         read_oifits(path, insname="K")
 
 
+def test_the_name_of_a_combiner_is_that_of_both_its_polarisations(
+    made: HandMade, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    values = []
+    for name in ("SC_P1", "SC_P2"):
+        other = HandMade(rng)
+        values.append(other.vis2.ravel())
+        made.more += [
+            table("OI_WAVELENGTH", other.tables["OI_WAVELENGTH"], INSNAME=name),
+            table("OI_VIS2", other.tables["OI_VIS2"], INSNAME=name, ARRNAME="X"),
+        ]
+    path = made.write(tmp_path / "a.fits")
+    both = read_oifits(path, insname="sc")
+    np.testing.assert_array_equal(both.vis2.value, np.concatenate(values))
+    one = read_oifits(path, insname="SC_P2")
+    np.testing.assert_array_equal(one.vis2.value, values[1])
+
+
 def test_tables_that_are_not_used_are_kept_and_named(made: HandMade, tmp_path: Path) -> None:
     flux = table("OI_FLUX", {"FLUX": ("3D", made.vis2, "Jy")}, EXTVER=4)
     made.more += [flux, fits.ImageHDU(np.arange(6.0).reshape(2, 3), name="EXTRA")]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
@@ -128,26 +130,73 @@ def test_a_bright_disc_outside_the_default_field_is_found(rng) -> None:
     assert companion.contrast == pytest.approx(0.5, abs=0.03)
 
 
-@pytest.mark.parametrize(("diameter", "resolved"), [(2.2, True), (0.3, False)])
-def test_closure_phases_alone_show_the_disc_of_a_star_beside_a_companion(
-    diameter, resolved, rng
+@pytest.mark.parametrize(("diameter", "other"), [(2.2, 0.5), (1.0, 0.0), (0.3, 0.0)])
+def test_closure_phases_alone_leave_the_contrast_to_the_disc_of_the_star(
+    diameter, other, rng
 ) -> None:
-    """λ/B is 3.1 mas: as points, two stars of 2.2 and 0.5 mas have another flux ratio."""
+    """λ/B is 3.1 mas: beside a point the flux ratio is another one."""
 
     def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
         fringe = np.exp(-2j * np.pi * MAS * (9.0 * u + 5.0 * v))
-        star, other = (darkened_disc(d, 0.0, u, v) for d in (diameter, 0.5))
-        return (star + 0.15 * fringe * other) / 1.15
+        star, second = (darkened_disc(d, 0.0, u, v) for d in (diameter, other))
+        return (star + 0.15 * fringe * second) / 1.15
 
-    data = observed(four_telescopes(6), binary, rng).only(["cp"])
+    data = observed(four_telescopes(6, closure_error_deg=0.5), binary, rng).only(["cp"])
     result = search_field(data, SearchOptions()).result
-    assert ("diameter_mas" in result.likelihood.parameters.names) is resolved
     companion = result.companion
-    assert abs(companion.contrast - 0.15) < 5.0 * companion.contrast_error
-    if resolved:
+    assert abs(companion.contrast - 0.15) < 4.0 * companion.contrast_error
+    if diameter > 2.0:
         at = result.likelihood.parameters.names.index("diameter_mas")
         error = np.sqrt(result.theta_covariance[at, at])
         assert abs(result.theta[at] - diameter) < 5.0 * error < 1.0
+    elif diameter > 0.9:
+        point = search_field(data, SearchOptions(diameter=0.0)).result.companion
+        assert point.contrast - 0.15 > 4.0 * point.contrast_error
+
+
+def test_closure_phases_alone_show_the_disc_of_a_companion(rng) -> None:
+    """λ/B is 3.1 mas: a companion of 1.8 mas counted as a fainter point.
+
+    They tell how much larger it is than the star, and hardly what either is.
+    """
+
+    def binary(u: np.ndarray, v: np.ndarray, _: np.ndarray) -> np.ndarray:
+        fringe = np.exp(-2j * np.pi * MAS * (9.0 * u + 5.0 * v))
+        star, second = (darkened_disc(d, 0.0, u, v) for d in (0.6, 1.8))
+        return (star + 0.3 * fringe * second) / 1.3
+
+    data = observed(four_telescopes(6, closure_error_deg=0.5), binary, rng).only(["cp"])
+    result = search_field(data, SearchOptions()).result
+    discs = [result.nuisance(name) for name in ("companion_diameter_mas", "diameter_mas")]
+    assert discs[0] ** 2 - discs[1] ** 2 == pytest.approx(1.8**2 - 0.6**2, rel=0.15)
+    assert abs(result.companion.contrast - 0.3) < 4.0 * result.companion.contrast_error < 0.1
+
+
+def test_a_mask_has_no_disc_of_the_star_in_its_closure_phases(rng) -> None:
+    """λ/B is 0.15 arcsec: a star of a likely size is a point to it."""
+    data = simulated(niriss(), [0.0, 150.0, 0.02], rng).only(["cp"])
+    result = search_field(data, SearchOptions()).result
+    assert "diameter_mas" not in result.likelihood.parameters.names
+
+
+def test_a_field_that_is_widened_is_none_that_is_refused(rng, monkeypatch) -> None:
+    """A motion is tried at many rates: of three nights of a month the wider field was too large."""
+    monkeypatch.setattr("amibayes.companion_search.search.MAX_POSITIONS", 300_000)
+    nights = []
+    for k, day in enumerate((0.0, 10.0, 31.0)):
+        sheet = four_telescopes(2, turn_deg=20.0 + 10.0 * k)
+        tables = (replace(t, mjd=t.mjd + day) for t in (sheet.vis2, sheet.closure_phase))
+        sheet = replace(sheet, **dict(zip(("vis2", "closure_phase"), tables, strict=True)))
+        east, north = 7.0 + 0.15 * day, 6.0 + 0.1 * day
+
+        def binary(u, v, _, east=east, north=north):
+            return (1.0 + 0.1 * np.exp(-2j * np.pi * MAS * (east * u + north * v))) / 1.1
+
+        nights.append(observed(sheet, binary, rng))
+    options = SearchOptions(motion=True, fastest_mas_yr=60.0)
+    found = search_field(join(nights), options).result
+    rates = found.theta[found.likelihood.parameters.rates]
+    np.testing.assert_allclose(rates, [54.8, 36.5], atol=5.0)
 
 
 def test_baselines_without_length_are_refused_by_their_columns() -> None:

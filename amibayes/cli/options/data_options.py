@@ -181,7 +181,8 @@ def add_model(group: argparse._ActionsContainer) -> None:
         "--diameter",
         type=common.number_or_free,
         metavar="MAS|free",
-        help="diameter of the primary (default: free where V2 is used, else 0)",
+        help="diameter of the primary (default: free where V2 is used, or where the contrast that "
+        "closure phases alone give depends on it, else 0)",
     )
     group.add_argument(
         "--limb-darkening",
@@ -194,8 +195,8 @@ def add_model(group: argparse._ActionsContainer) -> None:
         "--companion-diameter",
         type=common.number_or_free,
         metavar="MAS|free",
-        help="uniform-disc diameter of companions (default: 0; free where V2 shows the disc of the "
-        "companion that is found)",
+        help="uniform-disc diameter of companions (default: 0; free where data show the disc "
+        "of the companion that is found)",
     )
     group.add_argument(
         "--contrast-slope",
