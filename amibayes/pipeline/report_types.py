@@ -57,12 +57,12 @@ class SearchReport(Shown):
     left_out: tuple[OutlyingRow, ...] = ()
     timing_s: dict[str, float] = field(default_factory=dict)
 
-<<<<<<< HEAD
     @property
     def statement(self) -> Statement | None:
         """What the verdict says; None where nothing was tested."""
         return None if self.verdict is None else self.verdict.statement
-=======
+
+    @property
     def star_alone(self) -> dict[str, tuple[float, float]]:
         """Value and error of each free parameter of the star without a companion.
 
@@ -71,7 +71,6 @@ class SearchReport(Shown):
         """
         said = self.verdict
         return said.star if said is not None and said.star else self.result.star_alone()
->>>>>>> a646bd208c6340c4f273dac60791fa850a82bb2b
 
     def rows(self) -> Rows:
         """What an interpreter shows."""
