@@ -115,7 +115,7 @@ def _fit(report: SearchReport) -> Json:
         **joint_fit_json(result),
         "star_alone": {
             name: {"value": value, "error": number(error)}
-            for name, (value, error) in report.star_alone().items()
+            for name, (value, error) in report.star_alone.items()
         },
         "errors": _errors(c, result),
     }

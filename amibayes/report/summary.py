@@ -249,7 +249,7 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
         parameters[k].name: (float(result.theta[k]), float(np.sqrt(result.theta_covariance[k, k])))
         for k in parameters.nuisance
     }
-    for name, (value, error) in (report.star_alone() if alone else star).items():
+    for name, (value, error) in (report.star_alone if alone else star).items():
         label = name.removesuffix("_mas").replace("limb_darkening", "limb dark.")
         unit = " mas" if name.endswith("_mas") else ""
         if name == "diameter_mas" and (bound := _upper_limit(value, error)) is not None:
