@@ -141,7 +141,7 @@ def row(case: PublicCase, report: SearchReport) -> str:
         others = len(report.result.rivals)
         if others:
             place += f"; {others} other position{'s' if others > 1 else ''} within Δχ² 9"
-    star = report.star_alone().get("diameter_mas")
+    star = report.star_alone.get("diameter_mas")
     single = verdict is not None and verdict.statement == "no companion"
     size = f"{star[0]:.3g} ± {star[1]:.1g}" if star and single else "–"
     statement = verdict.statement if verdict else "–"

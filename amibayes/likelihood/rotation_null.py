@@ -102,4 +102,9 @@ def rotation_null(noise: NoiseModel, residual: FloatArray) -> RotationNull | Non
     if freedom < min(LEAST_SCATTER, p):
         return None
     factor = axes[:, measured] * np.sqrt(freedom * variance[measured])
-    return RotationNull(degrees, freedom + 1.0, factor, residual)
+    # Counted with more degrees of freedom than it has, the scatter varies less: it gets a larger
+    # share of the estimate (whose prior grows by less), which then varies as that of the data.
+    # No drawn mean may take more from the estimate than is in it.
+    estimate = (degrees - 2.0) * np.sqrt(freedom / noise.freedom.scatter)
+    grown = 2.0 + max(float(estimate), freedom * float(variance[-1]))
+    return RotationNull(grown, freedom + 1.0, factor, residual)

@@ -187,22 +187,27 @@ def scaled(n: int, vis2: float, closure: float, rng: np.random.Generator) -> np.
     return out
 
 
-def test_probability_is_uniform_where_few_integrations_were_calibrated() -> None:
+@pytest.mark.parametrize(("share", "stated"), [(0.001, True), (0.25, False)])
+def test_probability_is_uniform_where_few_integrations_were_calibrated(share, stated) -> None:
     """Four integrations of a target and of three calibrators, of noise that was expected.
 
-    They scatter in twelve directions, and are worth five degrees of freedom together.
+    They scatter in twelve directions, and are worth five degrees of freedom together; this share
+    of the estimate is by their scatter.
     """
     rng, n = np.random.default_rng(9), 100
-    colour = np.linalg.pinv(niriss().covariance.whitening.toarray())
+    basis, colour = basis_of(niriss()), linalg.pinv(niriss().covariance.whitening.toarray())
     found = []
     for _ in range(n):
         target, calibrators = rng.standard_normal((3, 36)), rng.standard_normal((9, 36))
         scatter = 0.75 * (target.T @ target / 3.0 + calibrators.T @ calibrators / 27.0)
+        estimate = colour @ ((1.0 - share) * np.eye(36) + share * scatter) @ colour.T
         sheet = replace(
-            niriss(), freedom=Freedom(5000.0, 5.1), scatter=csr_array(colour @ scatter @ colour.T)
+            with_values(niriss(), niriss().covariance.draw(rng, 1)[:, 0]),
+            covariance=dense_covariance(estimate, basis),
+            freedom=Freedom(2.0 + 5.1 / share, 5.1),
+            scatter=csr_array(colour @ scatter @ colour.T),
         )
-        sheet = with_values(sheet, sheet.covariance.draw(rng, 1)[:, 0])
-        test = made(sheet, 60.0, stated_errors=True)
+        test = made(sheet, 60.0, stated_errors=stated)
         found.append(significance(test, 300, rng).probability)
     # No test of this kind is exact: small probabilities must not come too often.
     assert stats.binomtest(int((np.array(found) < 0.1).sum()), n, 0.1, "greater").pvalue > 1e-3

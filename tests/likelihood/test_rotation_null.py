@@ -44,3 +44,22 @@ def test_few_rotations_are_the_residuals_themselves(scatter, lowest, highest) ->
     )
     along = drawn[-1] ** 2 / (drawn**2).sum(axis=0)
     assert lowest < np.mean(along > np.cos(np.radians(6.0)) ** 2) < highest
+
+
+def test_no_mean_takes_more_from_the_estimate_than_is_in_it() -> None:
+    """Target and calibrators scatter in 12 directions with 5 degrees of freedom, a quarter of the
+    estimate in their directions."""
+    rng, scatter, residual = np.random.default_rng(5), np.zeros((N, N)), np.zeros(N)
+    scatter[:12, :12], residual[-1] = 3.5 * np.eye(12), 60.0
+    null = rotation_null(
+        SimpleNamespace(  # type: ignore[arg-type]
+            freedom=Freedom(22.0, 5.0),
+            scatter=csr_array(scatter),
+            covariance=SimpleNamespace(whitening=csr_array(np.eye(N))),
+        ),
+        residual,
+    )
+    assert null is not None
+    drawn = null.draw(rng.standard_normal((N, 4000)), rng)
+    total = (null.degrees - 2.0) * np.eye(N) + np.outer(residual, residual)
+    assert (drawn * np.linalg.solve(total, drawn)).sum(axis=0).max() < 1.0
