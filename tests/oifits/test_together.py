@@ -112,6 +112,27 @@ def test_calibrated_products_take_no_calibrators() -> None:
     assert uncalibrated([done, file("x")], []) == ()
 
 
+@pytest.mark.parametrize(
+    ("category", "raw"),
+    [
+        ("TARGET_OIDATA_RAW", True),
+        ("TARGET_OIDATA_CALIBRATED", False),
+        ("TARGET_RAW_INT", True),
+        ("TARGET_CAL_INT", False),
+        ("SINGLE_SCI_VIS", True),
+        ("SINGLE_SCI_VIS_CALIBRATED", False),
+        ("VIS_SINGLE_CALIBRATED", False),
+        ("SCIENCE_REDUCED", True),
+    ],
+)
+def test_categories_of_eso_tell_what_is_calibrated(category: str, raw: bool) -> None:
+    """Those of PIONIER, MATISSE, GRAVITY and AMBER; V² with the transfer function look binary."""
+    said = uncalibrated([file("a", **{"ESO PRO CATG": category})], [])
+    expected = f"a: not calibrated (ESO PRO CATG {category}); give its calibrators with --cal"
+    assert said == ((expected,) if raw else ())
+    assert not uncalibrated([file("a", **{"ESO PRO CATG": category})], [file("b")])
+
+
 def pointed(place_mas: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Phases at (u, v) of light that stands elsewhere than the model's centre."""
     uv = baselines() / 4.8e-6

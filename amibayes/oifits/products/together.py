@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from amibayes.errors import UsageError
 from amibayes.oifits.products.recognise import exposure_of, is_normalized, is_product_header
+
+UNCALIBRATED = re.compile(r"_RAW(_|$)|_REDUCED$|_(SCI|CAL)_VIS$")
+"""Categories of ESO's pipelines that hold the transfer function: TARGET_OIDATA_RAW of PIONIER,
+TARGET_RAW_INT of MATISSE, SCIENCE_REDUCED of AMBER, SINGLE_SCI_VIS of GRAVITY."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,14 @@ class Contents:
     def is_normalized(self) -> bool:
         """Whether the pipeline has calibrated it."""
         return self.is_product and is_normalized(self.header, self.columns)
+
+    @property
+    def uncalibrated_by(self) -> str:
+        """What says that nobody has calibrated it; empty where nothing does."""
+        if self.is_product and not self.is_normalized:
+            return "jwst"
+        category = str(self.header.get("ESO PRO CATG", ""))
+        return f"ESO PRO CATG {category}" if UNCALIBRATED.search(category) else ""
 
 
 def refuse_twice(files: Sequence[Contents]) -> None:
@@ -112,10 +125,14 @@ def refuse_calibrating_again(targets: Sequence[Contents], calibrators: Sequence[
 
 
 def uncalibrated(targets: Sequence[Contents], calibrators: Sequence[Contents]) -> tuple[str, ...]:
-    """Name the products that nobody has calibrated."""
+    """Name what nobody has calibrated, by the headers of pipelines."""
     if calibrators:
         return ()
-    raw = [f.path for f in targets if f.is_product and not f.is_normalized]
-    if not raw:
-        return ()
-    return (f"{', '.join(raw)}: not calibrated (jwst); give its calibrators with --cal",)
+    raw: dict[str, list[str]] = {}
+    for file in targets:
+        if file.uncalibrated_by:
+            raw.setdefault(file.uncalibrated_by, []).append(file.path)
+    return tuple(
+        f"{', '.join(paths)}: not calibrated ({by}); give its calibrators with --cal"
+        for by, paths in raw.items()
+    )
