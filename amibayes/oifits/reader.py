@@ -9,9 +9,10 @@ import numpy as np
 
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
+from amibayes.data.polarisations import without_polarisation
 from amibayes.data.setup import Setup
 from amibayes.errors import DataError
-from amibayes.oifits.columns import integers, listing, same, without_polarisation
+from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import Rows, channel_count, read_rows
