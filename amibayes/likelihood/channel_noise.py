@@ -33,7 +33,7 @@ from amibayes.data.blocks import Block, BlockCovariance, orthonormal
 from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
-from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows, channel_layout
+from amibayes.likelihood.channel_rows import APART, ChannelLayout, ChannelRows, channel_layout
 from amibayes.likelihood.chi2 import restricted_loss, touched
 from amibayes.likelihood.exposure_rows import series_of, turned_rows
 from amibayes.likelihood.noise import GaussianNoise, NoiseModel, noise_of
@@ -322,8 +322,9 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     several = layout.count > 1
     single_row = ~several[layout.group]
     alone = steps[single_row] / np.sqrt(1.0 + further[single_row])[:, None]
-    # Half of the floor is a slope; the fit of ρ and φ leaves that out.
-    sure = 0.5 * further[layout.starts][several]
+    # Half of the floor is a slope, of several channels; the fit of ρ and φ leaves that out.
+    sloped = layout.sums((layout.gap < APART).astype(float)) > 0.0
+    sure = (np.where(sloped, 0.5, 1.0) * further[layout.starts])[several]
     along, length = along[several], length[several]
     whole = steps[several[layout.group]]
     rest, single = whole.T @ whole - along.T @ along, alone.T @ alone

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
 from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
+from amibayes.data.polarisations import rows_of_exposures
+from amibayes.likelihood.smooth_basis import smooth_basis
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 
@@ -19,7 +22,8 @@ from amibayes.units import BoolArray, FloatArray, IntArray
 class ChannelLayout:
     """Which whitened rows are the channels of one baseline, or triangles, of one exposure.
 
-    Arrays are sorted by group, and by channel within a group.
+    Those of both polarisations: they have the calibrator and the atmosphere in common. Arrays are
+    sorted by group, by polarisation and by channel within a group.
 
     Parameters
     ----------
@@ -28,7 +32,8 @@ class ChannelLayout:
     group : (rank,) int array
         Numbered from 0.
     gap : (rank,) float array
-        Channels since the one before in its group; infinite for the first one.
+        Channels since the one before in its group; infinite for the first one, and `APART` for the
+        first one of another polarisation.
     weight : (rank,) float array
         Shape of the common error in units of the errors, of unit mean square in each group.
     unit : (rank,) float array
@@ -113,19 +118,21 @@ class ChannelLayout:
                 parts.append((np.array([first]), np.array([first]), np.ones(1)))
                 variance[first] += floor[first]
                 continue
-            basis = smooth_basis(self.weight[first:last])
+            others = first + np.flatnonzero(self.gap[first:last] == APART)
+            basis = smooth_basis(self.weight[first:last], np.diff([first, *others, last]).tolist())
             parts.append((basis.row + first, basis.column + first, basis.value))
             rho, phi = common[first], neighbour[first]
             # Differences of neighbours are never trusted more than independent channels are:
             # what makes neighbours alike (overlap on the detector) blurs the signal there too.
-            rest = np.maximum(variance_of(basis.row, basis.value, phi), 1.0)
+            rest = np.maximum(basis.variance(phi), 1.0)
             rest = (1.0 - rho) * rest
             # A floor says that exposures are too few to tell: no errors then shrink by a fit.
             variance[first:last] = np.maximum(rest, 1.0) if floor[first] > 0.0 else rest
             added[first] = further[0, first] * (last - first)
             added[first:last] += further[1, first] * basis.slope_share
             variance[first] += rho * (last - first)
-            level[first : first + 2] = OFFSET, SLOPE
+            if basis.slope:
+                level[first : first + 2] = OFFSET, SLOPE
         variance += added
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
@@ -181,108 +188,15 @@ class ChannelRows:
 
 OFFSET, SLOPE = 1, 2
 
+APART = 1e9
+"""Channels between those of two polarisations: no noise of neighbours reaches so far."""
+
 
 def independent_rows(n: int) -> ChannelRows:
     """Whitened data (n,) as they are."""
     one = np.ones(n)
     unit = csr_array((one, (np.arange(n), np.arange(n))), shape=(n, n))
     return ChannelRows(unit, one, np.zeros(n, dtype=np.intp), np.zeros(n))
-
-
-def variance_of(row: IntArray, value: FloatArray, phi: float) -> FloatArray:
-    """Variance of rows of channels in order, correlated by φ^|i−j| and of unit variance each."""
-    if phi == 0.0:
-        return np.asarray(np.bincount(row, value**2), dtype=float)
-    # Sum of all channels before, each times φ to the power of its distance, by doubling.
-    before = np.concatenate([[0.0], phi * value[:-1]]) * (np.diff(row, prepend=-1) == 0)
-    step, power = 1, phi
-    longest = int(np.bincount(row).max(initial=1))
-    while step < longest:
-        same = row[step:] == row[:-step]
-        before[step:] += np.where(same, power * before[:-step], 0.0)
-        step, power = 2 * step, power**2
-    return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
-
-
-@dataclass(frozen=True, eq=False)
-class SmoothBasis:
-    """Orthonormal rows of n channels: an offset, a slope, and details of ever shorter ranges.
-
-    Parameters
-    ----------
-    row, column : (n_entries,) int arrays
-        Sorted by row, and by column within one.
-    value : (n_entries,) float array
-    depth : (n,) int array
-        How often a row's range was halved; −1 of offset and slope.
-    """
-
-    row: IntArray
-    column: IntArray
-    value: FloatArray
-    depth: IntArray
-
-    @property
-    def slope_share(self) -> FloatArray:
-        """Variance in each row of an error that changes over channels, its slope of mean square 1.
-
-        Beside the slope are curved changes, a quarter of it in the details of the whole range and a
-        quarter of that in those of its halves: red noise, as the transfer functions of
-        spectrographs differ.
-        """
-        depth = self.depth
-        share = CURVED ** (depth + 1.0) / np.bincount(depth + 1)[depth + 1]
-        share[0], share[1:2] = 0.0, 1.0
-        return np.asarray(len(depth) * share)
-
-
-CURVED = 0.25
-"""Variance of changes over half of a range of channels, in units of that over the whole of it."""
-
-LEAF = (4, 16)
-"""Channels of the shortest ranges, of up to 64 and of more than 256: they cost as many products."""
-
-
-def smooth_basis(weight: FloatArray) -> SmoothBasis:
-    """Rows of which the first is along ``weight`` (n,) and the second a slope of it.
-
-    All others see neither: differences within a range of channels that are orthogonal to both,
-    those between the halves of these, and so on (multiwavelets: Alpert 1993, SIAM J. Math.
-    Anal. 24, 246). They have n log n entries.
-    """
-    return _smooth_basis(np.ascontiguousarray(weight, dtype=float).tobytes())
-
-
-@lru_cache(maxsize=8192)
-def _smooth_basis(content: bytes) -> SmoothBasis:
-    """`smooth_basis`, remembered: it is asked for at every noise that is tried."""
-    weight = np.frombuffer(content)
-    n = len(weight)
-    wanted = np.column_stack([weight, weight * np.linspace(-1.0, 1.0, n)])
-    details: list[tuple[int, int, FloatArray]] = []
-    leaf = int(np.clip(n // 16, *LEAF))
-
-    def along(first: int, last: int, depth: int) -> FloatArray:
-        """Basis of what is wanted in a range, (length, 1 or 2); the rest becomes details."""
-        if last - first <= leaf:
-            turned = np.linalg.qr(wanted[first:last], mode="complete")[0]
-        else:
-            middle = (first + last) // 2
-            left, right = along(first, middle, depth + 1), along(middle, last, depth + 1)
-            products = left.T @ wanted[first:middle], right.T @ wanted[middle:last]
-            mixed = np.linalg.qr(np.concatenate(products), mode="complete")[0]
-            cut = left.shape[1]
-            turned = np.concatenate([left @ mixed[:cut], right @ mixed[cut:]])
-        details.extend((depth, first, detail) for detail in turned[:, 2:].T)
-        return turned[:, :2]
-
-    whole = along(0, n, 0)
-    rows = [(-1, 0, part * np.sign(part @ w)) for part, w in zip(whole.T, wanted.T, strict=False)]
-    rows += sorted(details, key=lambda d: d[:2])
-    length = [len(values) for _, _, values in rows]
-    column = np.concatenate([first + np.arange(len(values)) for _, first, values in rows])
-    value, depth = np.concatenate([v for *_, v in rows]), np.array([d for d, *_ in rows])
-    return SmoothBasis(np.repeat(np.arange(n), length), column, value, depth)
 
 
 def channel_layout(data: Observables) -> ChannelLayout:
@@ -295,18 +209,22 @@ def channel_layout(data: Observables) -> ChannelLayout:
         across kinds, already have their correlations stated: they are groups of one.
     """
     group, weight, first, place, stated = _labelled(data)
-    channel = np.concatenate([data.vis2.channel, data.closure_phase.channel])[first]
-    order = np.lexsort((channel, group))
+    setup, channel = (
+        np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])[first]
+        for name in ("setup", "channel")
+    )
+    order = np.lexsort((channel, setup, group))
     group, channel, weight, first = group[order], channel[order], weight[order], first[order]
+    setup = setup[order]
     begins = np.append(True, np.diff(group) != 0)[: len(group)]
     group = np.cumsum(begins) - 1
-    gap = np.where(begins, np.inf, np.diff(channel, prepend=0).astype(float))
+    gap = np.where(np.diff(setup, prepend=-1) == 0, np.diff(channel, prepend=0), APART)
+    gap = np.where(begins, np.inf, gap)
     count = np.maximum(np.bincount(group), 1)
     mean = np.bincount(group, weight**2) / count
     slope = np.bincount(group, _amplitudes(data)[first] ** 2) / count
     names = tuple(sorted({s.source for s in data.setups}))
     of_setup = np.array([names.index(s.source) for s in data.setups], dtype=np.intp)
-    setup = np.concatenate([data.vis2.setup, data.closure_phase.setup])[first]
     return ChannelLayout(
         order,
         group,
@@ -347,9 +265,9 @@ def _pattern(data: Observables) -> FloatArray:
 def _labelled(data: Observables) -> tuple[IntArray, FloatArray, IntArray, IntArray, BoolArray]:
     """Group of each whitened row, shape of its common error, first datum, combination, stated."""
     n_vis2 = data.n_vis2
-    setup, row, channel = (
-        np.concatenate([getattr(m, name) for m in (data.vis2, data.closure_phase)])
-        for name in ("setup", "row", "channel")
+    row, channel = (
+        np.concatenate([of(m) for m in (data.vis2, data.closure_phase)])
+        for of in (partial(rows_of_exposures, data.setups), attrgetter("channel"))
     )
     sigma = np.sqrt(data.covariance.variance)
     # The pattern of a gain is V² itself, not below its noise; that of an offset is flat.
@@ -362,7 +280,7 @@ def _labelled(data: Observables) -> tuple[IntArray, FloatArray, IntArray, IntArr
     used = 0
     for stack in data.covariance.stacks:
         inside, rank = stack.index, stack.shape[1]
-        key = np.concatenate([kinds[inside[:, :1]], setup[inside], row[inside]], axis=1)
+        key = np.concatenate([kinds[inside[:, :1]], row[inside]], axis=1)
         same = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1, 1)
         alike = (channel[inside] == channel[inside[:, :1]]) & (vis2[inside] == vis2[inside[:, :1]])
         # Rows of one exposure and kind, one of each channel; of a block of several, each alone.

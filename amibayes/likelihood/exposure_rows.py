@@ -18,6 +18,7 @@ from scipy.sparse import csr_array
 from amibayes.data.closure import canonical
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
+from amibayes.data.polarisations import without_polarisation
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
 from amibayes.likelihood.chi2 import restricted_loss
 from amibayes.units import FloatArray, IntArray
@@ -125,7 +126,7 @@ def series_of(data: Observables, layout: ChannelLayout) -> tuple[Series, ...]:
     rows_of_data = zip(layout.order[at], layout.datum[at], names, layout.place[at], strict=True)
     for row, datum, name, place in rows_of_data:
         own, vis2 = data.setups[setup[datum]], bool(datum < data.n_vis2)
-        key = own.source, vis2, own.insname, name, int(place)
+        key = own.source, vis2, without_polarisation(own.insname), name, int(place)
         of.setdefault(key, []).append((24.0 * float(mjd[datum]), int(row)))
     found = []
     for (source, kind, *_), members in of.items():

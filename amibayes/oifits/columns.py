@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -78,14 +77,6 @@ def rest_of(table: OITable, name: str, shape: tuple[int, ...]) -> FloatArray:
 def same(a: str, b: str) -> bool:
     """Whether two names are one, whatever their padding and case."""
     return plain(a).casefold() == plain(b).casefold()
-
-
-_POLARISATION = re.compile(r"[_ -]?(?:P|POL)[12]$", re.IGNORECASE)
-
-
-def without_polarisation(insname: str) -> str:
-    """INSNAME of both polarisations: ``GRAVITY_SC`` of ``GRAVITY_SC_P1``."""
-    return _POLARISATION.sub("", plain(insname))
 
 
 def listing(names: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 
@@ -9,9 +10,10 @@ import numpy as np
 
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
+from amibayes.data.polarisations import without_polarisation
 from amibayes.data.setup import Setup
 from amibayes.errors import DataError
-from amibayes.oifits.columns import integers, listing, same, without_polarisation
+from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response
 from amibayes.oifits.row_stations import stations_of_rows
 from amibayes.oifits.rows import Rows, channel_count, read_rows
@@ -55,11 +57,6 @@ def observables_of(
             remedy="check FLAG and what is named",
         )
     stated = stated_covariance(oifits, content, closure_covariance)
-    unused = tuple(
-        f"{t.name or 'unnamed'} {t.extver} is not used"
-        for t in oifits.unused
-        if t.name not in (RESPONSE, SCATTER, SHARED)
-    )
     trailing = (f"{oifits.trailing_bytes} bytes after the last table",)
     return Observables(
         content.vis2.measurements,
@@ -68,12 +65,21 @@ def observables_of(
         stated.kind,
         setups,
         stated.n_integrations,
-        (*(n for p in parts for n in p.rows.notes), *stated.notes, *unused)
+        (*(n for p in parts for n in p.rows.notes), *stated.notes, *_unused(oifits))
         + (trailing if oifits.trailing_bytes else ()),
         stated.freedom,
         stated.scatter,
         stated.shared,
     )
+
+
+def _unused(oifits: OIFits) -> list[str]:
+    """Say which tables are not used; those that are called the same in one line."""
+    names = (t for t in oifits.unused if t.name not in (RESPONSE, SCATTER, SHARED))
+    count = Counter(f"{t.name or 'unnamed'} {t.extver}" for t in names)
+    return [
+        f"{name} is not used" + (f" ({n} tables)" if n > 1 else "") for name, n in count.items()
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from amibayes.companion_search.field import (
     MARGIN,
     SURELY_NOT_NOISE,
     choose_field,
+    default_separation,
     look_inside,
     look_outside,
     notices_disc,
@@ -126,12 +127,7 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     )
     field, warnings = options.separation_mas, list[str]()
     if field is None:
-        field, place = choose_field(likelihood, noise_prior(likelihood.observables, options))
-        if place is not None:
-            warnings = [
-                f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: near {place:.1f} "
-                "mas, outside the default one, a companion fits better than anywhere inside"
-            ]
+        field, warnings = _chosen_field(likelihood, options)
     first = search(likelihood, field, check=False)
     if options.diameter is None:
         likelihood, first = _without_disc(likelihood, first)
@@ -144,6 +140,24 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
     result, noise = _searched(first, options)
     warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings), observables)
+
+
+def _chosen_field(
+    likelihood: Likelihood, options: SearchOptions
+) -> tuple[tuple[float, float], list[str]]:
+    """The field where none is asked for, and warnings: no wider than one that is searched."""
+    field, place = choose_field(likelihood, noise_prior(likelihood.observables, options))
+    if place is None:
+        return field, []
+    better = "outside the default one, a companion fits better than anywhere inside"
+    # It was seen at rest: with all rates of a motion so wide a field may be too large.
+    farthest = farthest_searched(likelihood, *field)
+    if place > farthest:
+        told = f"near {place:.1f} mas, {better}, at rest: with a motion that is too far to search"
+        return default_separation(likelihood), [f"the field was not widened: {told}"]
+    field = field[0], farthest
+    told = f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: near {place:.1f} mas"
+    return field, [f"{told}, {better}"]
 
 
 def _with_its_disc(

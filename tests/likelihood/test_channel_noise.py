@@ -22,10 +22,11 @@ from amibayes.likelihood.channel_noise import (
     correlation_of,
     noise_with_channels,
 )
-from amibayes.likelihood.channel_rows import OFFSET, SLOPE, channel_layout, smooth_basis
+from amibayes.likelihood.channel_rows import OFFSET, SLOPE, channel_layout
 from amibayes.likelihood.extra_noise import NoisePrior
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise_fit import _Kind, fit_noise
+from amibayes.likelihood.smooth_basis import smooth_basis
 from amibayes.models.binary import BinaryModel
 
 

@@ -18,7 +18,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.averaged_noise import averaged_noise
 from amibayes.likelihood.channel_noise import noise_with_channels
-from amibayes.likelihood.channel_rows import channel_layout, smooth_basis
+from amibayes.likelihood.channel_rows import channel_layout
 from amibayes.likelihood.chi2 import (
     candid_n_sigma,
     chi2_of_part,
@@ -46,6 +46,7 @@ from amibayes.likelihood.linear_response import (
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.quadrature import Marginal
 from amibayes.likelihood.rotation_null import rotation_null
+from amibayes.likelihood.smooth_basis import smooth_basis
 from amibayes.likelihood.student import (
     Robustness,
     averaged_student_noise,

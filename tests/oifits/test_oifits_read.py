@@ -265,6 +265,16 @@ def test_tables_that_are_not_used_are_kept_and_named(made: HandMade, tmp_path: P
         oifits.named("OI_FLUX")[0].columns["FLUX"][0] = 1.0
 
 
+def test_tables_of_one_name_that_are_not_used_are_one_line(made: HandMade, tmp_path: Path) -> None:
+    made.more += [table("OI_VIS", {"VISAMP": ("3D", made.vis2, "")}) for _ in range(3)]
+    made.more += [table("OI_FLUX", {"FLUX": ("3D", made.vis2, "Jy")}, EXTVER=2)]
+    notes = observables_of(open_oifits(made.write(tmp_path / "a.fits"))).notes
+    assert [n for n in notes if "is not used" in n] == [
+        "OI_VIS 1 is not used (3 tables)",
+        "OI_FLUX 2 is not used",
+    ]
+
+
 def test_correlations_of_oi_corr(made: HandMade, tmp_path: Path) -> None:
     # V² 1 with 2, V² 3 with closure phase 19, closure phases 19 with 22 (same channel).
     made.correlate([(1, 2, 0.5), (19, 3, -0.25), (19, 22, 0.3), (4, 4, 1.0)])

@@ -199,6 +199,32 @@ def test_a_field_that_is_widened_is_none_that_is_refused(rng, monkeypatch) -> No
     np.testing.assert_allclose(rates, [54.8, 36.5], atol=5.0)
 
 
+@pytest.mark.parametrize(("most", "said"), [(625_000, "widened to"), (310_000, "not widened")])
+def test_a_wide_companion_at_rest_is_no_reason_to_refuse_a_motion(
+    most, said, rng, monkeypatch
+) -> None:
+    """At 15 mas in three nights, with rates as of a motion: searched as far as can be."""
+    monkeypatch.setattr("amibayes.companion_search.search.MAX_POSITIONS", most)
+    nights = []
+    for k, day in enumerate((0.0, 10.0, 31.0)):
+        sheet = four_telescopes(2, turn_deg=20.0 + 10.0 * k)
+        tables = (replace(t, mjd=t.mjd + day) for t in (sheet.vis2, sheet.closure_phase))
+        sheet = replace(sheet, **dict(zip(("vis2", "closure_phase"), tables, strict=True)))
+
+        def binary(u, v, _):
+            return (1.0 + 0.1 * np.exp(-2j * np.pi * MAS * (12.0 * u + 9.0 * v))) / 1.1
+
+        nights.append(observed(sheet, binary, rng))
+    found = search_field(join(nights), SearchOptions(motion=True, fastest_mas_yr=60.0))
+    assert any(said in line for line in found.warnings)
+    companion, outer = found.result.companion, found.result.grid.outer_mas
+    if said == "widened to":
+        assert 15.0 < outer < 1.2 * 15.0  # not so wide as unlimited
+        assert [companion.east_mas, companion.north_mas] == pytest.approx([12.0, 9.0], abs=0.1)
+    else:
+        assert outer < 15.0
+
+
 def test_baselines_without_length_are_refused_by_their_columns() -> None:
     data = point_source(np.zeros((4, 2)), [1.6e-6], [1e-8], vis2_error=0.01, closure_error_rad=0.02)
     with pytest.raises(DataError, match=r"zero or infinite length \(check UCOORD"):

@@ -1,0 +1,138 @@
+"""An orthonormal basis of channels: what they have in common, a slope, and details."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from amibayes.units import FloatArray, IntArray
+
+CURVED = 0.25
+"""Variance of changes over half of a range of channels, in units of that over the whole of it."""
+
+LEAF = (4, 16)
+"""Channels of the shortest ranges, of up to 64 and of more than 256: they cost as many products."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothBasis:
+    """Orthonormal rows of n channels: an offset, a slope, and details of ever shorter ranges.
+
+    Parameters
+    ----------
+    row, column : (n_entries,) int arrays
+        Sorted by row, and by column within one.
+    value : (n_entries,) float array
+    depth : (n,) int array
+        How often a row's range was halved; −1 of offset, slope and differences of polarisations.
+    spectrum : (n,) int array
+        Which of the spectra (polarisations) a channel is of.
+    slope : bool
+        Whether there is one: none of single channels.
+    """
+
+    row: IntArray
+    column: IntArray
+    value: FloatArray
+    depth: IntArray
+    spectrum: IntArray
+    slope: bool
+
+    @property
+    def slope_share(self) -> FloatArray:
+        """Variance in each row of an error that changes over channels, its slope of mean square 1.
+
+        Beside the slope are curved changes, a quarter of it in the details of the whole range and a
+        quarter of that in those of its halves: red noise, as the transfer functions of
+        spectrographs differ. Of single channels it is an offset.
+        """
+        depth = self.depth
+        share = CURVED ** (depth + 1.0) / np.bincount(depth + 1)[depth + 1]
+        share[depth < 0] = 0.0
+        share[int(self.slope)] = 1.0
+        return np.asarray(len(depth) * share)
+
+    def variance(self, phi: float) -> FloatArray:
+        """Variance of the rows where channels, of unit variance, are correlated by φ^|i−j|.
+
+        Those of different spectra are not.
+        """
+        row, value, n = self.row, self.value, len(self.depth)
+        if phi == 0.0:
+            return np.asarray(np.bincount(row, value**2, minlength=n), dtype=float)
+        # Sum of all channels before, each times φ to the power of its distance, by doubling.
+        run = row * (self.spectrum.max() + 1) + self.spectrum[self.column]
+        before = np.concatenate([[0.0], phi * value[:-1]]) * (np.diff(run, prepend=-1) == 0)
+        step, power = 1, phi
+        longest = int(np.bincount(run).max(initial=1))
+        while step < longest:
+            same = run[step:] == run[:-step]
+            before[step:] += np.where(same, power * before[:-step], 0.0)
+            step, power = 2 * step, power**2
+        return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
+
+
+def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis:
+    """Rows of which the first is along ``weight`` (n,) and the second a slope of it.
+
+    All others see neither: differences within a range of channels that are orthogonal to both,
+    those between the halves of these, and so on (multiwavelets: Alpert 1993, SIAM J. Math.
+    Anal. 24, 246). They have n log n entries.
+
+    Parameters
+    ----------
+    weight : (n,) float array
+    lengths : sequence of int, optional
+        Channels of each of the spectra that ``weight`` is made of: offset and slope are common to
+        these, and their differences come next.
+    """
+    content = np.ascontiguousarray(weight, dtype=float).tobytes()
+    return _smooth_basis(content, tuple(lengths) or (len(weight),))
+
+
+@lru_cache(maxsize=8192)
+def _smooth_basis(content: bytes, lengths: tuple[int, ...]) -> SmoothBasis:
+    """`smooth_basis`, remembered: it is asked for at every noise that is tried."""
+    weight = np.frombuffer(content)
+    n, longest = len(weight), max(lengths)
+    across = [np.linspace(-1.0, 1.0, k) if k > 1 else np.zeros(1) for k in lengths]
+    wanted = np.column_stack([weight, weight * np.concatenate(across)])[:, : 1 + (longest > 1)]
+    details: list[tuple[int, int, FloatArray]] = []
+    leaf = int(np.clip(longest // 16, *LEAF))
+
+    def kept(turned: FloatArray, first: int, depth: int) -> FloatArray:
+        """What is wanted of a range; the rest becomes details."""
+        n_wanted = wanted.shape[1]
+        details.extend((depth, first, detail) for detail in turned[:, n_wanted:].T)
+        return turned[:, :n_wanted]
+
+    def joined(left: FloatArray, right: FloatArray, first: int) -> FloatArray:
+        """Basis of what is wanted in two ranges that follow each other from ``first`` on."""
+        middle, cut = first + len(left), left.shape[1]
+        products = left.T @ wanted[first:middle], right.T @ wanted[middle : middle + len(right)]
+        mixed = np.linalg.qr(np.concatenate(products), mode="complete")[0]
+        return np.concatenate([left @ mixed[:cut], right @ mixed[cut:]])
+
+    def along(first: int, last: int, depth: int) -> FloatArray:
+        """Basis of what is wanted in a range, (length, 1 or 2)."""
+        if last - first <= leaf:
+            return kept(np.linalg.qr(wanted[first:last], mode="complete")[0], first, depth)
+        middle = (first + last) // 2
+        halves = along(first, middle, depth + 1), along(middle, last, depth + 1)
+        return kept(joined(*halves, first), first, depth)
+
+    cuts = np.cumsum([0, *lengths]).tolist()
+    whole, *others = [along(first, last, 0) for first, last in pairwise(cuts)]
+    for other in others:
+        whole = kept(joined(whole, other, 0), 0, -1)
+    rows = [(-1, 0, part * np.sign(part @ w)) for part, w in zip(whole.T, wanted.T, strict=False)]
+    rows += sorted(details, key=lambda d: d[:2])
+    length = [len(values) for _, _, values in rows]
+    column = np.concatenate([first + np.arange(len(values)) for _, first, values in rows])
+    value, depth = np.concatenate([v for *_, v in rows]), np.array([d for d, *_ in rows])
+    row, spectrum = np.repeat(np.arange(n), length), np.repeat(np.arange(len(lengths)), lengths)
+    return SmoothBasis(row, column, value, depth, spectrum, longest > 1)
