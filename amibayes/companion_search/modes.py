@@ -13,8 +13,12 @@ from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.parameters import Box
 from amibayes.units import FloatArray
 
-AS_GOOD = 1.0
-"""Δχ² within which one of two positions does not fit better: one standard deviation."""
+AS_GOOD = 2.7
+"""Δχ² within which one of two positions does not fit better.
+
+Of two positions whose predictions are d standard deviations apart the wrong one gains -d² ± 2d:
+more than 1.645² in 5 % of data at most, whatever d is.
+"""
 
 
 NEARLY_EQUAL = 0.5

@@ -394,6 +394,6 @@ def _warnings(
         far = ", ".join(f"{m.companion.separation_mas:.0f}" for m in repeated)
         warnings.append(
             f"beyond {ends:.0f} mas the sky repeats itself for these baselines: {far} mas would "
-            "fit as well; the innermost is reported"
+            "fit as well; of these the innermost is reported"
         )
     return tuple(warnings)

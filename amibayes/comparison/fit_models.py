@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amibayes.companion_search.modes import AS_GOOD
 from amibayes.comparison.fitting import STEPS, SeedBank, least_squares
 from amibayes.comparison.hypotheses import Hypothesis
 from amibayes.comparison.unit_cube import CubeModel
@@ -26,10 +27,6 @@ REFERENCES, ELSEWHERE = 3, 0.05
 """Fits of a simpler model that another source is searched for beside: the best one, and others that
 differ from it by so much in a dimension of the cube. Two companions may each be an alias, or
 lie where the best single one does not."""
-
-AS_GOOD = 1.0
-"""χ² within which, of several places of companions, the innermost counts as the best fit: a mask
-on a lattice repeats itself on the sky, as in `amibayes.companion_search.modes`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -262,7 +262,7 @@ def join(parts: Sequence[Observables]) -> Observables:
         min((p.covariance_kind for p in parts), key=kinds.index),
         tuple(s for p in parts for s in p.setups),
         min(known) if known else None,
-        tuple(n for p in parts for n in p.notes),
+        tuple(dict.fromkeys(n for p in parts for n in p.notes)),
         stacked_freedom((p.n_independent, p.freedom) for p in parts),
         None if scatter is None else scatter[order][:, order],
     )

@@ -318,11 +318,13 @@ def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
     return replace(vetted, kept=not reasons, reason="; ".join(reasons))
 
 
-def notes(vetted: Vetted, alpha: float) -> list[str]:
+def notes(vetted: Vetted, vetting: Vetting) -> list[str]:
     """List what does not drop a calibrator and should be known."""
-    found = []
+    found, alpha = [], vetting.alpha
     if vetted.kept and vetted.agreement is not None and vetted.agreement < alpha:
-        found.append("disagrees with the only other calibrator left: either may be wrong")
+        rivals = any(v.kept for v in vetting.calibrators if v.path != vetted.path)
+        left = "only other calibrator left: either may be wrong"
+        found.append(f"disagrees with the {left if rivals else 'calibrator that is dropped'}")
     small = {
         "a companion": vetted.shows_companion(alpha) and vetted.small_companion,
         "a disc": vetted.shows_disc(alpha) and vetted.small_disc,

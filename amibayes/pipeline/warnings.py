@@ -81,9 +81,7 @@ def vetting_warnings(vetting: Vetting | None) -> list[str]:
         f"calibrator {v.path} dropped: {v.reason}" for v in vetting.calibrators if not v.kept
     ]
     return dropped + [
-        f"calibrator {v.path} {note}"
-        for v in vetting.calibrators
-        for note in notes(v, vetting.alpha)
+        f"calibrator {v.path} {note}" for v in vetting.calibrators for note in notes(v, vetting)
     ]
 
 

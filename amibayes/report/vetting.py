@@ -21,18 +21,18 @@ Json = dict[str, Any]
 def vetting_json(vetting: Vetting) -> Json:
     """Build the content of ``vetting.json``, calibrators in the order given."""
     return {
-        "calibrators": [_entry(v, vetting.alpha) for v in vetting.calibrators],
+        "calibrators": [_entry(v, vetting) for v in vetting.calibrators],
         "alpha": vetting.alpha,
         "false_drop_rate": vetting.false_drop_rate,
     }
 
 
-def _entry(vetted: Vetted, alpha: float) -> Json:
+def _entry(vetted: Vetted, vetting: Vetting) -> Json:
     return {
         "path": vetted.path,
         "kept": vetted.kept,
         "reason": vetted.reason,
-        "notes": notes(vetted, alpha),
+        "notes": notes(vetted, vetting),
         "agreement_probability": vetted.agreement,
         "companion": _companion(vetted),
         "diameter_mas": vetted.diameter_mas,
@@ -65,7 +65,7 @@ def vetting_table(vetting: Vetting, last: Sequence[str] = ()) -> list[str]:
         tested = None if v.significance is None else v.significance.probability
         numbers = " ".join(_cell(p) for p in (v.agreement, tested, v.diameter_probability))
         lines.append(f"{name:<28} {'keep' if v.kept else 'DROP':<7} {numbers}")
-        lines += [f"    {text}" for text in [v.reason, *notes(v, vetting.alpha)] if text]
+        lines += [f"    {text}" for text in [v.reason, *notes(v, vetting)] if text]
     rule = (
         f"probabilities of chance; below {vetting.alpha:g} a calibrator is dropped "
         f"(good ones: {vetting.false_drop_rate:.1%} of the time)"

@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from commands import run
 from epochs import F430M, F480M, MJD, epoch, noisy
+from helpers import niriss
 
 from amibayes.calibration import calibrate
 from amibayes.data.joining import in_order, refuse_twice, unused
@@ -280,3 +281,9 @@ def test_several_targets_say_which_option_chooses(tmp_path) -> None:
     with pytest.raises(DataError, match=r"several targets: A, B \(choose .* target=NAME"):
         read_oifits(path)
     assert read_oifits(path, target="B").n_vis2 == 21
+
+
+def test_what_is_said_of_every_file_stands_once() -> None:
+    notes = [("the header lacks NGROUPS", "1 of 10 integrations not used"), ("another",)]
+    parts = [replace(niriss(), notes=(first, *more)) for first, *more in [*notes, notes[0][:1]]]
+    assert join(parts).notes == (*notes[0], *notes[1])

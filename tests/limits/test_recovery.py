@@ -87,3 +87,19 @@ def test_the_search_itself_reports_what_recovery_says(separation: float, n: int)
         alike += bool(away < 0.5 * fringe) == (not lost)
     expected = 12.0 / 13.0
     assert alike >= n * expected - 4.5 * np.sqrt(n * expected * (1.0 - expected))
+
+
+def test_noise_does_not_move_a_companion_to_an_alias_farther_out() -> None:
+    """Companions, noise and all, in the whole field: the limits count them as found at their place.
+
+    The lattice of the mask gives each an alias beyond 390 mas, which the width of the band keeps
+    about one standard deviation apart: by noise it fits better by more than 1 in 16 % of data.
+    """
+    rng = np.random.default_rng(8)
+    sheet, n = niriss(), 100
+    near = []
+    for place in np.column_stack(offset(200.0, rng.uniform(0.0, 360.0, n))):
+        found = search(Likelihood(simulated(sheet, [*place, 0.014], rng)), check=False)
+        away = np.subtract((found.companion.east_mas, found.companion.north_mas), place)
+        near.append(np.hypot(*away) < 0.5 * resolution_mas(found.likelihood))
+    assert np.mean(near) > 0.95

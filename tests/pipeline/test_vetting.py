@@ -20,7 +20,7 @@ from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import write_oifits
-from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, vet
+from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, notes, vet
 from amibayes.report.vetting import vetting_picture, vetting_table
 from amibayes.units import MAS
 
@@ -149,6 +149,15 @@ def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys
     assert any("charge level is 5 times" in text for text in said)
     assert any("disagrees" in text or "companion" in text for text in said)
     assert (tmp_path / "out" / "vetting.png").stat().st_size > 1000
+
+
+def test_one_that_disagrees_with_a_dropped_one_is_not_doubted() -> None:
+    kept, binary = Vetted("a.oifits", True, "", 0.0), Vetted("b.oifits", False, "companion", 0.0)
+    assert notes(kept, Vetting((kept, binary), 0.003)) == [
+        "disagrees with the calibrator that is dropped"
+    ]
+    other = replace(kept, path="b.oifits")
+    assert "either may be wrong" in notes(kept, Vetting((kept, other), 0.003))[0]
 
 
 @pytest.mark.slow
