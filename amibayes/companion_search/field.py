@@ -91,6 +91,10 @@ def look_inside(result: SearchResult) -> float | None:
     return float(np.hypot(*place)) if gain >= max(as_good, SURELY_NOT_NOISE) else None
 
 
+EQUAL = 1.0
+"""Δχ² of an alias outside the field that is as good by the geometry alone, and not told of."""
+
+
 def look_outside(result: SearchResult) -> float | None:
     """Find where farther out than the field a companion would fit as well.
 
@@ -125,7 +129,8 @@ def look_outside(result: SearchResult) -> float | None:
     best = result.modes[0]
     modes = sorted((best, found), key=lambda m: -m.delta_chi2)
     aliases = innermost_first(likelihood, modes, single, fringe)[1]
-    if aliases or found.delta_chi2 < best.delta_chi2 - RIVAL:
+    alike = bool(aliases) and abs(found.delta_chi2 - best.delta_chi2) < EQUAL
+    if alike or found.delta_chi2 < best.delta_chi2 - RIVAL:
         return None
     return found.companion.separation_mas
 

@@ -201,7 +201,7 @@ def test_a_place_outside_counts_where_it_is_as_good(
 def test_an_alias_outside_is_left_out(
     looked: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked.gain, found = 1e3, mode(300.0, 400.0, 120.0)
+    looked.gain, found = 1e3, mode(300.0, 400.0, 100.5)
     monkeypatch.setattr(PATH + "_fit_from", lambda *_: found)
     asked: list[Any] = []
 
@@ -213,7 +213,7 @@ def test_an_alias_outside_is_left_out(
     result = found_in(make_grid(80.0, 300.0, 12.0), 100.0, modes=(mode(9, 9, 100.0),))
     for aliases in ((), (found,)):
         assert (field.look_outside(result) is None) is bool(aliases)
-    assert asked[0] == [120.0, 100.0]
+    assert asked[0] == [100.5, 100.0]
 
 
 def test_a_look_outside_reaches_as_far_as_channels_and_work_allow(looked: SimpleNamespace) -> None:
