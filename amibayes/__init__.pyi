@@ -44,7 +44,7 @@ from .instrument import (
     instrument_names as instrument_names,
     load_instrument as load_instrument,
 )
-from .likelihood.joint import joint_likelihood as joint_likelihood
+from .likelihood.likelihood import joint_likelihood as joint_likelihood
 from .likelihood.likelihood import Likelihood as Likelihood
 from .likelihood.noise import FittedNoise as FittedNoise, NoiseModel as NoiseModel
 from .limits.analytic import AnalyticLimit as AnalyticLimit, analytic_limit as analytic_limit

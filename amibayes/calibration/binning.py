@@ -16,8 +16,7 @@ from amibayes.calibration.transfer import wrapped
 from amibayes.data.closure import canonical, canonical_uv
 from amibayes.data.measurements import DAY_S, SIMULTANEOUS_S, Measurements
 from amibayes.data.observables import Observables
-from amibayes.data.polarisations import without_polarisation
-from amibayes.data.setup import Setup
+from amibayes.data.setup import Setup, without_polarisation
 from amibayes.data.shared_errors import SharedErrors
 from amibayes.errors import UsageError
 from amibayes.oifits.correlations import Pairs, given_covariance

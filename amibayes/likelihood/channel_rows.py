@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
-from amibayes.data.polarisations import rows_of_exposures
+from amibayes.data.setup import rows_of_exposures
 from amibayes.likelihood.smooth_basis import smooth_basis
 from amibayes.units import BoolArray, FloatArray, IntArray
 

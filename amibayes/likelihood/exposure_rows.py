@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from amibayes.data.closure import canonical
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
-from amibayes.data.polarisations import without_polarisation
+from amibayes.data.setup import without_polarisation
 from amibayes.likelihood.channel_rows import ChannelLayout, ChannelRows
 from amibayes.likelihood.chi2 import restricted_loss
 from amibayes.units import FloatArray, IntArray

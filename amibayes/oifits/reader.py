@@ -10,8 +10,7 @@ import numpy as np
 
 from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
-from amibayes.data.polarisations import without_polarisation
-from amibayes.data.setup import Setup
+from amibayes.data.setup import Setup, without_polarisation
 from amibayes.errors import DataError
 from amibayes.oifits.columns import integers, listing, same
 from amibayes.oifits.off_axis import RESPONSE, with_response

@@ -36,8 +36,7 @@ from amibayes.detection.outlying_rows import (
     without_rows,
 )
 from amibayes.likelihood.extra_noise import ExtraNoise
-from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.models.parameters import Box
 from amibayes.pipeline.options import SearchOptions, model_of, noise_prior

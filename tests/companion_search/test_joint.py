@@ -32,8 +32,7 @@ from amibayes.detection.statistic import make_statistic
 from amibayes.errors import DataError, UsageError
 from amibayes.likelihood.averaged_noise import averaged_noise, files_share_errors
 from amibayes.likelihood.extra_noise import ExtraNoise, FileNoise, add_noise
-from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.residuals import files_of
 from amibayes.models.bands import band_numbers, bands_of, dates

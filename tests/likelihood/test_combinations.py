@@ -26,8 +26,7 @@ from amibayes.likelihood.averaged_noise import averaged_noise
 from amibayes.likelihood.channel_noise import ChannelShare, Correlation
 from amibayes.likelihood.combinations import Combination, combination_of, refusal, require
 from amibayes.likelihood.extra_noise import ExtraNoise, with_noise
-from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import fit_noise
 from amibayes.likelihood.student import averaged_student_noise, symmetric_whitening
 from amibayes.models.parameters import Box

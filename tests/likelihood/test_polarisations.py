@@ -12,7 +12,7 @@ from amibayes.calibration import average_polarisations
 from amibayes.companion_search.grid import make_grid
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
-from amibayes.data.polarisations import rows_of_exposures, without_polarisation
+from amibayes.data.setup import rows_of_exposures, without_polarisation
 from amibayes.data.systematics import Systematics, systematics_of
 from amibayes.detection.statistic import make_statistic
 from amibayes.likelihood.channel_noise import noise_with_channels

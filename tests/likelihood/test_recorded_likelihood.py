@@ -36,8 +36,7 @@ from amibayes.likelihood.extra_noise import (
     mean_of_files,
     with_noise,
 )
-from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood, single_likelihood
+from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.linear_response import (
     companions_beside,
     linear_response,

@@ -11,8 +11,7 @@ from helpers import NIRISS_HOLES, niriss, numerical_gradient, simulated
 from amibayes.data.observables import join
 from amibayes.data.point_source import point_source
 from amibayes.errors import DataError, UsageError
-from amibayes.likelihood.joint import joint_likelihood
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, joint_likelihood
 from amibayes.models.bands import dates
 from amibayes.models.binary import BinaryModel
 from amibayes.models.uv_points import uv_points_of
