@@ -207,19 +207,18 @@ def _finished(parts: list[_Part], options: ExtractOptions) -> Extraction:
     notes = _unnamed(parts) + _of_headers(parts) + _notes(view, frames, shrunk)
     notes += tuple(dict.fromkeys(note for p in parts for note in p.charge.notes))
     sources = tuple(p.template.source for p in parts)
-    count = [float(np.count_nonzero(frames.used & (frames.file == k))) for k in range(len(parts))]
-    response = mean_response([p.response for p in parts], count)
+    weight = np.bincount(frames.file[frames.used], minlength=len(parts)) / frames.used.sum()
+    response = mean_response([p.response for p in parts], weight)
     observables = _tabled(parts[0], response, frames, mean, shrunk, basis, notes, sources)
-    observables = _sharing(observables, parts, frames)
+    observables = _sharing(observables, parts, weight)
     operators = tuple(p.operator for p in parts)
     return Extraction(
         observables, frames, mean, shrunk, physical, operators, options, sources, parts[0].charge
     )
 
 
-def _sharing(observables: Observables, parts: list[_Part], frames: Frames) -> Observables:
-    """Put in what errors of the charge migration do to the mean of all files."""
-    weight = np.bincount(frames.file[frames.used], minlength=len(parts)) / frames.used.sum()
+def _sharing(observables: Observables, parts: list[_Part], weight: FloatArray) -> Observables:
+    """Put in what errors of the charge migration do to the mean of all files, by their weights."""
     changes = [
         (p.charge.migration, w * p.changes)
         for p, w in zip(parts, weight, strict=True)

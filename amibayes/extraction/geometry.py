@@ -120,14 +120,14 @@ def solve_geometry(
     """
     pixels = image.reshape(1, -1)
     # The place of the envelope is fitted too, but the fringes say where the star is.
-    slopes = geometry_slopes(view, fit.solve(pixels)[0, :-1])
+    coefficients = fit.solve(pixels)[0, :-1]
+    slopes = geometry_slopes(view, coefficients)
     slopes -= fit.solve(slopes) @ fit.design.T
     covariance = np.linalg.pinv((slopes * fit.weight) @ slopes.T)
     error = np.sqrt(np.maximum(np.diag(covariance), 0.0))[:2]
     if not 0.0 < error.min() <= error.max() < CONSTRAINED:
         return None
-    unlike = view.unlike_a_star(fit.solve(pixels)[0, :-1])
-    limit = np.maximum(SIGNIFICANT * error, max(SMALLEST, unlike))
+    limit = np.maximum(SIGNIFICANT * error, max(SMALLEST, view.unlike_a_star(coefficients)))
     adopted = np.zeros(2)
     for _ in range(MAX_STEPS):
         residual = pixels[0] - (fit.solve(pixels) @ fit.design.T)[0]

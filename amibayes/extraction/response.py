@@ -109,9 +109,7 @@ def _interpolating(values: ComplexArray) -> ComplexArray:
     return np.asarray(padded[:, RUN_OUT - 1 : 1 - RUN_OUT, RUN_OUT - 1 : 1 - RUN_OUT])
 
 
-def mean_response(
-    responses: Sequence[OffAxisResponse], weights: Sequence[float]
-) -> OffAxisResponse:
+def mean_response(responses: Sequence[OffAxisResponse], weights: FloatArray) -> OffAxisResponse:
     """Response of the mean of several files; of the first one where their lattices differ."""
     first = responses[0]
     if any(r.n_nodes != first.n_nodes for r in responses):

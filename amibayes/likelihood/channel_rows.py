@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -265,10 +264,9 @@ def _pattern(data: Observables) -> FloatArray:
 def _labelled(data: Observables) -> tuple[IntArray, FloatArray, IntArray, IntArray, BoolArray]:
     """Group of each whitened row, shape of its common error, first datum, combination, stated."""
     n_vis2 = data.n_vis2
-    row, channel = (
-        np.concatenate([of(m) for m in (data.vis2, data.closure_phase)])
-        for of in (partial(rows_of_exposures, data.setups), attrgetter("channel"))
-    )
+    tables = data.vis2, data.closure_phase
+    row = np.concatenate([rows_of_exposures(data.setups, m) for m in tables])
+    channel = np.concatenate([m.channel for m in tables])
     sigma = np.sqrt(data.covariance.variance)
     # The pattern of a gain is V² itself, not below its noise; that of an offset is flat.
     shape = np.ones(len(sigma))
