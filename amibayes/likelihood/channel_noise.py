@@ -66,6 +66,9 @@ class Correlation:
         Share of what is common to the channels that exposures which follow each other have in
         common too, for each of `amibayes.likelihood.exposure_rows.HOURS`; empty where no
         baseline was observed twice in a night.
+    sloping : float
+        Variance of an error that changes evenly across the channels, in units of the errors, where
+        no floor has one and residuals show more of it than neighbours share.
     """
 
     common: float = 0.0
@@ -75,11 +78,12 @@ class Correlation:
     offset: float = 1.0
     slope: float = 1.0
     lasting: tuple[float, ...] = ()
+    sloping: float = 0.0
 
     @property
     def any(self) -> bool:
         """Whether anything is shared, by channels or by exposures."""
-        return self.value > 0.0 or sum(self.lasting) > 0.0
+        return self.value > 0.0 or self.sloping > 0.0 or sum(self.lasting) > 0.0
 
 
 @dataclass(frozen=True)
@@ -200,15 +204,17 @@ def channel_rows(
 ) -> ChannelRows:
     """Rows of channels that are correlated as the shares and floors of their files say."""
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
-    growth = np.ones((2, len(layout.order)))
+    growth, sloping = np.ones((2, len(layout.order))), np.zeros(len(layout.order))
     for k, name in enumerate(layout.names):
         share = share_of(shares, name)
         for kind, found in ((layout.vis2, share.vis2), (~layout.vis2, share.closure_phase)):
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour
             growth[:, here] = np.array([[found.offset], [found.slope]])
+            sloping[here] = found.sloping
     # Half of it is common to all channels, half changes: calibrations err in either way.
-    return layout.turned(common, neighbour, 0.5 * growth * floor_of_rows(layout, floors))
+    further = 0.5 * growth * floor_of_rows(layout, floors)
+    return layout.turned(common, neighbour, further, sloping)
 
 
 def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:
@@ -269,6 +275,8 @@ def correlation_of(
     residual: FloatArray,
     jacobian: FloatArray,
     floors: Sequence[Systematics] = (),
+    *,
+    sloping: bool = False,
 ) -> Correlation:
     """Find ρ and φ by restricted likelihood under a uniform prior: their posterior means.
 
@@ -282,6 +290,8 @@ def correlation_of(
         Of its parameters, likewise: they take their share of what is common.
     floors : sequence of Systematics
         What is common for certain.
+    sloping : bool
+        Exposures have errors that change evenly across channels, of any size.
 
     Notes
     -----
@@ -293,7 +303,8 @@ def correlation_of(
         return Correlation()
     both = np.column_stack([residual, jacobian])[layout.order]
     further = floor_of_rows(layout, floors)
-    loss = np.array([_losses(layout, both, further, phi) for phi in NEIGHBOUR])
+    slope = layout.slope if sloping else np.zeros(len(both))
+    loss = np.array([_losses(layout, both, further, slope, phi) for phi in NEIGHBOUR])
     mass = np.exp(-0.5 * (loss - loss.min())) * _widths(NEIGHBOUR)[:, None]
     mass /= mass.sum()
     value = COMMON + (1.0 - COMMON) * NEIGHBOUR[:, None]
@@ -309,14 +320,25 @@ def _widths(nodes: FloatArray) -> FloatArray:
     return np.diff(edges)
 
 
-def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: float) -> FloatArray:
+def _losses(
+    layout: ChannelLayout, both: FloatArray, further: FloatArray, slope: FloatArray, phi: float
+) -> FloatArray:
     """−2 ln of the restricted likelihood at every node of ρ, the scale of errors at its best.
 
-    ``both`` (rank, 1 + n_dim) has residual and slopes, sorted as the layout.
+    ``both`` (rank, 1 + n_dim) has residual and slopes of the fit, sorted as the layout; of
+    ``slope`` (rank,) every group may have any amount.
     """
     neighbour = np.full(len(both), phi)
-    steps = layout.innovations(both, neighbour)
-    weight = layout.innovations(layout.weight, neighbour)
+    across = layout.innovations(slope, neighbour)
+    extent = layout.sums(across**2)
+    unit = across / np.sqrt(np.where(extent > 0.0, extent, 1.0))[layout.group]
+
+    def level(values: FloatArray) -> FloatArray:
+        """Innovations of values (rank, n) without any slope."""
+        steps = layout.innovations(values, neighbour)
+        return steps - unit[:, None] * layout.sums(unit[:, None] * steps)[layout.group]
+
+    steps, weight = level(both), level(layout.weight[:, None])[:, 0]
     length = layout.sums(weight**2)
     along = layout.sums(steps * weight[:, None]) / np.sqrt(length)[:, None]
     several = layout.count > 1
@@ -328,12 +350,13 @@ def _losses(layout: ChannelLayout, both: FloatArray, further: FloatArray, phi: f
     along, length = along[several], length[several]
     whole = steps[several[layout.group]]
     rest, single = whole.T @ whole - along.T @ along, alone.T @ alone
-    n_rest = len(whole) - len(along)
+    free = np.log(extent[extent > 0.0])
+    n_rest = len(whole) - len(along) - len(free)
     back = layout._back(neighbour)
     log_step = float(np.log1p(-(back**2)).sum())
     each = COMMON[:, None]
     variance = 1.0 - each + (each + sure) * length
     weighted = along.T / variance[:, None] @ along
     product = rest / (1.0 - each[:, None]) + single + weighted
-    logdet = log_step + n_rest * np.log1p(-COMMON) + np.log(variance).sum(axis=1)
-    return restricted_loss(product, len(both), logdet)
+    logdet = log_step + n_rest * np.log1p(-COMMON) + np.log(variance).sum(axis=1) + free.sum()
+    return restricted_loss(product, len(both) - len(free), logdet)

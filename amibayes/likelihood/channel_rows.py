@@ -79,6 +79,13 @@ class ChannelLayout:
         """Whether there is a group of several channels."""
         return bool(len(self.count) and self.count.max() > 1)
 
+    @cached_property
+    def slope(self) -> FloatArray:
+        """Error that changes evenly across the channels of each group, (rank,); 0 of one row."""
+        nothing = np.zeros(len(self.order))
+        rows = self.turned(nothing, nothing, np.zeros((2, len(nothing))), nothing)
+        return np.asarray((rows.rotation.T @ (rows.level == SLOPE).astype(float))[self.order])
+
     def sums(self, values: FloatArray) -> FloatArray:
         """Sums of (rank, …) over the groups, (n_groups, …)."""
         at = np.flatnonzero(self.starts)
@@ -101,11 +108,17 @@ class ChannelLayout:
                 self.starts, 0.0, np.power(neighbour, np.where(self.starts, 1, self.gap))
             )
 
-    def turned(self, common: FloatArray, neighbour: FloatArray, further: FloatArray) -> ChannelRows:
+    def turned(
+        self,
+        common: FloatArray,
+        neighbour: FloatArray,
+        further: FloatArray,
+        sloping: FloatArray,
+    ) -> ChannelRows:
         """Rows for shares ρ, correlations φ (rank,) and variances of further errors (2, rank).
 
         Of these the first is common to the channels and the second changes across them, in units
-        of the errors. All are sorted likewise.
+        of the errors, as does ``sloping`` (rank,), which is no floor. All are sorted likewise.
         """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
@@ -132,6 +145,7 @@ class ChannelLayout:
             variance[first] += rho * (last - first)
             if basis.slope:
                 level[first : first + 2] = OFFSET, SLOPE
+                variance[first + 1] += sloping[first] * (last - first)
         variance += added
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))

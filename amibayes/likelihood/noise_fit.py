@@ -125,13 +125,14 @@ class _Fit:
         floors = self.prior.floors
         one = _Kind(part, self.difference[which], self.jacobian[which], self.share, kind, floors)
         for _ in range(ROUNDS):
-            before = amount
+            before, sloped = amount, shared.sloping > 0.0
             if self.prior.channels and self.data.freedom is None:
-                shared = one.correlation(amount)
+                shared = one.correlation(amount, sloping=sloped)
                 shared = one.with_larger_floors(amount, shared, self.prior)
+                shared = one.with_slopes(amount, shared, self.prior)
                 shared = one.with_exposures(amount, shared)
             amount = one.amount(shared, self.prior.width(part, kind))
-            if abs(amount - before) <= 1e-2 * amount:
+            if abs(amount - before) <= 1e-2 * amount and (shared.sloping > 0.0) is sloped:
                 break
         return amount, shared
 
@@ -248,11 +249,11 @@ class _Kind:
         added = covariance_of(self.data, self._extra(1.0))
         return self.data.covariance.against(added, self.residual)
 
-    def correlation(self, amount: float) -> Correlation:
-        """What channels share, given an amount of extra noise."""
+    def correlation(self, amount: float, *, sloping: bool = False) -> Correlation:
+        """What channels share, given an amount of extra noise; see `correlation_of`."""
         base = self._with(amount)
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
-        return correlation_of(self._layout, white, slopes, self._own_floors)
+        return correlation_of(self._layout, white, slopes, self._own_floors, sloping=sloping)
 
     def with_larger_floors(
         self, amount: float, shared: Correlation, prior: NoisePrior
@@ -262,9 +263,7 @@ class _Kind:
         Gains and slopes of single exposures tell their size, which is that of a good night in a
         table. By restricted likelihood, the excess with the prior of extra noise.
         """
-        floors = [f.vis2 if self.kind == "vis2" else f.closure_phase_rad for f in self._own_floors]
-        width = prior.vis2 if self.kind == "vis2" else prior.closure_phase_rad
-        floor = max(floors, default=0.0)
+        floor, width = self._floor, self._width(prior)
         if not floor or not width:
             return shared
         base = self._with(amount)
@@ -276,6 +275,37 @@ class _Kind:
             for at in (rows.level == OFFSET, rows.level == SLOPE)
         ]
         return replace(shared, offset=found[0], slope=found[1])
+
+    def with_slopes(self, amount: float, shared: Correlation, prior: NoisePrior) -> Correlation:
+        """The same with errors that change evenly across channels, where no floor has any.
+
+        Those of single exposures tell their variance, as they do of a floor.
+        """
+        width = self._width(prior)
+        if self._floor or not width:
+            return shared
+        base = self._with(amount)
+        layout = channel_layout(replace(self.data, covariance=base))
+        rows, with_one = (
+            channel_rows(layout, [ChannelShare(own, own)])
+            for own in (replace(shared, sloping=size) for size in (0.0, 1.0))
+        )
+        at = rows.level == SLOPE
+        square = (rows.rotation @ base.whiten(self.residual)) ** 2
+        variance = rows.sigma[at] ** 2
+        added = with_one.sigma[at] ** 2 - variance
+        ratio = 1.0 / (float(np.median(layout.unit)) * width)
+        return replace(shared, sloping=self._growth(square[at], variance, added, ratio) - 1.0)
+
+    @property
+    def _floor(self) -> float:
+        """The largest one of this kind."""
+        vis2 = self.kind == "vis2"
+        return max((f.vis2 if vis2 else f.closure_phase_rad for f in self._own_floors), default=0.0)
+
+    def _width(self, prior: NoisePrior) -> float:
+        """Width of the prior of this kind's extra noise."""
+        return prior.vis2 if self.kind == "vis2" else prior.closure_phase_rad
 
     def with_exposures(self, amount: float, shared: Correlation) -> Correlation:
         """The same with what exposures that follow each other share, as the residuals show."""

@@ -76,7 +76,8 @@ def left_out_json(rows: Sequence[OutlyingRow]) -> list[Json]:
 def channel_correlation_json(noise: ExtraNoise) -> Json:
     """Correlation of neighbouring channels' noise, its error, what all share, and exposures share.
 
-    Of files with correlations of their own the mean.
+    And errors that change evenly across channels, in units of the errors. Of files with
+    correlations of their own the mean.
     """
     found: Json = {}
     for key in ("vis2", "closure_phase"):
@@ -90,6 +91,8 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
         found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
         lasting = [sum(s.lasting) for s in shares]
         found[f"{key}_lasting"] = float(np.mean(lasting)) if lasting else 0.0
+        sloping = [s.sloping for s in shares]
+        found[f"{key}_slope_in_errors"] = float(np.sqrt(np.mean(sloping))) if sloping else 0.0
     return found
 
 
