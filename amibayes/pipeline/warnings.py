@@ -204,6 +204,22 @@ def _of_prior(result: SearchResult, prior: Prior) -> list[str]:
     ]
 
 
+WAVELENGTH_SCALE = 1e-3
+"""Relative error of a spectrograph's wavelengths below which few are known."""
+
+
+def _of_scale(result: SearchResult) -> list[str]:
+    """Say what an error of all wavelengths does to a separation that is known better than they."""
+    separation = result.companion.separation_mas
+    if not result.companion.separation_error_mas < WAVELENGTH_SCALE * separation:
+        return []
+    return [
+        "lengths on the sky go with the wavelengths that the data state: if these are off by "
+        f"{WAVELENGTH_SCALE:.1%}, the separation is off by {WAVELENGTH_SCALE * separation:.2g} mas; "
+        "its error leaves that out"
+    ]
+
+
 def _joint_warnings(result: SearchResult) -> list[str]:
     """Warn of what free contrasts and motion take away, and where the rate is no measurement."""
     model = result.likelihood.model
@@ -284,6 +300,8 @@ def search_warnings(
         found += _drifting(tested.exposures)
     found += _outliers(result, noise)
     found += _correlated(result)
+    if tested is not None and tested.detected:
+        found += _of_scale(result)
     excluded = [] if posterior is None else _of_prior(result, posterior.prior)
     found += excluded
     if posterior is not None and not excluded and len(posterior.mode_probability) > 1:
