@@ -210,13 +210,13 @@ WAVELENGTH_SCALE = 1e-3
 
 def _of_scale(result: SearchResult) -> list[str]:
     """Say what an error of all wavelengths does to a separation that is known better than they."""
-    separation = result.companion.separation_mas
-    if not result.companion.separation_error_mas < WAVELENGTH_SCALE * separation:
+    change = WAVELENGTH_SCALE * result.companion.separation_mas
+    if not result.companion.separation_error_mas < change:
         return []
     return [
         "lengths on the sky go with the wavelengths that the data state: if these are off by "
-        f"{WAVELENGTH_SCALE:.1%}, the separation is off by {WAVELENGTH_SCALE * separation:.2g} mas; "
-        "its error leaves that out"
+        f"{WAVELENGTH_SCALE:.1%}, the separation is off by {change:.2g} mas; its error leaves that "
+        "out"
     ]
 
 
