@@ -125,7 +125,7 @@ def _same_shares(a: ExtraNoise, b: ExtraNoise) -> bool:
     return all(
         abs(x.value - y.value) <= max(SHARE_CONVERGED, SHARE_OF_ERROR * np.nan_to_num(y.error))
         and abs(np.log(x.offset / y.offset)) + abs(np.log(x.slope / y.slope)) <= GROWTH_CONVERGED
-        and abs(np.log((1.0 + x.sloping) / (1.0 + y.sloping))) <= GROWTH_CONVERGED
+        and np.abs(np.diff(np.log1p([x.smooth, y.smooth]), axis=0)).max() <= GROWTH_CONVERGED
         and abs(sum(x.lasting) - sum(y.lasting)) <= LASTING_CONVERGED
         for x, y in pairs
     )

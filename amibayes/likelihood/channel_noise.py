@@ -66,9 +66,9 @@ class Correlation:
         Share of what is common to the channels that exposures which follow each other have in
         common too, for each of `amibayes.likelihood.exposure_rows.HOURS`; empty where no
         baseline was observed twice in a night.
-    sloping : float
-        Variance of an error that changes evenly across the channels, in units of the errors, where
-        no floor has one and residuals show more of it than neighbours share.
+    smooth : (float, float, float)
+        Variance of errors that are common to the channels, change evenly across them, and by a
+        curve, in units of the errors: what residuals show beyond ρ and φ, where no floor has them.
     """
 
     common: float = 0.0
@@ -78,12 +78,12 @@ class Correlation:
     offset: float = 1.0
     slope: float = 1.0
     lasting: tuple[float, ...] = ()
-    sloping: float = 0.0
+    smooth: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def any(self) -> bool:
         """Whether anything is shared, by channels or by exposures."""
-        return self.value > 0.0 or self.sloping > 0.0 or sum(self.lasting) > 0.0
+        return self.value + sum(self.smooth) + sum(self.lasting) > 0.0
 
 
 @dataclass(frozen=True)
@@ -204,17 +204,17 @@ def channel_rows(
 ) -> ChannelRows:
     """Rows of channels that are correlated as the shares and floors of their files say."""
     common, neighbour = np.zeros(len(layout.order)), np.zeros(len(layout.order))
-    growth, sloping = np.ones((2, len(layout.order))), np.zeros(len(layout.order))
+    growth, smooth = np.ones((2, len(layout.order))), np.zeros((3, len(layout.order)))
     for k, name in enumerate(layout.names):
         share = share_of(shares, name)
         for kind, found in ((layout.vis2, share.vis2), (~layout.vis2, share.closure_phase)):
             here = (layout.source == k) & kind
             common[here], neighbour[here] = found.common, found.neighbour
             growth[:, here] = np.array([[found.offset], [found.slope]])
-            sloping[here] = found.sloping
+            smooth[:, here] = np.array(found.smooth)[:, None]
     # Half of it is common to all channels, half changes: calibrations err in either way.
     further = 0.5 * growth * floor_of_rows(layout, floors)
-    return layout.turned(common, neighbour, further, sloping)
+    return layout.turned(common, neighbour, further, smooth)
 
 
 def floor_of_rows(layout: ChannelLayout, floors: Sequence[Systematics]) -> FloatArray:
@@ -276,7 +276,7 @@ def correlation_of(
     jacobian: FloatArray,
     floors: Sequence[Systematics] = (),
     *,
-    sloping: bool = False,
+    changing: tuple[bool, bool] = (False, False),
 ) -> Correlation:
     """Find ρ and φ by restricted likelihood under a uniform prior: their posterior means.
 
@@ -290,8 +290,8 @@ def correlation_of(
         Of its parameters, likewise: they take their share of what is common.
     floors : sequence of Systematics
         What is common for certain.
-    sloping : bool
-        Exposures have errors that change evenly across channels, of any size.
+    changing : (bool, bool)
+        Whether exposures have errors that change across channels, of any size: evenly, by a curve.
 
     Notes
     -----
@@ -303,8 +303,8 @@ def correlation_of(
         return Correlation()
     both = np.column_stack([residual, jacobian])[layout.order]
     further = floor_of_rows(layout, floors)
-    slope = layout.slope if sloping else np.zeros(len(both))
-    loss = np.array([_losses(layout, both, further, slope, phi) for phi in NEIGHBOUR])
+    changes = layout.changes(changing)
+    loss = np.array([_losses(layout, both, further, changes, phi) for phi in NEIGHBOUR])
     mass = np.exp(-0.5 * (loss - loss.min())) * _widths(NEIGHBOUR)[:, None]
     mass /= mass.sum()
     value = COMMON + (1.0 - COMMON) * NEIGHBOUR[:, None]
@@ -321,23 +321,29 @@ def _widths(nodes: FloatArray) -> FloatArray:
 
 
 def _losses(
-    layout: ChannelLayout, both: FloatArray, further: FloatArray, slope: FloatArray, phi: float
+    layout: ChannelLayout, both: FloatArray, further: FloatArray, changes: FloatArray, phi: float
 ) -> FloatArray:
     """−2 ln of the restricted likelihood at every node of ρ, the scale of errors at its best.
 
-    ``both`` (rank, 1 + n_dim) has residual and slopes of the fit, sorted as the layout; of
-    ``slope`` (rank,) every group may have any amount.
+    ``both`` (rank, 1 + n_dim) has residual and slopes of the fit, sorted as the layout; of each of
+    the ``changes`` (n, rank) every group may have any amount.
     """
     neighbour = np.full(len(both), phi)
-    across = layout.innovations(slope, neighbour)
-    extent = layout.sums(across**2)
-    unit = across / np.sqrt(np.where(extent > 0.0, extent, 1.0))[layout.group]
+    units: list[FloatArray] = []
+    extents = [np.empty(0)]
 
     def level(values: FloatArray) -> FloatArray:
-        """Innovations of values (rank, n) without any slope."""
+        """Innovations of values (rank, n) without the changes so far."""
         steps = layout.innovations(values, neighbour)
-        return steps - unit[:, None] * layout.sums(unit[:, None] * steps)[layout.group]
+        for unit in units:
+            steps = steps - unit[:, None] * layout.sums(unit[:, None] * steps)[layout.group]
+        return steps
 
+    for change in changes:
+        across = level(change[:, None])[:, 0]
+        extent = layout.sums(across**2)
+        units.append(across / np.sqrt(np.where(extent > 0.0, extent, 1.0))[layout.group])
+        extents.append(extent[extent > 0.0])
     steps, weight = level(both), level(layout.weight[:, None])[:, 0]
     length = layout.sums(weight**2)
     along = layout.sums(steps * weight[:, None]) / np.sqrt(length)[:, None]
@@ -350,7 +356,7 @@ def _losses(
     along, length = along[several], length[several]
     whole = steps[several[layout.group]]
     rest, single = whole.T @ whole - along.T @ along, alone.T @ alone
-    free = np.log(extent[extent > 0.0])
+    free = np.log(np.concatenate(extents))
     n_rest = len(whole) - len(along) - len(free)
     back = layout._back(neighbour)
     log_step = float(np.log1p(-(back**2)).sum())

@@ -79,12 +79,30 @@ class ChannelLayout:
         """Whether there is a group of several channels."""
         return bool(len(self.count) and self.count.max() > 1)
 
+    def changes(self, which: tuple[bool, bool]) -> FloatArray:
+        """Errors that change across the channels of each group, (n, rank): slope, and curves.
+
+        Orthonormal; 0 where a group has none.
+        """
+        rows, place = (
+            self._plain,
+            np.arange(len(self.order)) - np.flatnonzero(self.starts)[self.group],
+        )
+        wanted = [level for level, one in zip((SLOPE, CURVE), which, strict=True) if one]
+        level = rows.level[self.order]
+        turn = csr_array(rows.rotation[self.order][:, self.order])
+        found = [
+            turn.T @ ((level == own) & (place == k)).astype(float)
+            for own in wanted
+            for k in np.unique(place[level == own])
+        ]
+        return np.array(found).reshape(-1, len(self.order))
+
     @cached_property
-    def slope(self) -> FloatArray:
-        """Error that changes evenly across the channels of each group, (rank,); 0 of one row."""
-        nothing = np.zeros(len(self.order))
-        rows = self.turned(nothing, nothing, np.zeros((2, len(nothing))), nothing)
-        return np.asarray((rows.rotation.T @ (rows.level == SLOPE).astype(float))[self.order])
+    def _plain(self) -> ChannelRows:
+        """Rows of channels that share nothing."""
+        n = np.zeros(len(self.order))
+        return self.turned(n, n, np.zeros((2, len(n))), np.zeros((3, len(n))))
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Sums of (rank, …) over the groups, (n_groups, …)."""
@@ -113,12 +131,13 @@ class ChannelLayout:
         common: FloatArray,
         neighbour: FloatArray,
         further: FloatArray,
-        sloping: FloatArray,
+        smooth: FloatArray,
     ) -> ChannelRows:
         """Rows for shares ρ, correlations φ (rank,) and variances of further errors (2, rank).
 
         Of these the first is common to the channels and the second changes across them, in units
-        of the errors, as does ``sloping`` (rank,), which is no floor. All are sorted likewise.
+        of the errors; ``smooth`` (3, rank) are those of offset, slope and curves that no floor has.
+        All are sorted likewise.
         """
         n = len(self.order)
         cuts = np.append(np.flatnonzero(self.starts), n).tolist()
@@ -138,15 +157,21 @@ class ChannelLayout:
             # what makes neighbours alike (overlap on the detector) blurs the signal there too.
             rest = np.maximum(basis.variance(phi), 1.0)
             rest = (1.0 - rho) * rest
-            # A floor says that exposures are too few to tell: no errors then shrink by a fit.
-            variance[first:last] = np.maximum(rest, 1.0) if floor[first] > 0.0 else rest
+            # A floor says that exposures are too few to tell: no errors then shrink by a fit. Nor
+            # do they where smooth errors are beside them, and not a share of them.
+            beside = floor[first] + smooth[:, first].sum() > 0.0
+            variance[first:last] = np.maximum(rest, 1.0) if beside else rest
             added[first] = further[0, first] * (last - first)
             added[first:last] += further[1, first] * basis.slope_share
             variance[first] += rho * (last - first)
             if basis.slope:
                 level[first : first + 2] = OFFSET, SLOPE
-                variance[first + 1] += sloping[first] * (last - first)
+                level[first + np.flatnonzero(basis.curves)] = CURVE
         variance += added
+        for own, size in zip((OFFSET, SLOPE, CURVE), smooth, strict=True):
+            here = (level == own).astype(float)
+            number = np.maximum(self.sums(here), 1.0)
+            variance += here * size * (self.count / number)[self.group]
         places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
         rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
         sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
@@ -175,7 +200,7 @@ class ChannelRows:
         Standard deviation of the rows.
     level : (rank,) int array
         `OFFSET` of rows along an error that is common to the channels, `SLOPE` of those along one
-        that changes evenly across them, 0 of all others.
+        that changes evenly across them, `CURVE` of curves over all of them, 0 of all others.
     floor : (rank,) float array
         Variance by further errors, of several channels.
     apart : ChannelRows, optional
@@ -199,7 +224,7 @@ class ChannelRows:
         )
 
 
-OFFSET, SLOPE = 1, 2
+OFFSET, SLOPE, CURVE = 1, 2, 3
 
 APART = 1e9
 """Channels between those of two polarisations: no noise of neighbours reaches so far."""

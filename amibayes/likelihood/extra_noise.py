@@ -122,6 +122,23 @@ class ExtraNoise:
         """Whether there is any."""
         return self.vis2 > 0.0 or self.closure_phase_rad > 0.0
 
+    @property
+    def smooth(self) -> tuple[float, float]:
+        """Of V² and of closure phases: what channels share beside the errors, rms in these.
+
+        The largest of all files; see `amibayes.likelihood.channel_noise.Correlation`.
+        """
+        found = [(sum(c.vis2.smooth), sum(c.closure_phase.smooth)) for c in self.channels]
+        vis2, closure = (
+            np.sqrt(np.max(found, axis=0, initial=0.0)).tolist() if found else (0.0, 0.0)
+        )
+        return vis2, closure
+
+    @property
+    def exceeds_stated(self) -> bool:
+        """Whether residuals show more than the stated errors and floors."""
+        return self.any or sum(self.smooth) > 0.0
+
     def of(self, data: Observables) -> tuple[FloatArray, FloatArray]:
         """Variance added to each unflagged V² (n_vis2,) and closure phase (n_closure,)."""
         vis2 = np.full(data.n_vis2, self.vis2**2)

@@ -23,6 +23,7 @@ from amibayes.likelihood.channel_noise import (
     noise_rows,
 )
 from amibayes.likelihood.channel_rows import (
+    CURVE,
     OFFSET,
     SLOPE,
     ChannelLayout,
@@ -125,14 +126,14 @@ class _Fit:
         floors = self.prior.floors
         one = _Kind(part, self.difference[which], self.jacobian[which], self.share, kind, floors)
         for _ in range(ROUNDS):
-            before, sloped = amount, shared.sloping > 0.0
+            before, smooth = amount, shared.smooth
             if self.prior.channels and self.data.freedom is None:
-                shared = one.correlation(amount, sloping=sloped)
+                shared = one.correlation(amount, smooth)
                 shared = one.with_larger_floors(amount, shared, self.prior)
-                shared = one.with_slopes(amount, shared, self.prior)
+                shared = one.with_smooth(amount, shared, self.prior)
                 shared = one.with_exposures(amount, shared)
             amount = one.amount(shared, self.prior.width(part, kind))
-            if abs(amount - before) <= 1e-2 * amount and (shared.sloping > 0.0) is sloped:
+            if abs(amount - before) <= 1e-2 * amount and _some(shared.smooth) == _some(smooth):
                 break
         return amount, shared
 
@@ -249,11 +250,11 @@ class _Kind:
         added = covariance_of(self.data, self._extra(1.0))
         return self.data.covariance.against(added, self.residual)
 
-    def correlation(self, amount: float, *, sloping: bool = False) -> Correlation:
-        """What channels share, given an amount of extra noise; see `correlation_of`."""
+    def correlation(self, amount: float, smooth: tuple[float, float, float]) -> Correlation:
+        """What channels share, given an amount of extra noise and `Correlation.smooth`."""
         base = self._with(amount)
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
-        return correlation_of(self._layout, white, slopes, self._own_floors, sloping=sloping)
+        return correlation_of(self._layout, white, slopes, self._own_floors, changing=_some(smooth))
 
     def with_larger_floors(
         self, amount: float, shared: Correlation, prior: NoisePrior
@@ -276,10 +277,11 @@ class _Kind:
         ]
         return replace(shared, offset=found[0], slope=found[1])
 
-    def with_slopes(self, amount: float, shared: Correlation, prior: NoisePrior) -> Correlation:
-        """The same with errors that change evenly across channels, where no floor has any.
+    def with_smooth(self, amount: float, shared: Correlation, prior: NoisePrior) -> Correlation:
+        """The same with errors that are smooth over channels, where no floor has any.
 
-        Those of single exposures tell their variance, as they do of a floor.
+        Those of single exposures tell their variance, as they do of a floor. They are beside what
+        details show of the size of all errors, of which the amount of extra noise is found next.
         """
         width = self._width(prior)
         if self._floor or not width:
@@ -288,14 +290,19 @@ class _Kind:
         layout = channel_layout(replace(self.data, covariance=base))
         rows, with_one = (
             channel_rows(layout, [ChannelShare(own, own)])
-            for own in (replace(shared, sloping=size) for size in (0.0, 1.0))
+            for own in (replace(shared, smooth=(size, size, size)) for size in (NEXT_TO_NONE, 1.0))
         )
-        at = rows.level == SLOPE
-        square = (rows.rotation @ base.whiten(self.residual)) ** 2
-        variance = rows.sigma[at] ** 2
-        added = with_one.sigma[at] ** 2 - variance
+        square, details = (rows.rotation @ base.whiten(self.residual)) ** 2, rows.level == 0
+        if not details.any():
+            return shared
+        square /= max(float((square / rows.sigma**2)[details].mean()) / self.share, 1.0)
+        added = with_one.sigma**2 - rows.sigma**2
         ratio = 1.0 / (float(np.median(layout.unit)) * width)
-        return replace(shared, sloping=self._growth(square[at], variance, added, ratio) - 1.0)
+        offset, slope, curve = (
+            self._growth(square[at], rows.sigma[at] ** 2, added[at], ratio) - 1.0
+            for at in (rows.level == level for level in (OFFSET, SLOPE, CURVE))
+        )
+        return replace(shared, smooth=(offset, slope, curve))
 
     @property
     def _floor(self) -> float:
@@ -338,11 +345,19 @@ class _Kind:
         return growth if loss(0.0) - best.fun > CLEARLY_LARGER else 1.0
 
 
+NEXT_TO_NONE = 1e-9
+"""Variance of smooth errors beside which all others are what they are beside larger ones."""
+
 MIN_ROWS = 6
 """Gains (of baselines in exposures) from which on their scatter is known to a third."""
 
 CLEARLY_LARGER = 4.0
 """2Δln L by which a floor has to be exceeded: two standard deviations."""
+
+
+def _some(smooth: tuple[float, float, float]) -> tuple[bool, bool]:
+    """Whether errors change across channels, evenly and by a curve."""
+    return smooth[1] > 0.0, smooth[2] > 0.0
 
 
 def _chi2(covariance: Covariance, residual: FloatArray) -> float:

@@ -8,6 +8,7 @@ from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amibayes.units import FloatArray, IntArray
 
@@ -41,6 +42,11 @@ class SmoothBasis:
     depth: IntArray
     spectrum: IntArray
     slope: bool
+
+    @property
+    def curves(self) -> NDArray[np.bool_]:
+        """Details of the whole range (n,), where those of shorter ranges are apart from them."""
+        return np.asarray((self.depth == 0) & (self.depth.max() > 0))
 
     @property
     def slope_share(self) -> FloatArray:

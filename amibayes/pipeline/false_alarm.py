@@ -243,7 +243,7 @@ def _nights_and_files(
     apart = "another star, orientation or calibration of a file"
     nights = by_night(data)
     parts = [(f"the night of {n}", mask, motion_words(moves=moves)) for n, mask in nights.items()]
-    if noise.any:
+    if noise.exceeds_stated:
         known = {mask.tobytes() for mask in nights.values()}
         files = {f.source: np.concatenate([f.vis2, f.closure_phase]) for f in files_of(data)}
         parts += [(n, mask, apart) for n, mask in files.items() if mask.tobytes() not in known]

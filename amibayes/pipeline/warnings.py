@@ -127,7 +127,11 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
     """Warn where the errors are so large that CANDID's nσ has lost its meaning."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
-    which = "the errors, with the noise that was added," if noise.any else "the stated errors"
+    which = (
+        "the errors, with the noise that was added,"
+        if noise.exceeds_stated
+        else "the stated errors"
+    )
     if noise.floors:
         which = "the errors, with the calibration errors of the instrument,"
     return [
@@ -176,15 +180,21 @@ def _grown(noise: ExtraNoise) -> str:
 
 
 def _noise_warning(noise: ExtraNoise) -> str:
+    parts = [f"noise of {_added(noise)} was added in quadrature"] * noise.any
+    kinds = zip(noise.smooth, ("V2", "closure phase"), strict=True)
+    if each := [f"{size:.2g} times the errors in {kind}" for size, kind in kinds if size > 0.0]:
+        parts.append(f"the channels of an exposure share errors of {' and '.join(each)}")
+    return (
+        f"the stated errors do not explain the residuals: {', and '.join(parts)}; chi2 and errors "
+        "include it"
+    )
+
+
+def _added(noise: ExtraNoise) -> str:
     each = [f for f in noise.files if f.vis2 > 0.0 or f.closure_phase_rad > 0.0]
     if each:
-        added = ", ".join(f"{_amount(f.vis2, f.closure_phase_rad)} to {f.source}" for f in each)
-    else:
-        added = _amount(noise.vis2, noise.closure_phase_rad)
-    return (
-        f"the stated errors do not explain the residuals: noise of {added} was added in "
-        "quadrature; chi2 and errors include it"
-    )
+        return ", ".join(f"{_amount(f.vis2, f.closure_phase_rad)} to {f.source}" for f in each)
+    return _amount(noise.vis2, noise.closure_phase_rad)
 
 
 def _amount(vis2: float, closure_phase_rad: float) -> str:
@@ -282,7 +292,7 @@ def search_warnings(
     found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
     if noise.floors:
         found.append(_floor_warning(noise))
-    if noise.any:
+    if noise.exceeds_stated:
         found.append(_noise_warning(noise))
     elif result.chi2_binary / result.ndof > 2.0:
         found.append(

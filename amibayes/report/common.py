@@ -76,8 +76,8 @@ def left_out_json(rows: Sequence[OutlyingRow]) -> list[Json]:
 def channel_correlation_json(noise: ExtraNoise) -> Json:
     """Correlation of neighbouring channels' noise, its error, what all share, and exposures share.
 
-    And errors that change evenly across channels, in units of the errors. Of files with
-    correlations of their own the mean.
+    And errors that are smooth over channels, in units of the errors. Of files with correlations
+    of their own the mean.
     """
     found: Json = {}
     for key in ("vis2", "closure_phase"):
@@ -91,8 +91,10 @@ def channel_correlation_json(noise: ExtraNoise) -> Json:
         found[f"{key}_common"] = float(np.mean(common)) if common else 0.0
         lasting = [sum(s.lasting) for s in shares]
         found[f"{key}_lasting"] = float(np.mean(lasting)) if lasting else 0.0
-        sloping = [s.sloping for s in shares]
-        found[f"{key}_slope_in_errors"] = float(np.sqrt(np.mean(sloping))) if sloping else 0.0
+        smooth = np.array([s.smooth for s in shares]).reshape(-1, 3)
+        rms = np.sqrt(smooth.mean(axis=0)) if len(smooth) else np.zeros(3)
+        for name, size in zip(("offset", "slope", "curve"), rms.tolist(), strict=True):
+            found[f"{key}_{name}_in_errors"] = size
     return found
 
 

@@ -22,7 +22,7 @@ from amibayes.likelihood.channel_noise import (
     correlation_of,
     noise_with_channels,
 )
-from amibayes.likelihood.channel_rows import OFFSET, SLOPE, channel_layout
+from amibayes.likelihood.channel_rows import CURVE, OFFSET, SLOPE, channel_layout
 from amibayes.likelihood.extra_noise import NoisePrior, with_noise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.noise_fit import _Kind, fit_noise
@@ -190,7 +190,7 @@ def test_gains_that_change_across_the_band_are_no_companion() -> None:
         draw = gain * across[sheet.vis2.channel] + 0.01 * rng.standard_normal(len(rows.ravel()))
         likelihood = Likelihood(with_draw(sheet, draw))
         noise = noise_with_channels(likelihood.observables, (), floors)
-        assert set(np.unique(noise.rows.level)) == {0, OFFSET, SLOPE}
+        assert set(np.unique(noise.rows.level)) == {0, OFFSET, SLOPE, CURVE}
         statistic = make_statistic(likelihood.with_noise(noise), grid, np.empty(0))
         null = statistic.draw_null(100, rng)
         out.append((1 + (null >= statistic.value).sum()) / 101.0)
@@ -209,29 +209,35 @@ def test_fit_of_noise_finds_share_and_amount(rng) -> None:
     ).channels
 
 
-def test_offsets_and_slopes_of_exposures_are_told_apart(rng) -> None:
-    """V² with offsets and slopes of 4 % and errors of 2 %: variances that were put in.
+@pytest.mark.parametrize(
+    "sizes", [(0.0, 0.0, 0.0), (0.04, 0.0, 0.0), (0.04, 0.04, 0.0), (0.04, 0.04, 0.03)]
+)
+def test_smooth_errors_of_exposures_are_told_apart(sizes, rng) -> None:
+    """V² with offsets, slopes and curves beside errors of 2 %: variances that were put in.
 
-    Of 72 exposures and baselines a variance is known to 0.17 of itself, and channels' to 0.08. With
-    nothing but ρ and φ that of a slope was a fourth of what it is.
+    Of 72 exposures and baselines a variance is known to 0.17 of itself. With nothing but ρ and φ
+    that of a slope was a fourth of what it is.
     """
     sheet = pionier(12, "diagonal").only(["vis2"])
     rows = np.unique(np.stack([sheet.vis2.setup, sheet.vis2.row]), axis=1, return_inverse=True)[1]
-    across = np.linspace(-1.0, 1.0, 6) / np.sqrt(np.mean(np.linspace(-1.0, 1.0, 6) ** 2))
-    for slope in (0.0, 0.04):
-        offset, own = 0.04 * rng.standard_normal((2, rows.max() + 1))[:, rows.ravel()]
-        draw = offset + own * (slope / 0.04) * across[sheet.vis2.channel]
-        draw += 0.02 * rng.standard_normal(len(draw))
-        likelihood = Likelihood(with_draw(sheet, draw))
-        theta = np.array([10.0, 5.0, 0.0])
-        noise = fit_noise(likelihood, theta)
-        assert (noise.channels[0].vis2.sloping > 0.0) is (slope > 0.0)
-        found = with_noise(likelihood, noise).noise.covariance.dense()[:6, :6]
-        curve = across**2 - 1.0
-        for shape, size in ((np.ones(6), 0.04), (across, slope), (curve, 0.0)):
-            unit = shape / np.linalg.norm(shape)
-            expected = 0.02**2 + 6.0 * size**2
-            assert unit @ found @ unit == pytest.approx(expected, rel=4.0 * 0.17)
+    # Curves are a tent, and a step with neither offset nor slope.
+    x = np.linspace(-1.0, 1.0, 6)
+    shapes = np.array([np.ones(6), x, np.abs(x) - 0.6, np.sign(x) - 9.0 / 7.0 * x])
+    shapes /= np.sqrt((shapes**2).mean(axis=1, keepdims=True))
+    curve = sizes[2] / np.sqrt(2.0)
+    theta, draw = np.array([10.0, 5.0, 0.0]), 0.02 * rng.standard_normal(len(rows.ravel()))
+    for shape, size in zip(shapes, (*sizes[:2], curve, curve), strict=True):
+        own = size * rng.standard_normal(rows.max() + 1)[rows.ravel()]
+        draw += own * shape[sheet.vis2.channel]
+    likelihood = Likelihood(with_draw(sheet, draw))
+    noise = fit_noise(likelihood, theta)
+    told = noise.channels[0].vis2.smooth
+    assert noise.vis2 < 0.015
+    found = with_noise(likelihood, noise).noise.covariance.dense()[:6, :6]
+    assert all(one > 0.0 or size == 0.0 for one, size in zip(told, sizes, strict=True))
+    for shape, size in zip(shapes, (*sizes[:2], curve, curve), strict=True):
+        expected = 0.02**2 + 6.0 * size**2
+        assert shape @ found @ shape / 6.0 == pytest.approx(expected, rel=5.0 * 0.17)
 
 
 def test_gains_larger_than_the_floor_are_fitted_and_smaller_ones_are_not(rng) -> None:
@@ -254,14 +260,22 @@ def test_gains_larger_than_the_floor_are_fitted_and_smaller_ones_are_not(rng) ->
 
 def test_extra_noise_is_bounded_by_its_prior(rng) -> None:
     """A binary that a single star is fitted to looks like noise of tens of degrees."""
-    data = simulated(pionier(4), [12.0, 6.0, 0.5], rng)
-    noise = fit_noise(Likelihood(data), np.array([10.0, 5.0, 0.0]))
-    assert noise.closure_phase_rad <= np.radians(9.0)
-    assert noise.vis2 <= 0.15
-    wide = fit_noise(
-        Likelihood(data), np.array([10.0, 5.0, 0.0]), prior=NoisePrior(1.0, np.radians(60.0))
-    )
-    assert wide.closure_phase_rad > np.radians(12.0)
+    likelihood = Likelihood(simulated(pionier(4), [12.0, 6.0, 0.5], rng))
+    theta = np.array([10.0, 5.0, 0.0])
+    bounds = {"narrow": (0.15, np.radians(9.0)), "wide": (3.0, np.radians(180.0))}
+    found = {
+        "narrow": fit_noise(likelihood, theta),
+        "wide": fit_noise(likelihood, theta, prior=NoisePrior(1.0, np.radians(60.0))),
+    }
+    for name, noise in found.items():
+        each = zip((noise.vis2, noise.closure_phase_rad), noise.smooth, bounds[name], strict=True)
+        for (amount, smooth, bound), error in zip(each, (0.02, np.radians(1.0)), strict=True):
+            assert amount <= bound
+            # Offset, slope and curve each.
+            assert smooth * np.hypot(error, amount) <= np.sqrt(3.0) * 1.1 * bound
+    wide = found["wide"]
+    size = wide.smooth[1] * np.hypot(np.radians(1.0), wide.closure_phase_rad)
+    assert np.hypot(size, wide.closure_phase_rad) > np.radians(12.0)
 
 
 def test_false_alarms_are_uniform_with_half_of_the_noise_common() -> None:
