@@ -34,6 +34,7 @@ from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, vet
 from amibayes.pipeline.warnings import (
     calibration_warnings,
+    calibrator_warnings,
     unused_calibrators,
     vetting_warnings,
 )
@@ -117,6 +118,11 @@ def prepare(
     warnings = (
         *vetting_warnings(ready.vetting),
         *calibration_warnings(ready.calibration),
+        *calibrator_warnings(
+            [part.only(options.observables) for part in parts],
+            ready.serving,
+            sized=options.calibrator_diameters is not None,
+        ),
         *unused_calibrators(ready.calibration, [r.source for r in references]),
         *(uncalibrated_images(targets) if ready.calibration is None else ()),
         *joined,
