@@ -135,6 +135,18 @@ def look_outside(result: SearchResult) -> float | None:
     return found.companion.separation_mas
 
 
+def rival_outside(result: SearchResult) -> list[str]:
+    """Warn where a companion outside the default field fits as well."""
+    place = look_outside(result)
+    if place is None:
+        return []
+    wider = f"{result.grid.inner_mas:.3g}:{MARGIN * place:.3g}"
+    return [
+        f"outside the field, near {place:.1f} mas, a companion fits as well: the position is not "
+        f"certain (--separation {wider} searches there too)"
+    ]
+
+
 def _residuals(likelihood: Likelihood, single: FloatArray) -> FloatArray:
     """Whitened residuals of a star alone, (n_data,)."""
     return single_likelihood(likelihood).residuals(single)[:, 0]

@@ -385,8 +385,8 @@ def _warnings(
             warnings.append("without closure phases a position cannot be told from its opposite")
     elif equal and any(m.delta_chi2 > modes[0].delta_chi2 - RIVAL for m in opposite):
         warnings.append(
-            "the two stars are equally bright within the errors: the position may be the opposite "
-            "one, 180 deg away, as either may be the companion"
+            "fitted as two stars, they are equally bright within the errors: the position may be "
+            "the opposite one, 180 deg away, as either may be the companion"
         )
     repeated = [m for m in aliases if m not in opposite]
     if repeated:

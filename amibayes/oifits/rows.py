@@ -58,6 +58,9 @@ T3 = Kind(
 )
 KINDS = {kind.table: kind for kind in (VIS2, T3)}
 
+MIN_BLANK = 4
+"""Closure phases of a table that are exactly 0, all of them: not one of so many was measured."""
+
 MIN_ERROR = 1e-12
 """An error below this is none: it would outweigh everything else."""
 
@@ -219,6 +222,11 @@ def unusable(kind: Kind, value: FloatArray, variance: FloatArray) -> BoolArray:
     return np.asarray(~usable)
 
 
+def blank(kind: Kind, value: FloatArray) -> bool:
+    """Whether a table, values (rows, channels), has 0 in place of closure phases."""
+    return kind.is_angle and value.size >= MIN_BLANK and not value.any()
+
+
 def _repeats_a_station(stations: IntArray) -> BoolArray:
     in_order = np.sort(stations, axis=1)
     return np.asarray((np.diff(in_order, axis=1) == 0).any(axis=1))
@@ -295,6 +303,7 @@ def _faults(
     known = np.isfinite(np.concatenate([cells.u_m, cells.v_m], axis=1)).all(axis=1)
     return {
         "without a usable value": unusable(kind, cells.value, fine),
+        "exactly 0, as all of the table": np.full_like(known, blank(kind, cells.value))[:, None],
         "without a usable error": unusable(kind, np.zeros_like(cells.value), has_error),
         "without a wavelength": np.broadcast_to(~(wavelength > 0), cells.value.shape),
         "without (u, v)": np.broadcast_to(~known[:, None], cells.value.shape),

@@ -235,7 +235,13 @@ def _table(hdu: Any, number: int) -> OITable:
 
 
 def _native(values: Any) -> NDArray[Any]:
-    """A read-only copy in the machine's byte order; bytes become text."""
+    """A read-only copy in the machine's byte order; bytes become text.
+
+    Arrays of variable length become one where every row has the same number of values.
+    """
+    rows = values if getattr(values, "dtype", np.dtype(float)).hasobject else ()
+    if len({np.shape(row) for row in rows}) == 1:
+        values = np.stack(list(rows))
     array = np.array(values)
     if array.dtype.kind == "S":
         array = np.char.decode(array, "latin-1")

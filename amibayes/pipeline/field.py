@@ -8,18 +8,17 @@ import numpy as np
 
 from amibayes.companion_search.field import (
     EXPLAINED,
-    MARGIN,
     SURELY_NOT_NOISE,
     choose_field,
     default_separation,
     look_inside,
-    look_outside,
     notices_disc,
     on_inner_edge,
     on_outer_edge,
     outermost,
     refuse_no_length,
     resolution_mas,
+    rival_outside,
     wider_fields,
 )
 from amibayes.companion_search.optimise import SHAPE_START, refine, with_disc
@@ -39,7 +38,7 @@ from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.models.parameters import Box
-from amibayes.pipeline.options import SearchOptions, model_of, noise_prior
+from amibayes.pipeline.options import SearchOptions, is_past_null, model_of, noise_prior
 
 DISC_CONTRAST = 0.03
 """Contrast below which a disc is not tried unasked: as large as the star's it would have a surface
@@ -136,8 +135,9 @@ def _search_field(observables: Observables, options: SearchOptions) -> FieldSear
         first, wider = _in_wider_field(likelihood, first, options)
         first, past = _past_the_edge(likelihood, first, options)
         warnings = past or wider or warnings
+    first = _with_small_star(first) if options.limb_darkening is None else first
     result, noise = _searched(first, options)
-    warnings += _beyond(result) if options.separation_mas else _rival_outside(result)
+    warnings += _beyond(result) if options.separation_mas else rival_outside(result)
     return FieldSearch(result, noise, tuple(warnings), observables)
 
 
@@ -157,6 +157,21 @@ def _chosen_field(
     field = field[0], farthest
     told = f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: near {place:.1f} mas"
     return field, [f"{told}, {better}"]
+
+
+def _with_small_star(first: SearchResult) -> SearchResult:
+    """The search without limb darkening, where the star beside its companion is not past its null.
+
+    As a star alone two bright ones are; that of a small one makes its diameter undetermined.
+    """
+    model, names = first.likelihood.model, first.likelihood.parameters.names
+    if model.limb_darkening != "free" or first.chi2_binary > EXPLAINED * first.chi2_single:
+        return first
+    if is_past_null(first.likelihood, first.nuisance("diameter_mas")):
+        return first
+    uniform = first.likelihood.with_model(replace(model, limb_darkening=0.0))
+    known = np.delete([mode.theta for mode in first.modes], names.index("limb_darkening"), axis=1)
+    return search(uniform, (first.grid.inner_mas, first.grid.outer_mas), known=known, check=False)
 
 
 def _with_its_disc(
@@ -257,18 +272,6 @@ def _score(result: SearchResult, options: SearchOptions) -> float:
     prior = noise_prior(likelihood.observables, options)
     _, noisy = noise_beside(likelihood, result.theta, per_file=apart, prior=prior)
     return float(-2.0 * noisy.log_prob(result.theta)[0])
-
-
-def _rival_outside(result: SearchResult) -> list[str]:
-    """Warn where a companion outside the default field fits as well."""
-    place = look_outside(result)
-    if place is None:
-        return []
-    wider = f"{result.grid.inner_mas:.3g}:{MARGIN * place:.3g}"
-    return [
-        f"outside the field, near {place:.1f} mas, a companion fits as well: the position is not "
-        f"certain (--separation {wider} searches there too)"
-    ]
 
 
 def _without_disc(likelihood: Likelihood, free: SearchResult) -> tuple[Likelihood, SearchResult]:

@@ -228,7 +228,13 @@ def past_first_null(likelihood: Likelihood) -> bool:
         return False
     disc = likelihood.with_model(BinaryModel(1, "free"))
     (diameter,), _ = fit_single(disc)
-    return bool(np.pi * diameter * MAS * likelihood.samples.frequency.max() > FIRST_NULL)
+    return is_past_null(likelihood, diameter)
+
+
+def is_past_null(likelihood: Likelihood, diameter_mas: float) -> bool:
+    """Whether the longest baseline is past the null of a disc."""
+    longest = likelihood.samples.frequency.max()
+    return bool(np.pi * diameter_mas * MAS * longest > FIRST_NULL)
 
 
 FIRST_NULL = 3.83

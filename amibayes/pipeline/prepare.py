@@ -31,12 +31,14 @@ from amibayes.extraction.reading import (
 )
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
-from amibayes.pipeline.vetting import Vetting, vet
+from amibayes.pipeline.vetting import Vetting, agreement_of_two, vet
 from amibayes.pipeline.warnings import (
     calibration_warnings,
+    calibrator_warnings,
     unused_calibrators,
     vetting_warnings,
 )
+from amibayes.support.options import VETTING_ALPHA
 from amibayes.support.shared_results import shared
 
 MIN_TO_VET = 3
@@ -117,6 +119,12 @@ def prepare(
     warnings = (
         *vetting_warnings(ready.vetting),
         *calibration_warnings(ready.calibration),
+        *_two_that_disagree(ready),
+        *calibrator_warnings(
+            [part.only(options.observables) for part in parts],
+            ready.serving,
+            sized=options.calibrator_diameters is not None,
+        ),
         *unused_calibrators(ready.calibration, [r.source for r in references]),
         *(uncalibrated_images(targets) if ready.calibration is None else ()),
         *joined,
@@ -185,6 +193,21 @@ def _calibrated(
         serving=tuple(serving),
         diameters_mas=tuple(sizes),
     )
+
+
+def _two_that_disagree(ready: Prepared) -> list[str]:
+    """Warn of two calibrators, too few to be vetted, that disagree."""
+    if len(ready.serving) != 2 or ready.vetting is not None:
+        return []
+    each = zip(ready.serving, ready.diameters_mas, strict=True)
+    first, second = (without_disc(data, *size) for data, size in each)
+    p = agreement_of_two(first, second)
+    if p is None or p >= VETTING_ALPHA:
+        return []
+    return [
+        f"the calibrators {first.source} and {second.source} disagree (p = {p:.1g}): one of them "
+        "may be no point, and which cannot be told (see amibayes vet, and give a third)"
+    ]
 
 
 def _vetted(

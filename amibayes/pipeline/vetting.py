@@ -171,6 +171,14 @@ def vet(
     return Vetting(tuple(calibrators_tested), alpha)
 
 
+def agreement_of_two(first: Observables, second: Observables) -> float | None:
+    """Probability that two calibrators, as points, disagree as much; None where nothing is shared.
+
+    Which of them is the bad one they cannot tell.
+    """
+    return _LeaveOut([first.unflagged(), second.unflagged()]).agreement(0, [0, 1])
+
+
 def _ratio(charge_levels: Sequence[float] | None, k: int) -> float | None:
     return None if charge_levels is None else float(charge_levels[1 + k] / charge_levels[0])
 

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
+from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
@@ -20,6 +21,7 @@ from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.grid import integrable
 from amibayes.posterior.modes import modes_to_sample
 from amibayes.posterior.priors import Prior
+from amibayes.units import MAS, FloatArray
 
 MAX_NAMED = 3
 """Outliers that a warning names."""
@@ -48,6 +50,60 @@ def calibration_warnings(calibration: Calibration | None) -> list[str]:
         "in simulated NIRISS images 68 % intervals then held 54 %, with three calibrators "
         "their nominal share"
     ]
+
+
+USUAL_CALIBRATOR_MAS, NOTABLE_LOSS = 0.3, 0.01
+"""Diameter that calibrators of interferometers have, and a change of V² that diameters notice."""
+
+SAME_NIGHT_DAYS = 0.5
+
+
+def calibrator_warnings(
+    targets: Sequence[Observables], references: Sequence[Observables], *, sized: bool
+) -> list[str]:
+    """Tell of calibrators taken for points that may not be, and of those of other nights.
+
+    Parameters
+    ----------
+    targets, references : sequence of Observables
+        As read; V² that are not used are flagged or left out.
+    sized : bool
+        Diameters of calibrators were given.
+    """
+    if not references:
+        return []
+    found = []
+    used = [data.vis2.select(~data.vis2.flag) for data in targets]
+    longest = max((float(np.max(_frequency(m), initial=0.0)) for m in used), default=0.0)
+    # V² of a small disc: 1 − x²/4.
+    loss = 0.25 * (np.pi * USUAL_CALIBRATOR_MAS * MAS * longest) ** 2
+    if loss > NOTABLE_LOSS and not sized:
+        found.append(
+            f"calibrators were taken for points: one of {USUAL_CALIBRATOR_MAS} mas makes V2 of the "
+            f"target up to {100.0 * min(1.0, loss):.0f} % too large and its diameter too small "
+            "(--calibrator-diameters)"
+        )
+    dates = np.concatenate([_dates(data) for data in references])
+    for data in targets if len(dates) else ():
+        days = float(np.abs(_dates(data)[:, None] - dates).min(axis=1).max(initial=0.0))
+        if days > SAME_NIGHT_DAYS:
+            found.append(
+                f"{data.source} has exposures {days:.1f} days from the nearest one of a "
+                "calibrator: nothing tells how the instrument changed from night to night"
+            )
+    return found
+
+
+def _dates(observables: Observables) -> FloatArray:
+    """Dates of exposures, without those of a file that tells none."""
+    dates = np.unique(np.concatenate([observables.vis2.mjd, observables.closure_phase.mjd]))
+    return np.asarray(dates[dates > 1.0])
+
+
+def _frequency(measurements: Measurements) -> FloatArray:
+    """Spatial frequency (n,) of V²."""
+    length = np.hypot(measurements.u_m[:, 0], measurements.v_m[:, 0])
+    return np.asarray(length / measurements.wavelength_m)
 
 
 def unused_calibrators(calibration: Calibration | None, given: Sequence[str]) -> list[str]:

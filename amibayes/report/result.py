@@ -12,7 +12,7 @@ from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.comparison.limits import LimitsBeside
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance
-from amibayes.detection.verdict import Verdict
+from amibayes.detection.verdict import REFUSED, Verdict
 from amibayes.likelihood.likelihood import single_likelihood
 from amibayes.likelihood.student import DEGREES, normal_moments
 from amibayes.pipeline.report_types import SearchReport, calibrator_verdicts
@@ -287,10 +287,13 @@ def upper_limit(report: SearchReport, level: float = 0.95) -> Json | None:
 
     With a contrast uniform in the range of the prior: a log-uniform one gives a bound that its
     lower end makes, as low as one likes. Null where it takes the chain's samples, which have one
-    prior, and where the data do not lower the bound of the prior alone to half.
+    prior, and where the data do not lower the bound of the prior alone to half. Nor has a model
+    that the verdict refuses a bound.
     """
     tested, posterior, grid = report.significance, report.posterior, report.grid
     if posterior is None or grid is None or (tested is not None and tested.detected):
+        return None
+    if report.statement in REFUSED:
         return None
     contrast = grid.upper_limit(level, uniform=True)
     low, high = posterior.prior.contrast_min, posterior.prior.contrast_max

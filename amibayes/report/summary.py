@@ -58,7 +58,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         lines += _posterior_lines(report.posterior)
     lines += _upper_limit_lines(report)
     if report.evidence is not None:
-        lines += _evidence_lines(report.evidence)
+        lines += _evidence_lines(report, report.evidence)
         lines += _second_lines(report, report.evidence)
     lines += models_lines(report.models, report.limits_beside)
     if report.limits is not None:
@@ -310,10 +310,24 @@ def _upper_limit_lines(report: SearchReport) -> list[str]:
     ]
 
 
-def _evidence_lines(evidence: Evidence) -> list[str]:
+def _evidence_lines(report: SearchReport, evidence: Evidence) -> list[str]:
+    """Evidences, and what speaks against the most likely number of companions."""
     shares = zip(evidence.companions, evidence.log_z, evidence.probability, strict=True)
-    parts = [f"{k}: ln Z {z:.1f} ({_share(p)})" for k, z, p in shares]
-    return [f"evidence    companions (probability) {', '.join(parts)}"]
+    said = ", ".join(f"{k}: ln Z {z:.1f} ({_share(p)})" for k, z, p in shares)
+    if evidence.halo_log_z > max(evidence.log_z) + HALO_LIKELIER:
+        said += (
+            f"; none, but light that no baseline resolves: {evidence.halo_log_z:.1f}, more likely "
+            "(--background free)"
+        )
+    likeliest = evidence.companions[int(np.argmax(evidence.log_z))]
+    shared = report.significance is not None and report.significance.exposures is not None
+    if shared and likeliest > 0 and report.statement == "no companion":
+        said += "; as if exposures erred independently, which the verdict does not take for granted"
+    return [f"evidence    companions (probability) {said}"]
+
+
+HALO_LIKELIER = 3.0
+"""Gain in ln Z from which over-resolved light is told of: odds of 20."""
 
 
 def _share(probability: float) -> str:

@@ -7,6 +7,8 @@ import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from helpers import error_of, niriss, simulated
 
 from amibayes.calibration import calibrate
 from amibayes.detection.false_alarm import Significance
+from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.models.binary import BinaryModel
@@ -165,6 +168,35 @@ def test_other_positions_and_lost_limits_stand_in_the_statement(report: SearchRe
     assert "and 2 more" in said
     assert "No injected companion is recovered reliably" in said
     assert upper_limit(report) is None
+
+
+def test_a_model_that_is_refused_has_no_upper_limit(report: SearchReport) -> None:
+    assert report.significance is not None
+    assert report.verdict is not None
+    prior = SimpleNamespace(contrast_min=1e-5, contrast_max=1.0)
+    tight = SimpleNamespace(upper_limit=lambda *_, **__: 0.01)
+    unsure = replace(report.significance, interval=(0.2, 0.3))
+    parts: dict[str, Any] = {"posterior": SimpleNamespace(prior=prior), "grid": tight}
+    rejected = replace(report, significance=unsure, **parts)
+    none = replace(rejected, verdict=Verdict("no companion", "", 0.5))
+    assert rejected.statement == "model rejected"
+    assert upper_limit(rejected) is None
+    assert (upper_limit(none) or {})["contrast"] == 0.01
+
+
+def test_what_speaks_against_the_evidence_is_told(report: SearchReport) -> None:
+    found = report.evidence
+    assert found is not None
+    assert "baseline resolves" not in line(report, "evidence")
+    likelier = replace(found, halo_log_z=max(found.log_z) + 4.0)
+    said = line(replace(report, evidence=likelier), "evidence")
+    assert f"no baseline resolves: {likelier.halo_log_z:.1f}, more likely" in said
+    assert report.significance is not None
+    test: Any = replace(report.significance.test, exposures=object())  # type: ignore[type-var]
+    shared = replace(report, significance=replace(report.significance, test=test))
+    assert "independently" not in line(shared, "evidence")
+    none = replace(shared, verdict=Verdict("no companion", "", 0.5))
+    assert "as if exposures erred independently" in line(none, "evidence")
 
 
 def test_a_run_without_calibrators_has_no_verdicts(report: SearchReport) -> None:

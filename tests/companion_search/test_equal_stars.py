@@ -16,7 +16,7 @@ from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
 
 FIELD = (80.0, 670.0)
-TOLD = "equally bright"
+TOLD = "fitted as two stars, they are equally bright"
 
 
 def test_equal_stars_are_at_either_place(rng) -> None:

@@ -240,6 +240,40 @@ def test_flags_in_letters_are_obeyed(made: MaskFile, tmp_path: Path) -> None:
     assert list(np.flatnonzero(found.vis2.flag)) == [1]
 
 
+def test_closure_phases_that_are_all_zero_are_none(made: MaskFile, tmp_path: Path) -> None:
+    """Files of V² alone may hold them, with errors as if they were measured."""
+    made.change("OI_T3", np.zeros_like, "T3PHI")
+    path = made.write(tmp_path / "a.fits")
+    found = read_oifits(path)
+    assert found.closure_phase.flag.all()
+    assert not found.vis2.flag.any()
+    assert any("exactly 0, as all of the table" in note for note in found.notes)
+    assert "blank-phases" in {f.code for f in audit(path).findings}
+
+
+def test_some_closure_phases_may_be_zero(made: MaskFile, tmp_path: Path) -> None:
+    made.change("OI_T3", lambda x: np.where(np.arange(x.size).reshape(x.shape), 0.0, x), "T3PHI")
+    assert not read_oifits(made.write(tmp_path / "a.fits")).closure_phase.flag.any()
+
+
+def test_arrays_of_variable_length(made: MaskFile, tmp_path: Path) -> None:
+    sound = made.write(tmp_path / "sound.fits")
+    with fits.open(sound) as hdus:
+        for number, hdu in enumerate(hdus):
+            if hdu.name not in {"OI_VIS2", "OI_T3"}:
+                continue
+            columns = [
+                fits.Column(c.name, "PD()", array=np.array(hdu.data[c.name], dtype=object))
+                if c.format == "2D"
+                else c
+                for c in hdu.columns
+            ]
+            own = {k: hdu.header[k] for k in ("EXTNAME", "INSNAME", "ARRNAME") if k in hdu.header}
+            hdus[number] = fits.BinTableHDU.from_columns(columns, fits.Header(own))
+        hdus.writeto(tmp_path / "a.fits")
+    assert_same(read_oifits(tmp_path / "a.fits"), read_oifits(sound))
+
+
 def test_several_targets(made: MaskFile, tmp_path: Path) -> None:
     """Rows of two targets without stations: each is identified by itself."""
     sound = read_oifits(made.write(tmp_path / "sound.fits"))

@@ -34,6 +34,21 @@ def test_limb_darkening_is_free_where_the_star_is_past_its_null(diameter, expect
     assert model_of(Likelihood(data), SearchOptions(limb_darkening=0.1)).limb_darkening == 0.1
 
 
+def test_two_small_stars_are_no_darkened_giant(rng) -> None:
+    """A fit of one star takes them for a disc past its null, where limb darkening is free."""
+    sheet = point_source(
+        STATIONS, np.linspace(1.55e-6, 1.75e-6, 4), 0.04e-6, vis2_error=0.01, closure_error_rad=0.02
+    )
+    data = simulated(sheet, [5.0, 7.0, 0.95], rng, BinaryModel(diameter_mas=0.5))
+    assert model_of(Likelihood(data), SearchOptions()).limb_darkening == "free"
+    result = search_field(data, SearchOptions()).result
+    assert result.likelihood.model.limb_darkening == 0.0
+    at = result.likelihood.parameters.index("diameter_mas")
+    error = np.sqrt(result.theta_covariance[at, at])
+    assert error < 0.2
+    assert abs(result.theta[at] - 0.5) < 4.0 * error
+
+
 @pytest.mark.parametrize(("position", "outer"), [((4.2, 4.6), 10.2), ((2.2, -1.4), 4.1)])
 def test_a_bright_companion_outside_the_default_field_is_found(position, outer, rng) -> None:
     """V² of one baseline that turns, one narrow channel: the default field ends at 4.1 mas.

@@ -5,11 +5,14 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from amibayes.comparison.hypotheses import FAMILIES, hypotheses
 from amibayes.comparison.verdict import candidates
+from amibayes.data.point_source import point_source
 from amibayes.pipeline.models import models_warnings
+from amibayes.pipeline.warnings import calibrator_warnings
 from amibayes.support.options import SKY_MODELS
 
 
@@ -66,3 +69,31 @@ def test_no_kind_of_models_has_the_name_of_a_model() -> None:
     names = [name for name, _ in candidates(models)]
     assert len(set(names)) == len(names)
     assert set(FAMILIES.values()) & {m.name for m in models} <= {"star"}
+
+
+@pytest.mark.parametrize(("metres", "sized", "told"), [(100.0, False, True), (100.0, True, False),
+                                                       (5.0, False, False)])  # fmt: skip
+def test_calibrators_that_were_taken_for_points(metres: float, sized: bool, told: bool) -> None:
+    """0.3 mas at 100 m in K loses 1.1 % of V²; no mask of a telescope notices it."""
+    stations = np.array([[0.0, 0.0], [metres, 0.0], [0.0, 0.3 * metres]])
+    data = point_source(
+        stations, np.array([2.2e-6]), 5e-8, vis2_error=0.02, closure_error_rad=0.02, mjd=60000.0
+    )
+    said = calibrator_warnings([data], [data], sized=sized)
+    assert any("taken for points" in text for text in said) is told
+    assert not any("days" in text for text in said)
+    assert calibrator_warnings([data], [], sized=sized) == []
+    assert calibrator_warnings([data.only(["cp"])], [data], sized=False) == []
+
+
+@pytest.mark.parametrize(("days", "told"), [(0.2, False), (3.0, True)])
+def test_calibrators_of_another_night_are_told(days: float, told: bool) -> None:
+    target, calibrator = (
+        point_source(
+            np.array([[0.0, 0.0], [5.0, 0.0], [0.0, 3.0]]), np.array([2.2e-6]), 5e-8,
+            vis2_error=0.02, closure_error_rad=0.02, mjd=mjd,
+        )
+        for mjd in (60000.0, 60000.0 + days)
+    )  # fmt: skip
+    said = calibrator_warnings([target], [calibrator], sized=False)
+    assert any("3.0 days from the nearest" in text for text in said) is told

@@ -20,6 +20,7 @@ from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import write_oifits
+from amibayes.pipeline.prepare import Prepared, _two_that_disagree
 from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, notes, vet
 from amibayes.report.vetting import vetting_picture, vetting_table
 from amibayes.units import MAS
@@ -149,6 +150,22 @@ def test_two_that_disagree_are_both_kept_and_doubted(rng, tmp_path: Path, capsys
     assert any("charge level is 5 times" in text for text in said)
     assert any("disagrees" in text or "companion" in text for text in said)
     assert (tmp_path / "out" / "vetting.png").stat().st_size > 1000
+
+
+def test_a_search_with_two_that_disagree_says_so(rng) -> None:
+    good, other, bad = (calibrator(rng, name=name) for name in ("good", "other", "bad"))
+    bad = simulated(bad, [120.0, 60.0, 0.05], rng)
+    sizes = ((0.0, 0.0),) * 2
+
+    def said(*serving: Observables, vetting: Vetting | None = None) -> list[str]:
+        return _two_that_disagree(
+            Prepared(good, serving=serving, diameters_mas=sizes, vetting=vetting)
+        )
+
+    assert said(good, other) == []
+    (words,) = said(good, bad)
+    assert words.startswith("the calibrators good and bad disagree (p = ")
+    assert said(good, bad, vetting=Vetting((), 0.003)) == []
 
 
 def test_one_that_disagrees_with_a_dropped_one_is_not_doubted() -> None:

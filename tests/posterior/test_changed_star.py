@@ -7,6 +7,8 @@ times, and one of 0.2 fits as well with a disc that is 10 mas (35 errors of the 
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,6 +145,26 @@ def test_chain_without_an_integral_has_the_posterior_of_brute_force() -> None:
         mean = float(weight @ values)
         error = np.sqrt(weight**2 @ (values - mean) ** 2 + found.var() / posterior.n_effective)
         assert abs(found.mean() - mean) < 5.0 * error, name
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-4])
+def test_posterior_far_narrower_than_the_errors(
+    width: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One node of the first layout has all the weight: closure phases that turn at nulls do so."""
+    error, away = 0.02, 0.015305  # of the node above the middle of 20
+
+    def log_prob(theta: np.ndarray) -> np.ndarray:
+        return -0.5 * ((theta[:, 0] - 5.0 - away - 0.3 * width) / width) ** 2
+
+    likelihood = SimpleNamespace(errors=lambda _: np.array([[error**2]]), log_prob=log_prob)
+    flat = SimpleNamespace(low=0.0, high=10.0, log_density=lambda x: np.full_like(x, -np.log(10)))
+    monkeypatch.setattr("amibayes.posterior.nuisance.single_likelihood", lambda _: likelihood)
+    prior: Any = SimpleNamespace(ranges=[flat])
+    unused: Any = None
+    found = star_alone(unused, prior, np.array([5.0]))
+    assert found.log_z == pytest.approx(np.log(width * np.sqrt(2.0 * np.pi) / 10.0), abs=0.01)
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(width, rel=0.1)
 
 
 def test_density_of_a_companion_that_is_not_noticed_adds_up_to_1() -> None:

@@ -21,7 +21,8 @@ def bounded(vis2_error: float, closure_error_deg: float, rng):
     grid = grid_posterior(likelihood, prior)
     tested = SimpleNamespace(detected=False)
     posterior = SimpleNamespace(prior=prior)
-    return upper_limit(SimpleNamespace(significance=tested, posterior=posterior, grid=grid))
+    parts = {"significance": tested, "posterior": posterior, "grid": grid}
+    return upper_limit(SimpleNamespace(statement="no companion", **parts))
 
 
 def test_a_bound_by_the_data_is_that_of_a_uniform_contrast(rng) -> None:

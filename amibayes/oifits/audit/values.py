@@ -15,7 +15,7 @@ from amibayes.oifits.audit.finding import (
     unflagged,
 )
 from amibayes.oifits.dates import mjd_of_date
-from amibayes.oifits.rows import Kind, times_of, unusable
+from amibayes.oifits.rows import Kind, blank, times_of, unusable
 from amibayes.oifits.scales import LENGTH, TIME, scale_of
 from amibayes.oifits.tables import OIFits, OITable
 from amibayes.units import FloatArray
@@ -149,6 +149,21 @@ def unusable_unflagged(oifits: OIFits) -> Findings:
             )
 
 
+def blank_phases(oifits: OIFits) -> Findings:
+    """Closure phases that are 0 throughout a table."""
+    for table, kind in data_tables(oifits):
+        value = column(table, kind.value)
+        if value is not None and blank(kind, value):
+            yield Finding(
+                "error",
+                "blank-phases",
+                table.label,
+                f"every closure phase is exactly 0 ({count(value.size, 'value')})",
+                "none was measured, and a fit takes them for a star without a companion",
+                "flag them, or leave the table out",
+            )
+
+
 def vis2_range(oifits: OIFits) -> Findings:
     """V² above 1 or below 0 beyond their errors."""
     for table, kind in data_tables(oifits):
@@ -252,6 +267,7 @@ CHECKS = (
     dates,
     integration_times,
     unusable_unflagged,
+    blank_phases,
     vis2_range,
     phase_range,
     phases_that_are_radians,
