@@ -265,7 +265,7 @@ def beside_bright(tested: Significance, result: SearchResult, noise: ExtraNoise)
     tested : Significance
     result : SearchResult
     noise : ExtraNoise
-        What was added to the stated errors. Where anything was, the companion has to explain
+        What residuals show beside the stated errors. Where it is any, the companion has to explain
         more of the residuals, `EXPLAINED_BESIDE_NOISE`; else ``tested`` is given back.
 
     Notes
@@ -274,8 +274,10 @@ def beside_bright(tested: Significance, result: SearchResult, noise: ExtraNoise)
     """
     if tested.detected is not False:
         return tested
-    added = noise.vis2 > 0.0 or noise.closure_phase_rad > 0.0
-    if added and result.chi2_binary > (1.0 - EXPLAINED_BESIDE_NOISE) * result.chi2_single:
+    if (
+        noise.exceeds_stated
+        and result.chi2_binary > (1.0 - EXPLAINED_BESIDE_NOISE) * result.chi2_single
+    ):
         return tested
     bound = bright_probability(result, tested.test)
     if bound is None or 2.0 * bound >= tested.probability:
