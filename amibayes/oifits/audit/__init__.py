@@ -7,7 +7,7 @@ from pathlib import Path
 
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
-from amibayes.oifits.audit import geometry, jwst, noise, packages, structure, values
+from amibayes.oifits.audit import geometry, jwst, noise, packages, scale, structure, values
 from amibayes.oifits.audit.finding import Finding, Severity
 from amibayes.oifits.audit.repair import repair
 from amibayes.oifits.columns import integers
@@ -21,10 +21,11 @@ __all__ = ["Audit", "Finding", "Severity", "audit", "errors_in", "repair"]
 FILE_CHECKS = (
     *structure.CHECKS,
     *values.CHECKS,
+    *scale.CHECKS,
     *geometry.CHECKS,
     *noise.CHECKS,
 )
-DATA_CHECKS = (*geometry.DATA_CHECKS, *noise.DATA_CHECKS)
+DATA_CHECKS = (*geometry.DATA_CHECKS, *scale.DATA_CHECKS, *noise.DATA_CHECKS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,8 @@ def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
         What was read of it.
     """
     found = [finding for check in (*FILE_CHECKS, *packages.CHECKS) for finding in check(oifits)]
-    found += [f for check in geometry.DATA_CHECKS for f in check(oifits, [observables])]
+    checks = (*geometry.DATA_CHECKS, *scale.DATA_CHECKS)
+    found += [f for check in checks for f in check(oifits, [observables])]
     groups: dict[str, list[Finding]] = {}
     for finding in found:
         if finding.severity == "error" or finding.code in ALSO_WARNED_OF:
