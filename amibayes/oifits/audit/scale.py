@@ -192,10 +192,10 @@ def _rows_of_sides(table: OITable, other: OITable) -> IntArray | None:
     ours, theirs = ([column(t, n) for n in names] for t in (table, other))
     if any(x is None for x in (*ours, *theirs)):
         return None
-    if [np.shape(x)[1] for x in (ours[0], theirs[0])] not in ([2, 2], [2, 3]):
-        return None
     stations, target, mjd = (np.asarray(x) for x in ours)
     ends, whose, when = (np.asarray(x) for x in theirs)
+    if stations.shape[1] != 2 or ends.shape[1] not in (2, 3):
+        return None
     sides = [(0, 1)] if ends.shape[1] == 2 else [(0, 1), (1, 2), (0, 2)]
     found = np.full((len(ends), len(sides)), -1, dtype=np.intp)
     for k, side in enumerate(sides):
