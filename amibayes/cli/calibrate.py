@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from amibayes.calibration.transfer import Diameter
     from amibayes.data.observables import Observables
     from amibayes.extraction.reading import ImageOptions
+    from amibayes.pipeline.options import SearchOptions
 
 RESULT, KERNEL_RESULT = "calibrated.oifits", "calibrated_kpfits.fits"
 
@@ -70,14 +71,15 @@ def _add_method(group: argparse._ArgumentGroup) -> None:
 def _add_data(group: argparse._ArgumentGroup) -> None:
     data_options.add_closure_covariance(group)
     data_options.add_insname(group)
-    group.add_argument("--target", metavar="NAME", help="use one target of the target's files")
+    data_options.add_target(group)
+    data_options.add_cal_target(group)
     data_options.add_reduction(group)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate and write the file."""
     common.configure_logging(arguments)
-    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    common.refuse_repeated(arguments.targets, arguments.cal)
     if not arguments.cal and arguments.library is None:
         raise UsageError("no calibrator given", remedy="give --cal FILES, or --library FILE")
     import numpy as np
@@ -85,13 +87,15 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.calibration import calibrate, diameters_of
     from amibayes.extraction.reading import charge_of, check_together, of_one_visit
     from amibayes.kpfits import write_observables
+    from amibayes.pipeline.prepare import read, read_calibrators
     from amibayes.report.noise import migration_json, migration_lines
     from amibayes.support.atomic_files import output_folder
 
     check_together(arguments.targets, arguments.cal)
     images = of_one_visit([*arguments.targets, *arguments.cal], common.image_options_of(arguments))
-    calibrators = _prepared(arguments.cal, arguments, images, target=None, one_star=False)
-    targets = _prepared(arguments.targets, arguments, images, target=arguments.target)
+    reading = _reading(arguments, images)
+    targets = read(arguments.targets, reading)
+    calibrators = read_calibrators(arguments.cal, reading, targets)
     names = [RESULT, KERNEL_RESULT]
     folder = output_folder(arguments.out, names, overwrite=arguments.overwrite)
     diameters = diameters_of(arguments.calibrator_diameters, calibrators)
@@ -151,30 +155,18 @@ def _keep(
     add_to_library(arguments.add_to_library, calibrators, facts)
 
 
-def _prepared(
-    paths: list[str],
-    arguments: argparse.Namespace,
-    images: ImageOptions,
-    target: str | None,
-    *,
-    one_star: bool = True,
-) -> list[Observables]:
-    """Read files, flag, average."""
-    from amibayes.calibration import reduce_data
-    from amibayes.extraction.reading import read_observations
+def _reading(arguments: argparse.Namespace, images: ImageOptions) -> SearchOptions:
+    """Collect how files are read, flagged and averaged."""
+    from amibayes.pipeline.options import SearchOptions
 
-    found = read_observations(
-        paths,
-        images,
-        one_star=one_star,
+    return SearchOptions(
+        images=images,
         insname=arguments.insname,
-        target=target,
+        target=arguments.target,
+        cal_target=arguments.cal_target,
         closure_covariance=arguments.closure_covariance,
+        **data_options.reduction_settings(arguments),
     )
-    reduction = data_options.reduction_of(arguments)
-    if not one_star:  # calibrators are averaged key by key, whenever they were observed
-        reduction["epochs_days"] = None
-    return [reduce_data(each, **reduction) for each in found]
 
 
 def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> dict[str, object]:

@@ -86,12 +86,13 @@ def _add_data(data: argparse._ArgumentGroup) -> None:
     data_options.add_keep_all(data)
     data_options.add_insname(data)
     data_options.add_target(data)
+    data_options.add_cal_target(data)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct the image and write its files."""
     common.configure_logging(arguments)
-    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    common.refuse_repeated(arguments.targets, arguments.cal)
     from amibayes.pipeline.imaging import make_image
     from amibayes.plots.reconstruction import image_plot
     from amibayes.plots.style import save

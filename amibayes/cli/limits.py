@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
 def perform(arguments: argparse.Namespace) -> tuple[Any, Path]:
     """Measure the limits of one target and write their files, without printing."""
     batch.refuse_none(arguments)
-    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    common.refuse_repeated(arguments.targets, arguments.cal)
     from amibayes.plots.contrast_curve import MIGRATION
     from amibayes.support.atomic_files import output_folder
     from amibayes.support.request import refuse_other

@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 def perform(arguments: argparse.Namespace) -> tuple[SearchReport, Path, dict[str, object]]:
     """Run the main job for one target and write its files, without printing."""
     batch.refuse_none(arguments)
-    common.refuse_repeated([*arguments.targets, *arguments.cal])
+    common.refuse_repeated(arguments.targets, arguments.cal)
     from amibayes.parallel import Journals
     from amibayes.support.atomic_files import output_folder
     from amibayes.support.request import refuse_other

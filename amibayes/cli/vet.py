@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     data_options.add_closure_covariance(group)
     data_options.add_insname(group)
+    data_options.add_cal_target(group)
     data_options.add_reduction(group)
     data_options.add_calibrator_diameters(group)
     common.add_seed_option(group)
@@ -56,18 +57,10 @@ def run(arguments: argparse.Namespace) -> int:
     common.configure_logging(arguments)
     common.refuse_repeated(arguments.calibrators)
     levels = arguments.charge_levels
-    if levels is not None and len(levels) != 1 + len(arguments.calibrators):
-        raise UsageError(
-            f"needs {1 + len(arguments.calibrators)} numbers, the target's first",
-            source="--charge-levels",
-        )
     from amibayes.calibration import diameters_of, reduce_data, without_disc
-    from amibayes.extraction.reading import (
-        charge_of,
-        check_together,
-        of_one_visit,
-        read_observations,
-    )
+    from amibayes.extraction.reading import charge_of, check_together, of_one_visit
+    from amibayes.pipeline.options import SearchOptions
+    from amibayes.pipeline.prepare import read_calibrators
     from amibayes.pipeline.vetting import vet
     from amibayes.plots.style import save
     from amibayes.report.noise import migration_json, migration_lines
@@ -77,13 +70,17 @@ def run(arguments: argparse.Namespace) -> int:
     folder = output_folder(arguments.out, [RESULT, PICTURE], overwrite=arguments.overwrite)
     check_together([], arguments.calibrators)
     images = of_one_visit(arguments.calibrators, common.image_options_of(arguments))
-    data = read_observations(
-        arguments.calibrators,
-        images,
-        one_star=False,
+    reading = SearchOptions(
+        images=images,
         insname=arguments.insname,
+        cal_target=arguments.cal_target,
         closure_covariance=arguments.closure_covariance,
     )
+    data = read_calibrators(arguments.calibrators, reading)
+    if levels is not None and len(levels) != 1 + len(data):
+        raise UsageError(
+            f"needs {1 + len(data)} numbers, the target's first", source="--charge-levels"
+        )
     data = [reduce_data(each, **data_options.reduction_of(arguments)) for each in data]
     diameters = diameters_of(arguments.calibrator_diameters, data)
     if diameters is not None:

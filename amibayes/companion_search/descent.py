@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from amibayes.companion_search.optimise import CONVERGED, widest_steps
+from amibayes.companion_search.optimise import tolerance_of, widest_steps
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.parameters import Box, Parameters
 from amibayes.units import BoolArray, FloatArray, IntArray
@@ -42,9 +42,7 @@ ROUNDING, NO_LENGTH = 1e-9, 1e-12
 that has no direction."""
 
 
-def descend(
-    likelihood: Likelihood, seeds: FloatArray, box: Box, tolerance: float = CONVERGED
-) -> tuple[FloatArray, FloatArray]:
+def descend(likelihood: Likelihood, seeds: FloatArray, box: Box) -> tuple[FloatArray, FloatArray]:
     """Fit all free parameters from each of some seeds, staying near it and inside the field.
 
     Parameters
@@ -83,7 +81,8 @@ def _together(likelihood: Likelihood, seeds: FloatArray, box: Box) -> tuple[Floa
         theta[k[better]] = tried[better]
         now.take(k[better], there.of(better))
         damping[k] = np.maximum(damping[k] * np.where(better, EASED, RAISED), MIN_DAMPING)
-        moving[k] = np.where(better, gain > CONVERGED, damping[k] < MAX_DAMPING)
+        enough = tolerance_of(likelihood, here.chi2)
+        moving[k] = np.where(better, gain > enough, damping[k] < MAX_DAMPING)
         if not moving.any():
             break
     return theta, now.chi2

@@ -51,8 +51,16 @@ class ExactMap:
         return np.asarray(least.max() - least)
 
 
+LIKELY, LIKELY_AT_EACH = 0.03, 0.01
+"""Parts of a lattice that V² picks for the whole χ²: by the best contrast, and at each one."""
+
+
 def exact_map(
-    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...] = LADDER
+    likelihood: Likelihood,
+    grid: Grid,
+    nuisance: FloatArray,
+    contrasts: tuple[float, ...] = LADDER,
+    among: IntArray | None = None,
 ) -> ExactMap:
     """Evaluate χ² of companions at rest, alike in every band, over a lattice.
 
@@ -63,15 +71,68 @@ def exact_map(
     grid : Grid
     nuisance : (n_nuisance,) float array
     contrasts : tuple of float
+    among : (n_some,) int array, optional
+        Positions of the first half plane at which, and opposite to which, it is evaluated;
+        elsewhere χ² is as large as the largest of these.
     """
-    chi2 = np.empty((len(contrasts), len(grid)))
-    for index, values in _pieces(likelihood, grid, nuisance, contrasts):
+    chi2 = np.full((len(contrasts), len(grid)), -np.inf)
+    for index, values in _pieces(likelihood, grid, nuisance, contrasts, among):
         chi2[:, index] = values
+    if among is not None:
+        chi2 = np.where(np.isinf(chi2), chi2.max(axis=1, keepdims=True), chi2)
     return ExactMap(grid, chi2, np.array(contrasts))
 
 
+def likely_places(
+    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...] = LADDER
+) -> IntArray | None:
+    """Positions of the first half plane at which V² alone fits best at some contrast.
+
+    |V₀ + cE|² is V₀² + 2cV₀ Re E + c²|E|²: for χ² of V² at every contrast, but for what errors
+    share, sums over the points of five products of Re E and |E|² do.
+
+    Returns
+    -------
+    (n_some,) int array or None
+        None where V² does not tell: there is none, or light around the star is lopsided, or an
+        extraction lets only a part of the light off the axis through.
+    """
+    data, points = likelihood.observables, likelihood.samples
+    response = likelihood.model.linear_response(points, nuisance)
+    if not data.n_vis2 or points.off_axis is not None or response.across.any():
+        return None
+    weight = data.errors[0] ** -2.0
+    total = points.from_squares @ weight
+    measured = points.from_squares @ (weight * data.data[: data.n_vis2]) / np.maximum(total, 1e-300)
+    c = np.array(contrasts)[:, None]
+    wave, flux = response.scale * response.disc, (1.0 + c * response.scale) ** -2.0
+    left = measured - flux * response.star**2
+    one, two = 2.0 * c * flux * response.star * wave, c**2 * flux * wave**2
+    # χ² = Σ w (left − one·Re E − two·|E|²)², multiplied out.
+    factors = [-2.0 * left * one, -2.0 * left * two, one**2, 2.0 * one * two, two**2]
+    weights = np.hstack([total * factor for factor in factors])
+    chi2 = np.empty((len(c), len(grid) // 2))
+    for index, cosine, sine in lattice_waves(likelihood, grid):
+        power = cosine * cosine + sine * sine
+        products = (cosine, power, cosine * cosine, cosine * power, power * power)
+        chi2[:, index] = weights @ np.vstack(products)
+    chi2 += (total * left**2).sum(axis=1, keepdims=True)
+    chosen = [_least(chi2.min(axis=0), LIKELY), *(_least(row, LIKELY_AT_EACH) for row in chi2)]
+    return np.unique(np.concatenate(chosen))
+
+
+def _least(values: FloatArray, part: float) -> IntArray:
+    """Places of the smallest values, so large a part of them."""
+    n = int(np.ceil(part * len(values)))
+    return np.argpartition(values, n - 1)[:n] if n < len(values) else np.arange(len(values))
+
+
 def _pieces(
-    likelihood: Likelihood, grid: Grid, nuisance: FloatArray, contrasts: tuple[float, ...]
+    likelihood: Likelihood,
+    grid: Grid,
+    nuisance: FloatArray,
+    contrasts: tuple[float, ...],
+    among: IntArray | None,
 ) -> Iterator[tuple[IntArray, list[FloatArray]]]:
     """Yield positions and their χ² at every contrast."""
     if likelihood.samples.off_axis is not None:
@@ -82,7 +143,7 @@ def _pieces(
         part[:, None] for part in (response.scale, response.star, response.across)
     )
     wave = scale * response.disc[:, None]
-    for index, cosine, sine in lattice_waves(likelihood, grid):
+    for index, cosine, sine in lattice_waves(likelihood, grid, among):
         cosine *= wave
         sine *= wave
         # Light and flux in units of the star's and the background's: V₀ + cD·E and 1 + c.
@@ -130,11 +191,11 @@ def _by_model(
 
 
 def lattice_waves(
-    likelihood: Likelihood, grid: Grid
+    likelihood: Likelihood, grid: Grid, among: IntArray | None = None
 ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-    """Yield positions (m,) of one half plane with cosine and sine of a point's fringes."""
+    """Yield positions (m,) of one half plane, or some of it, and cosine and sine of fringes."""
     places = grid.places
-    for index in grid.half_plane(len(likelihood.samples)):
+    for index in grid.half_plane(len(likelihood.samples), among):
         cosine, sine = np.empty((2, len(likelihood.samples), len(index)))
         east, north = places[:, index]
         fringes_into(cosine, sine, likelihood.samples, east, north, likelihood.model.smearing)

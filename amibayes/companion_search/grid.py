@@ -56,18 +56,27 @@ class Grid:
         """East and north offsets, (2, n)."""
         return np.stack([self.east_mas, self.north_mas])
 
+    def holds(self, separation_mas: float) -> bool:
+        """Whether a separation is one of the annulus, its edges left out."""
+        return self.inner_mas < separation_mas < self.outer_mas
+
     @property
     def half_width(self) -> int:
         """Number of lattice points from the star to the edge of the map."""
         return int(self.outer_mas / self.step_mas)
 
-    def half_plane(self, n_samples: int, *, tiles: bool = False) -> list[IntArray]:
+    def half_plane(
+        self, n_samples: int, among: IntArray | None = None, *, tiles: bool = False
+    ) -> list[IntArray]:
         """Positions of one half plane, in pieces whose fringes at so many points stay in cache.
+
+        Or ``among`` some of them only.
 
         With ``tiles``, in squares with an even number of positions a side; those at the edges
         of the annulus have fewer.
         """
-        half, width = np.arange(len(self) // 2), int(np.clip(CACHED // n_samples, *WIDTHS))
+        half = np.arange(len(self) // 2) if among is None else among
+        width = int(np.clip(CACHED // n_samples, *WIDTHS))
         if not tiles or not len(half):
             return np.split(half, range(width, len(half), width)) if len(half) else []
         side = int(np.sqrt(width)) // 2 * 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import nlopt
 import numpy as np
@@ -262,9 +263,17 @@ def refine(
         before = deviance
         objective = _objective(likelihood, scale)
         theta, deviance = _minimise(objective, theta, scale, bounds, limits)
-        if deviance > before - CONVERGED:
+        if deviance > before - tolerance_of(likelihood, deviance):
             break
     return mode_of(parameters, theta, deviance_single - deviance)
+
+
+def tolerance_of(likelihood: Likelihood, chi2: Any) -> Any:
+    """Gain below which a fit has arrived: `CONVERGED`, in units of χ² per datum where that is more.
+
+    Of a model that is far from the data no such difference is one of noise.
+    """
+    return CONVERGED * np.maximum(chi2 / likelihood.n_independent, 1.0)
 
 
 def _natural_scale(likelihood: Likelihood, theta: FloatArray, box: Box) -> FloatArray:

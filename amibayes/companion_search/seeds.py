@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter
 
 from amibayes.calibration.binning import bin_channels
 from amibayes.companion_search.descent import descend
-from amibayes.companion_search.exact_map import LADDER, exact_map
+from amibayes.companion_search.exact_map import LADDER, exact_map, likely_places
 from amibayes.companion_search.grid import Grid, make_grid
 from amibayes.companion_search.optimise import refine, starting_points, with_large_discs
 from amibayes.companion_search.result import Mode, mode_of
@@ -36,6 +36,10 @@ data need the finer ones, which cost twice as much."""
 
 EXACT_WORK = 4e7
 """Model values (points, positions, contrasts) of an exact map: some two seconds."""
+
+STAGED = 0.5
+"""Times that work above which V² alone says first where the exact map is worth it: a thirtieth of
+the field is, and none of 63 simulated binaries of 10 to 100 % was lost by that."""
 
 PEAKS_PER_CONTRAST, MAX_BRIGHT_SEEDS = 8, 12
 """Peaks of the exact map that are fitted: at each contrast, and in all for each star."""
@@ -96,7 +100,9 @@ def bright_seeds(likelihood: Likelihood, nuisance: FloatArray, box: Box) -> Floa
     affordable = np.sqrt(EXACT_WORK / (area * len(likelihood.samples) * len(LADDER)))
     steps = np.clip(affordable, MIN_BRIGHT_STEPS, MAX_BRIGHT_STEPS)
     grid = make_grid(box.inner_mas, box.outer_mas, box.fringe_mas / float(steps))
-    found = exact_map(likelihood, grid, nuisance)
+    work = len(grid) * len(likelihood.samples) * len(LADDER)
+    among = likely_places(likelihood, grid, nuisance) if work > STAGED * EXACT_WORK else None
+    found = exact_map(likelihood, grid, nuisance, among=among)
     tops: list[tuple[float, int, float]] = []
     for chi2, contrast in zip(found.chi2, LADDER, strict=True):
         gain = chi2.max(initial=0.0) - chi2

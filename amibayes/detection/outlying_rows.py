@@ -70,6 +70,13 @@ class OutlyingRow:
         date = f" at MJD {self.mjd:.4f}" if np.isfinite(self.mjd) else ""
         return f"{name} {'-'.join(self.stations)}{date}"
 
+    def left_out(self) -> str:
+        """Say that it was left out."""
+        return (
+            f"{self} was left out: it is {self.deviation:.0f} times as far from what fits all "
+            "other data as its errors, or as others are (--keep-outliers takes it in)"
+        )
+
 
 def outlying_rows(
     data: Observables,
@@ -134,6 +141,28 @@ def may_be_left_out(data: Observables, rows: Sequence[OutlyingRow]) -> bool:
         if count > max(1.0, MOST * total):
             return False
     return True
+
+
+def model_is_wrong(
+    data: Observables, likelihood: Likelihood, theta: FloatArray, rows: Sequence[OutlyingRow]
+) -> bool:
+    """Whether a fit is so far from all other rows that no few of them are what is wrong.
+
+    Parameters
+    ----------
+    data : Observables
+        With the stated errors.
+    likelihood : Likelihood
+        Whose model was fitted.
+    theta : (n_dim,) float array
+    rows : sequence of OutlyingRow
+    """
+    others = Likelihood(without_rows(data, rows), likelihood.model)
+    return bool(others.chi2(theta)[0] > FAR_FROM_ALL * others.n_independent)
+
+
+FAR_FROM_ALL = 100.0
+"""χ² per datum with the stated errors of such a fit: errors ten times too small are no errors."""
 
 
 def without_rows(data: Observables, rows: Sequence[OutlyingRow]) -> Observables:

@@ -22,6 +22,7 @@ from amibayes.likelihood.extra_noise import MAX_ROUNDS, UNLIKELY, ExtraNoise, No
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
 from amibayes.likelihood.residuals import files_of
+from amibayes.support.terminal import LEAST_TOLD
 from amibayes.units import FloatArray
 
 Statement = Literal["companion", "no companion", "model rejected", "inconsistent data"]
@@ -359,10 +360,9 @@ def _rejected(
 
 
 def _worst(parts: Sequence[FitOfPart], degrees: float) -> FitOfPart:
-    """The part that fits worst."""
+    """The part that fits worst; by χ² as it is where probabilities are 0."""
 
     def chance(part: FitOfPart) -> tuple[float, float]:
-        """By χ² as it is; probabilities may be 0."""
         return float(chi2_survival(part.chi2, part.dof, degrees)), -part.chi2 / part.dof
 
     return min(parts, key=chance)
@@ -397,4 +397,4 @@ def _nothing(tested: Significance) -> str:
 
 
 def _share(p: float) -> str:
-    return f"{100.0 * p:.2g} %"
+    return f"{100.0 * p:.2g} %" if p >= LEAST_TOLD else f"less than {LEAST_TOLD:.0e}"

@@ -26,6 +26,7 @@ from amibayes.ramps.header import P_VALUES, SOURCE, Cards, migration_cards, migr
 from amibayes.ramps.migration import Migration
 from amibayes.ramps.own_response import OwnResponse
 from amibayes.ramps.transfer import KINDS, gain
+from amibayes.support.terminal import equals
 from amibayes.units import ComplexArray, FloatArray
 
 TOO_FEW_GROUPS = "ramps of fewer than 4 groups cannot tell charge migration from flux"
@@ -223,7 +224,7 @@ def _chosen(
     if fit is not None and (before is None or fit.migration.mean[1] < before.error):
         if not fit.explained:
             notes = (*notes, f"charge migration does not explain all that changes along the "
-                     f"ramps (p = {min(fit.p_value, fit.bend_p_value):.2g})")  # fmt: skip
+                     f"ramps (p {equals(min(fit.p_value, fit.bend_p_value))})")  # fmt: skip
         return fit.migration, notes
     if before is None:
         return None, notes

@@ -307,10 +307,10 @@ def read_observations(
     for kind in dict.fromkeys(kinds.values()):
         ours = [path for path in given if kinds[path] is kind]
         found += kind.read(ours, images or ImageOptions(), one_star, **options)
-    return sorted(found, key=lambda part: _first(part, given))
+    return sorted(found, key=lambda part: first_file(part, given))
 
 
-def _first(part: Observables, paths: list[str]) -> int:
+def first_file(part: Observables, paths: Sequence[str]) -> int:
     """Place among the paths of the first file that some observables come from."""
     own = {name for s in part.setups for name in s.source.split(SEPARATOR)}
     return next((k for k, path in enumerate(paths) if path in own), len(paths))

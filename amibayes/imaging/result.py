@@ -104,6 +104,20 @@ class ReconstructedImage:
         near = np.hypot(x[:, None], x) <= 0.5 * self.beam_mas
         return float(self.light[near].sum()) if self.star else 0.0
 
+    @property
+    def brightest(self) -> tuple[float, float, float]:
+        """East and north, mas, of the brightest place beyond λ/4B of the star, and its light.
+
+        That within λ/2B of it, in units of the star's: of a companion its own, while the light
+        of the whole image counts what noise adds to pixels that are nowhere negative.
+        """
+        x, seen = self.grid.offset_mas, self.convolved()
+        near = np.hypot(x[:, None], x) <= 0.5 * self.beam_mas
+        row, column = np.unravel_index(np.where(near & self.star, 0.0, seen).argmax(), seen.shape)
+        around = np.hypot(x[:, None] - x[row], x - x[column]) <= self.beam_mas
+        own = around & ~near if self.star else around
+        return float(x[column]), float(x[row]), float(self.light[own].sum())
+
     def convolved(self, fwhm_mas: float | None = None) -> FloatArray:
         """The image seen with a Gaussian beam, by default of λ/2B, (n, n); the flux stays."""
         sigma = (fwhm_mas or self.beam_mas) / np.sqrt(8.0 * np.log(2.0))

@@ -54,6 +54,22 @@ def targets_of(oifits: OIFits) -> dict[int, Target]:
     return found
 
 
+def names_of_targets(oifits: OIFits) -> list[str]:
+    """Names of the targets that have V² or closure phases, as `observables_of` knows them."""
+    known = targets_of(oifits) if oifits.named("OI_TARGET") else {}
+    names = []
+    for table in oifits.tables:
+        if table.name in DATA_TABLES and len(table):
+            try:
+                ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
+            except DataError:
+                continue
+            names += [
+                known[i].name if i in known else f"target {i}" for i in np.unique(ids).tolist()
+            ]
+    return list(dict.fromkeys(names))
+
+
 def _degrees(table: OITable, name: str) -> list[float]:
     values = table.columns.get(name)
     if values is None or values.dtype.kind not in "fiu" or values.ndim != 1:

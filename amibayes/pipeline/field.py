@@ -31,6 +31,7 @@ from amibayes.data.observables import Observables
 from amibayes.detection.outlying_rows import (
     OutlyingRow,
     may_be_left_out,
+    model_is_wrong,
     outlying_rows,
     without_rows,
 )
@@ -89,26 +90,21 @@ def search_field(observables: Observables, options: SearchOptions) -> FieldSearc
     left_out: tuple[OutlyingRow, ...] = ()
     used = observables.only(options.observables)
     while True:
-        outlying = outlying_rows(
-            used, found.result.likelihood, found.result.theta, options.systematics
-        )
+        likelihood, theta = found.result.likelihood, found.result.theta
+        outlying = outlying_rows(used, likelihood, theta, options.systematics)
         more = [row for row in outlying if row not in left_out]
         if not more:
             break
+        if model_is_wrong(used, likelihood, theta, outlying):
+            return whole
         left_out = (*left_out, more[0])
         if len(left_out) > MAX_LEFT_OUT or not may_be_left_out(used, left_out):
             return whole
         found = _search_field(without_rows(observables, left_out), options)
     if not left_out or set(outlying) != set(left_out):
         return whole
-    return replace(found, left_out=outlying, warnings=(*map(_told, outlying), *found.warnings))
-
-
-def _told(row: OutlyingRow) -> str:
-    """Say what was left out."""
-    return (
-        f"{row} was left out: it is {row.deviation:.0f} times as far from what fits all other data "
-        "as its errors, or as others are (--keep-outliers takes it in)"
+    return replace(
+        found, left_out=outlying, warnings=(*(row.left_out() for row in outlying), *found.warnings)
     )
 
 
@@ -175,14 +171,19 @@ def _with_small_star(first: SearchResult) -> SearchResult:
 
 
 def _with_its_disc(
-    likelihood: Likelihood, first: SearchResult, options: SearchOptions
+    likelihood: Likelihood,
+    first: SearchResult,
+    options: SearchOptions,
+    narrower: SearchResult | None = None,
 ) -> SearchResult:
     """The search with a free disc of the companion, where data show one and none was asked for."""
     if options.companion_diameter is not None:
         return first
     if shows_disc(likelihood, first):
         first = _search_for_disc(likelihood, first)
-    return _with_disc_elsewhere(likelihood, first)
+    # In the field of a narrower search discs of a few sizes have been tried.
+    within = narrower is not None and narrower.grid.holds(first.companion.separation_mas)
+    return first if within else _with_disc_elsewhere(likelihood, first)
 
 
 def _with_disc_elsewhere(likelihood: Likelihood, near: SearchResult) -> SearchResult:
@@ -228,7 +229,8 @@ def _in_wider_field(
     score = _score(first, options)
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
-        found = _with_its_disc(likelihood, search(likelihood, field, check=False), options)
+        found = search(likelihood, field, check=False)
+        found = _with_its_disc(likelihood, found, options, first)
         if found.chi2_binary < EXPLAINED * first.chi2_binary or (
             found.chi2_binary < first.chi2_binary
             and score - _score(found, options) > SURELY_NOT_NOISE

@@ -83,6 +83,8 @@ class SearchOptions:
         Use all calibrators, whatever vetting finds.
     insname, target : str, optional
         One instrument, one target of a file that holds several.
+    cal_target : tuple of str
+        Calibrators of files that hold several stars; by default every star but the targets.
     flag : tuple of str
         Rules of `amibayes.flag_by_rule`, for targets and calibrators.
     average_polarisations : bool
@@ -156,6 +158,7 @@ class SearchOptions:
     keep_all: bool = False
     insname: str | None = None
     target: str | None = None
+    cal_target: tuple[str, ...] = ()
     flag: tuple[str, ...] = ()
     average_polarisations: bool = False
     bin_channels: int = 1

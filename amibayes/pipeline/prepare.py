@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,12 +24,17 @@ from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.reading import (
+    FORMATS,
     charge_of,
     check_together,
+    first_file,
+    format_of,
     of_one_visit,
     read_observations,
     uncalibrated_images,
 )
+from amibayes.oifits import open_oifits
+from amibayes.oifits.setups import names_of_targets
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.run import Run
 from amibayes.pipeline.vetting import Vetting, agreement_of_two, vet
@@ -107,7 +113,7 @@ def prepare(
     with run.stage("read"):
         images = of_one_visit([*targets, *calibrators], options.images)
         parts = read(targets, replace(options, images=images))
-        references = read(calibrators, replace(options, images=images), one_star=False)
+        references = read_calibrators(calibrators, replace(options, images=images), parts)
     parts = in_order(parts)
     joined = (
         *together,
@@ -137,25 +143,98 @@ def read(
     paths: Sequence[str | Path], options: SearchOptions, *, one_star: bool = True
 ) -> list[Observables]:
     """Read files of any format, one table for each exposure, as the options ask."""
+    target = options.target if one_star else None
     found = read_observations(
-        paths,
-        options.images,
-        one_star=one_star,
-        insname=options.insname,
-        target=options.target,
-        closure_covariance=options.closure_covariance,
+        paths, options.images, one_star=one_star, target=target, **_of_oifits(options)
     )
-    return [
-        reduce_data(
-            each,
-            flag=options.flag,
-            polarisations=options.average_polarisations,
-            channels=options.bin_channels,
-            # Calibrators are averaged key by key, whenever they were observed.
-            epochs_days=options.merge_epochs_days if one_star else None,
+    return [_reduced(each, options, one_star) for each in found]
+
+
+def read_calibrators(
+    paths: Sequence[str | Path], options: SearchOptions, targets: Sequence[Observables] = ()
+) -> list[Observables]:
+    """Read calibrators as `read` does; each star of a file that holds several is one.
+
+    Parameters
+    ----------
+    paths : sequence of path
+    options : SearchOptions
+        ``cal_target`` chooses stars of files that hold several.
+    targets : sequence of Observables
+        What is calibrated: no calibrator, where ``cal_target`` chooses none.
+
+    Returns
+    -------
+    list of Observables
+        In the order of the files, and of the stars in each; the source of a star out of several
+        is ``FILE (STAR)``.
+
+    Raises
+    ------
+    UsageError
+        Where a star that was chosen is in no file, or none is left of a file.
+    """
+    given = [str(path) for path in paths]
+    stars = {path: stars_of(path) for path in given}
+    several = [path for path in given if len(stars[path]) > 1]
+    known = {name.casefold() for path in given for name in stars[path]}
+    lost = [name for name in options.cal_target if name.casefold() not in known]
+    if lost:
+        raise UsageError(
+            f"no calibrator file holds {', '.join(lost)}",
+            source="--cal-target",
+            remedy=f"files of several stars hold {', '.join(x for p in several for x in stars[p])}"
+            if several
+            else "leave it out: every file is of one star",
         )
-        for each in found
-    ]
+    found = read([path for path in given if path not in several], options, one_star=False)
+    placed = [(first_file(each, given), each) for each in found]
+    own = {s.target.casefold() for part in targets for s in part.setups}
+    for path in several:
+        chosen = _chosen(path, stars[path], options.cal_target, own)
+        placed += [(given.index(path), _star(path, name, options)) for name in chosen]
+    return [each for _, each in sorted(placed, key=lambda pair: pair[0])]
+
+
+def stars_of(path: str | Path) -> list[str]:
+    """Names of the targets that an OIFITS file has data of; none of a file of another format."""
+    if format_of(path) is not FORMATS[-1]:
+        return []
+    return names_of_targets(open_oifits(path))
+
+
+def _chosen(path: str, stars: list[str], wanted: Sequence[str], targets: set[str]) -> list[str]:
+    asked = {name.casefold() for name in wanted}
+    chosen = [s for s in stars if (s.casefold() in asked if asked else s.casefold() not in targets)]
+    if not chosen:
+        raise UsageError(
+            "holds no calibrator that is asked for",
+            source=path,
+            remedy=f"it has {', '.join(stars)}: choose with --cal-target",
+        )
+    return chosen
+
+
+def _star(path: str, name: str, options: SearchOptions) -> Observables:
+    """One star of a file that holds several, named after both."""
+    (found,) = read_observations(path, options.images, target=name, **_of_oifits(options))
+    setups = tuple(replace(s, source=f"{path} ({name})") for s in found.setups)
+    return _reduced(replace(found, setups=setups), options, False)
+
+
+def _of_oifits(options: SearchOptions) -> dict[str, Any]:
+    return {"insname": options.insname, "closure_covariance": options.closure_covariance}
+
+
+def _reduced(each: Observables, options: SearchOptions, one_star: bool) -> Observables:
+    return reduce_data(
+        each,
+        flag=options.flag,
+        polarisations=options.average_polarisations,
+        channels=options.bin_channels,
+        # Calibrators are averaged key by key, whenever they were observed.
+        epochs_days=options.merge_epochs_days if one_star else None,
+    )
 
 
 def _calibrated(

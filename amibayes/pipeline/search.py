@@ -69,7 +69,8 @@ def search_companion(
     ----------
     targets, calibrators : sequence of path
         OIFITS files or image cubes. Targets are fitted together; without calibrators they
-        are taken as calibrated.
+        are taken as calibrated. A file of several stars may be one of both
+        (``options.target``, ``options.cal_target``).
     options : SearchOptions, optional
     chain, resume : optional
         HDF5 file for the chain of the posterior, and whether to go on from it.

@@ -39,6 +39,7 @@ from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
 from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
+from amibayes.support.terminal import equals
 from amibayes.units import BoolArray
 
 CHARGE_FACTOR = 2.0
@@ -310,7 +311,9 @@ def _by_itself(
 def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
     reasons = []
     if disagrees:
-        reasons.append(f"disagrees with the other calibrators (p = {vetted.agreement:.2g})")
+        reasons.append(
+            f"disagrees with the other calibrators (p {equals(vetted.agreement or 0.0)})"
+        )
     tested, found = vetted.significance, vetted.companion
     seen = vetted.shows_companion(alpha) and not vetted.small_companion
     if seen and tested is not None and found is not None:
@@ -320,9 +323,8 @@ def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:
             f"PA {c.position_angle_deg:.0f} deg (false-alarm probability {tested.probability:.2g})"
         )
     elif vetted.shows_disc(alpha) and not vetted.small_disc:
-        reasons.append(
-            f"resolved: {vetted.diameter_mas:.2f} mas (p = {vetted.diameter_probability:.2g})"
-        )
+        p = equals(vetted.diameter_probability or 0.0)
+        reasons.append(f"resolved: {vetted.diameter_mas:.2f} mas (p {p})")
     return replace(vetted, kept=not reasons, reason="; ".join(reasons))
 
 

@@ -21,6 +21,7 @@ from amibayes.posterior.ensemble import Posterior
 from amibayes.posterior.grid import integrable
 from amibayes.posterior.modes import modes_to_sample
 from amibayes.posterior.priors import Prior
+from amibayes.support.terminal import equals
 from amibayes.units import MAS, FloatArray
 
 MAX_NAMED = 3
@@ -124,8 +125,8 @@ def consistency_warnings(splits: Sequence[Consistency]) -> list[str]:
         return []
     one, other = worst.parts
     return [
-        f"the companion depends on the calibrator: {one} and {other} disagree on it (p = "
-        f"{worst.p:.2g}); search without {one} as well"
+        f"the companion depends on the calibrator: {one} and {other} disagree on it (p "
+        f"{equals(worst.p)}); search without {one} as well"
     ]
 
 

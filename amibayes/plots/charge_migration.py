@@ -21,6 +21,7 @@ from amibayes.plots.style import (
 )
 from amibayes.ramps.curvature import Curvature
 from amibayes.ramps.fit import MigrationFit
+from amibayes.support.terminal import equals
 from amibayes.units import FloatArray, IntArray
 
 HALF_SIDE = 12
@@ -56,7 +57,7 @@ def migration_plot(fit: MigrationFit) -> Figure:
     value, error = fit.migration.mean
     figure.suptitle(
         f"Charge migration {1e7 * value:.2f} ± {1e7 * error:.2f} · 10⁻⁷ pixels per electron, "
-        f"p = {fit.p_value:.2g}"
+        f"p {equals(fit.p_value)}"
     )
     return figure
 

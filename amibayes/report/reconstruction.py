@@ -46,6 +46,7 @@ def imaging_json(report: ImagingReport, request: str) -> dict[str, Any]:
         "diameter_free": image.diameter_free,
         "flux": image.flux,
         "flux_beside_star": image.beside_star,
+        "brightest": dict(zip(("east_mas", "north_mas", "flux"), image.brightest, strict=True)),
         "chi2": image.chi2,
         "p_fit": image.p_fit,
         "chi2_star": _number(image.chi2_star),
@@ -75,6 +76,7 @@ def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
         f"mas, beam {content['beam_mas']:.4g} mas",
         f"prior       {content['regulariser']}, weight {content['weight']:.3g} ({chosen})",
         f"light       {around}",
+        *([_brightest(content)] if content["flux"] > 0.0 else []),
         f"chi2        {content['chi2']:.1f} of {data['n_independent']} numbers"
         + ("" if content["chi2_star"] is None else f" (star alone {content['chi2_star']:.1f})"),
     ]
@@ -83,6 +85,17 @@ def imaging_summary(content: dict[str, Any], folder: Path) -> list[str]:
         lines.append(f"left out    chi2 {best:.2f} per datum that the image was not made of")
     lines += [f"WARNING     {w}" for w in content["warnings"][: 18 - len(lines)]]
     return [*lines, f"written to  {folder}"]
+
+
+def _brightest(content: dict[str, Any]) -> str:
+    """Light at the brightest place, which is less than that of the image."""
+    found = content["brightest"]
+    east, north = found["east_mas"], found["north_mas"]
+    angle = np.degrees(np.arctan2(east, north)) % 360.0
+    return (
+        f"brightest   {found['flux']:.3g} within λ/2B of {np.hypot(east, north):.4g} mas, PA "
+        f"{angle:.0f} deg; the rest is spread over the field, as noise is too"
+    )
 
 
 TOLD_APART = 0.01

@@ -38,6 +38,7 @@ from amibayes.report.words import (
     fixed,
     plain,
     sentence,
+    tail,
 )
 
 Json = dict[str, Any]
@@ -221,7 +222,7 @@ def _calibrators(calibration: Json) -> Table:
         (
             c["path"],
             "kept" if c["kept"] else "dropped",
-            plain(c.get("agreement_probability"), 2),
+            tail(c.get("agreement_probability")),
             c["reason"] or "–",
         )
         for c in calibration["calibrators"]
@@ -239,8 +240,7 @@ def _consistency(splits: list[Json]) -> list[Table]:
         return []
     columns = Column("Compared", "text"), Column("Parts", "text"), Column("Δχ²"), Column("p")
     rows = tuple(
-        (s["split"], ", ".join(s["parts"]), fixed(s["delta_chi2"], 1), plain(s["p"], 2))
-        for s in splits
+        (s["split"], ", ".join(s["parts"]), fixed(s["delta_chi2"], 1), tail(s["p"])) for s in splits
     )
     caption = (
         "Whether parts of the data, and the target calibrated with each calibrator and with the "

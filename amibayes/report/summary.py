@@ -25,7 +25,7 @@ from amibayes.report.words import (
     percent,
     places_of,
 )
-from amibayes.support.terminal import row, with_warnings
+from amibayes.support.terminal import equals, row, with_warnings
 
 EVEN = 0.5
 """Probability that the stated errors are correct, above which extra noise is left out."""
@@ -283,7 +283,7 @@ def _noise_lines(report: SearchReport) -> list[str]:
         median, low, high = (unit * x for x in noise.interval())
         parts.append(
             f"{median:.2g} +{high - median:.1g} -{median - low:.1g} {label} "
-            f"(P(stated errors correct) = {noise.probability_none:.2g})"
+            f"(P(stated errors correct) {equals(noise.probability_none)})"
         )
     return [f"extra noise {', '.join(parts)}"]
 

@@ -13,7 +13,7 @@ from amibayes.plots.calibration import columns_of
 from amibayes.plots.style import GREY, marker_of, new_figure, styled
 from amibayes.report import limits_json, number
 from amibayes.support.atomic_files import short_names
-from amibayes.support.terminal import shortened
+from amibayes.support.terminal import shortened, tail
 
 Json = dict[str, Any]
 
@@ -80,7 +80,7 @@ def _named(vetting: Vetting) -> list[tuple[str, Vetted]]:
 
 
 def _cell(probability: float | None) -> str:
-    return f"{'-':>10}" if probability is None else f"{probability:>10.2g}"
+    return f"{'-':>10}" if probability is None else f"{tail(probability):>10}"
 
 
 HEIGHT_OF_NAMES = 0.2

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from amibayes.support.terminal import LEAST_TOLD
+
 NONE = "–"
 
 PLUS_MINUS, TIMES = " ±\u00a0", "\u00a0×\u00a0"
@@ -81,6 +83,13 @@ def chance(probability: float) -> str:
 FARTHEST_TOLD = 1e-10
 """Extrapolated probabilities below this have no number: thousands of draws say that they are
 small, and laws fitted to them no more."""
+
+
+def tail(probability: float | None) -> str:
+    """Write a probability of chance, where 0 is a number that is too small for the machine."""
+    if probability is not None and probability < LEAST_TOLD:
+        return f"<\u00a0{plain(LEAST_TOLD, 1)}"
+    return plain(probability, 2)
 
 
 def percent(share: float) -> str:

@@ -8,6 +8,20 @@ MAX_LINES = 20
 """What stays on a small terminal without scrolling."""
 
 
+LEAST_TOLD = 1e-300
+"""Probability below which a number of double precision is 0: it is said to be less."""
+
+
+def tail(probability: float) -> str:
+    """Write a probability of chance: ``0.02``; ``< 1e-300`` where the number is too small."""
+    return f"{probability:.2g}" if probability >= LEAST_TOLD else f"< {LEAST_TOLD:.0e}"
+
+
+def equals(probability: float) -> str:
+    """Write the same after its name: ``= 0.02`` or ``< 1e-300``."""
+    return f"= {tail(probability)}" if probability >= LEAST_TOLD else tail(probability)
+
+
 def shortened(
     lines: Sequence[str], last: Sequence[str] = (), more: str = "and {} more lines"
 ) -> list[str]:

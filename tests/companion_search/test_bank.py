@@ -206,7 +206,7 @@ def test_bright_seeds_cost_no_more_than_they_may(monkeypatch: pytest.MonkeyPatch
     """Positions, samples and contrasts of a field whose steps are neither finest nor coarsest."""
     made = []
 
-    def kept(likelihood: Likelihood, grid: Grid, nuisance: np.ndarray) -> ExactMap:
+    def kept(likelihood: Likelihood, grid: Grid, nuisance: np.ndarray, **_: object) -> ExactMap:
         made.append(len(grid) * len(likelihood.samples) * len(LADDER))
         return exact_map(likelihood, grid, nuisance)
 

@@ -19,9 +19,9 @@ from amibayes.extraction.options import ExtractOptions
 from amibayes.extraction.reading import (
     ImageOptions,
     _centred,
-    _first,
     charge_of,
     contents_of,
+    first_file,
     format_of,
     of_one_visit,
     read_observations,
@@ -108,8 +108,8 @@ def test_observables_come_in_the_order_of_their_files(tmp_path: Path) -> None:
     given = [oifits[0], made, oifits[1]]
     assert [o.source for o in read_observations(given)] == [str(p) for p in given]
     part = join([told("b.fits, c.fits"), told("d.fits")])
-    assert [_first(part, list(paths)) for paths in ("ab", ["c.fits"], ["a", "d.fits", "b.fits"])] \
-        == [2, 0, 1]  # fmt: skip
+    for paths, place in (("ab", 2), (["c.fits"], 0), (["a", "d.fits", "b.fits"], 1)):
+        assert first_file(part, list(paths)) == place
 
 
 def told(source: str) -> Observables:

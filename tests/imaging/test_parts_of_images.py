@@ -317,3 +317,13 @@ def test_what_may_be_the_star_is_no_light_around_it(
     content = imaging_json(report, "") | {"flux": 0.1568, "flux_beside_star": beside}
     (line,) = [x for x in imaging_summary(content, Path("out")) if x.startswith("light")]
     assert line.startswith(told)
+
+
+def test_the_summary_tells_the_light_at_the_brightest_place(image: ReconstructedImage) -> None:
+    report = ImagingReport(image, ImagingOptions(), (), (), (), {})
+    place = {"brightest": {"east_mas": -30.0, "north_mas": 40.0, "flux": 0.01004}}
+    content = imaging_json(report, "") | {"flux": 0.0123, "flux_beside_star": 0.0} | place
+    (line,) = [x for x in imaging_summary(content, Path("out")) if x.startswith("brightest")]
+    assert line.startswith("brightest   0.01 within λ/2B of 50 mas, PA 323 deg")
+    dark = imaging_summary(content | {"flux": 0.0}, Path("out"))
+    assert not any(x.startswith("brightest") for x in dark)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
-from helpers import niriss
+from helpers import niriss, simulated
 from pupil_images import Pupil, write_kernel_file
 from scenes import SCENES, binned, observed
 
@@ -223,3 +223,16 @@ def test_entropy_is_least_and_zero_at_its_default_image(flux: float | None) -> N
     np.testing.assert_allclose(gradient, 0.0, atol=1e-12)
     rng = np.random.default_rng(1)
     assert all(value(light * prior * rng.uniform(0.5, 1.5, 49))[0] > 0.0 for _ in range(5))
+
+
+@pytest.mark.parametrize("regulariser", ["tv", "entropy"])
+def test_light_at_the_brightest_place_is_the_companions(regulariser: str) -> None:
+    """That of the whole image is more: noise adds light, and pixels are nowhere negative."""
+    east, north, contrast = 173.2, -100.0, 0.01
+    rng = np.random.default_rng(0)
+    data = simulated(niriss(0.003, 0.1), (east, north, contrast), rng)
+    image = ab.reconstruct_image(data, regulariser=regulariser)
+    *place, flux = image.brightest
+    assert np.hypot(place[0] - east, place[1] - north) < 0.5 * image.beam_mas
+    assert flux == pytest.approx(contrast, rel=0.05)
+    assert image.flux > 1.03 * flux

@@ -214,7 +214,7 @@ CASES: dict[str, tuple[Change, set[str]]] = {
     "spelling": (unit("OI_VIS2", "UCOORD", "METERS"), {"unit-spelling"}),
     "no unit": (unit("OI_T3", "T3PHI", None), {"unit-spelling"}),
     "radians": (in_radians, {"unit"}),
-    "kilometres": (unit("OI_VIS2", "UCOORD", "km"), {"unit", "uv-stations", "uv-length"}),
+    "kilometres": (unit("OI_VIS2", "UCOORD", "km"), {"unit", "uv-stations", "uv-scale"}),
     "target": (set_column("OI_VIS2", "TARGET_ID", 3, 9), {"reference"}),
     "station": (set_column("OI_VIS2", "STA_INDEX", 3, [1, 9]), {"reference"}),
     "instrument": (keyword("OI_VIS2", "INSNAME", "X"), {"reference"}),

@@ -18,11 +18,11 @@ from amibayes.oifits.audit.geometry import (
     _closes,
     _legs,
     _turned,
-    baselines_longer_than_the_array,
     closures_that_do_not_close,
     four_triangles,
     uv_against_stations,
 )
+from amibayes.oifits.audit.scale import uv_of_another_scale
 from amibayes.oifits.tables import OIFits
 
 HERE = OIFits(Path("a"), {}, ())
@@ -67,7 +67,7 @@ def test_sound_observables_are_left_alone() -> None:
     made = data()
     for check in (
         uv_against_stations,
-        baselines_longer_than_the_array,
+        uv_of_another_scale,
         closures_that_do_not_close,
     ):
         assert list(check(HERE, [made])) == []
@@ -160,7 +160,7 @@ def test_baselines_longer_than_their_stations_apart_are_counted() -> None:
     made = data(n_exposures=2)
     long = changed(made, "vis2", [3, 7], u_m=lambda u: 1.2 * u, v_m=lambda v: 1.2 * v)
     long = changed(long, "vis2", [5], u_m=lambda u: 1.4 * u, v_m=lambda v: 1.4 * v)
-    (said,) = baselines_longer_than_the_array(HERE, [long])
+    (said,) = uv_of_another_scale(HERE, [long])
     assert (said.severity, said.code, said.where) == ("error", "uv-length", "NRM")
     assert said.what == ("3 baselines of 20 longer than the distance of the stations "
                          "(up to 1.4 times)")  # fmt: skip
@@ -169,9 +169,9 @@ def test_baselines_longer_than_their_stations_apart_are_counted() -> None:
         near = changed(
             made, "vis2", every, u_m=lambda u, s=share: u * s, v_m=lambda v, s=share: v * s
         )
-        assert len(list(baselines_longer_than_the_array(HERE, [near]))) == told
+        assert len(list(uv_of_another_scale(HERE, [near]))) == told
     unknown = replace(long, setups=(replace(long.setups[0], station_xyz_m=None),))
-    assert list(baselines_longer_than_the_array(HERE, [unknown])) == []
+    assert list(uv_of_another_scale(HERE, [unknown])) == []
 
 
 def test_sums_over_four_triangles_are_zero_but_for_noise() -> None:

@@ -21,8 +21,10 @@ from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.prepare import Prepared, _two_that_disagree
-from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _LeaveOut, notes, vet
+from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _decided, _LeaveOut, notes, vet
+from amibayes.report import words
 from amibayes.report.vetting import vetting_picture, vetting_table
+from amibayes.support.terminal import tail
 from amibayes.units import MAS
 
 FIELD = (50.0, 400.0)
@@ -178,6 +180,18 @@ def test_one_that_disagrees_with_a_dropped_one_is_not_doubted() -> None:
 
 
 @pytest.mark.slow
+def test_probabilities_too_small_for_a_number_are_said_to_be_less() -> None:
+    one = Vetted("a.oifits", True, "", 0.0, diameter_mas=1.0, diameter_probability=0.0)
+    dropped = _decided(one, True, 1e-3)
+    assert dropped.reason == "disagrees with the other calibrators (p < 1e-300)"
+    shown = vetting_table(Vetting((dropped, replace(one, path="b.oifits", agreement=0.02)), 1e-3))
+    assert "< 1e-300" in shown[1]
+    assert "0.02" in " ".join(shown[2:])
+    assert (tail(0.0), tail(0.02), tail(1e-290)) == ("< 1e-300", "0.02", "1e-290")
+    assert words.tail(0.0) == "<\u00a01\u00a0×\u00a010⁻³⁰⁰"
+    assert words.tail(None) == words.NONE
+
+
 def test_calibrators_of_two_filters_are_judged_among_their_own(rng) -> None:
     """As each filter by itself: no calibrator of the other one is asked."""
     reds = [calibrator(rng, name=f"red{k}") for k in range(3)]

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -275,8 +275,10 @@ def configure_logging(arguments: argparse.Namespace) -> None:
         warnings.simplefilter("ignore")
 
 
-def refuse_repeated(paths: list[str]) -> None:
+def refuse_repeated(paths: Sequence[str], calibrators: Sequence[str] = ()) -> None:
     """Refuse a file that was given twice, under whatever name.
+
+    A file of several stars may be one of targets and one of calibrators.
 
     Raises
     ------
@@ -284,11 +286,20 @@ def refuse_repeated(paths: list[str]) -> None:
         Naming the file.
     """
     seen: set[Path] = set()
-    for path in paths:
-        resolved = Path(path).resolve()
-        if resolved in seen:
-            raise UsageError("is given twice", source=path, remedy="give every file once")
-        seen.add(resolved)
+    for given in (paths, calibrators):
+        own: set[Path] = set()
+        for path in given:
+            resolved = Path(path).resolve()
+            if resolved in own or (resolved in seen and not _holds_several(path)):
+                raise UsageError("is given twice", source=path, remedy="give every file once")
+            own.add(resolved)
+        seen |= own
+
+
+def _holds_several(path: str) -> bool:
+    from amibayes.pipeline.prepare import stars_of
+
+    return len(stars_of(path)) > 1
 
 
 def number_or_free(text: str) -> float | str:

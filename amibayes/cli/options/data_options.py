@@ -95,7 +95,7 @@ def add_reduction(group: argparse._ActionsContainer) -> None:
 
 
 def reduction_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Collect the options of `add_reduction`, as `reduce_data` takes it."""
+    """Collect the options of `add_reduction`, as `reduce_data` takes them."""
     return {
         "flag": tuple(rule for given in arguments.flag for rule in _rules(given)),
         "polarisations": arguments.average_polarisations,
@@ -142,6 +142,17 @@ def add_insname(group: argparse._ActionsContainer) -> None:
 def add_target(group: argparse._ActionsContainer) -> None:
     """Add ``--target``."""
     group.add_argument("--target", metavar="NAME", help="use one target of files that hold several")
+
+
+def add_cal_target(group: argparse._ActionsContainer) -> None:
+    """Add ``--cal-target``."""
+    group.add_argument(
+        "--cal-target",
+        type=lambda text: tuple(text.split(",")),
+        default=(),
+        metavar="NAMES",
+        help="calibrators of files that hold several stars (default: all but the target)",
+    )
 
 
 def add_keep_all(group: argparse._ActionsContainer) -> None:
@@ -286,14 +297,20 @@ def search_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def reading_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Collect what `SearchOptions` has on how data are read, reduced and calibrated."""
+def reduction_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what `SearchOptions` has on what is flagged and averaged."""
     reduction = reduction_of(arguments)
     return {
         "flag": reduction["flag"],
         "average_polarisations": reduction["polarisations"],
         "bin_channels": reduction["channels"],
         "merge_epochs_days": reduction["epochs_days"],
+    }
+
+
+def reading_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Collect what `SearchOptions` has on how data are read, reduced and calibrated."""
+    return reduction_settings(arguments) | {
         "calibrator_diameters": arguments.calibrator_diameters,
         "closure_covariance": arguments.closure_covariance,
         "calibration": arguments.calibration,
@@ -301,6 +318,7 @@ def reading_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "keep_all": arguments.keep_all,
         "insname": arguments.insname,
         "target": arguments.target,
+        "cal_target": arguments.cal_target,
         "seed": arguments.seed,
         "images": common.image_options_of(arguments),
     }
@@ -379,3 +397,4 @@ def add_data(group: argparse._ActionsContainer) -> None:
         "all others is far from explaining",
     )
     add_target(group)
+    add_cal_target(group)

@@ -7,13 +7,12 @@ from pathlib import Path
 
 from amibayes.data.observables import Observables
 from amibayes.errors import DataError
-from amibayes.oifits.audit import geometry, jwst, noise, packages, structure, values
+from amibayes.oifits.audit import geometry, jwst, noise, packages, scale, structure, values
 from amibayes.oifits.audit.finding import Finding, Severity
 from amibayes.oifits.audit.repair import repair
-from amibayes.oifits.columns import integers
 from amibayes.oifits.products import product_of
 from amibayes.oifits.reader import observables_of
-from amibayes.oifits.setups import DATA_TABLES, targets_of
+from amibayes.oifits.setups import names_of_targets
 from amibayes.oifits.tables import OIFits, open_oifits
 
 __all__ = ["Audit", "Finding", "Severity", "audit", "errors_in", "repair"]
@@ -21,10 +20,11 @@ __all__ = ["Audit", "Finding", "Severity", "audit", "errors_in", "repair"]
 FILE_CHECKS = (
     *structure.CHECKS,
     *values.CHECKS,
+    *scale.CHECKS,
     *geometry.CHECKS,
     *noise.CHECKS,
 )
-DATA_CHECKS = (*geometry.DATA_CHECKS, *noise.DATA_CHECKS)
+DATA_CHECKS = (*geometry.DATA_CHECKS, *scale.DATA_CHECKS, *noise.DATA_CHECKS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ def audit(path: str | Path | OIFits) -> Audit:
     found = [finding for check in (*FILE_CHECKS, *own) for finding in check(oifits)]
     if product is not None:
         found = _of_product(found, jwst.findings_of(product))
-    names = _targets(oifits)
+    names = names_of_targets(oifits)
     found += list(noise.unusable(oifits, names))
     parts = [p for p in (_part(oifits, name) for name in names) if p is not None]
     found += [finding for check in DATA_CHECKS for finding in check(oifits, parts)]
@@ -107,7 +107,8 @@ def errors_in(oifits: OIFits, observables: Observables) -> tuple[str, ...]:
         What was read of it.
     """
     found = [finding for check in (*FILE_CHECKS, *packages.CHECKS) for finding in check(oifits)]
-    found += [f for check in geometry.DATA_CHECKS for f in check(oifits, [observables])]
+    checks = (*geometry.DATA_CHECKS, *scale.DATA_CHECKS)
+    found += [f for check in checks for f in check(oifits, [observables])]
     groups: dict[str, list[Finding]] = {}
     for finding in found:
         if finding.severity == "error" or finding.code in ALSO_WARNED_OF:
@@ -124,20 +125,6 @@ def _of_product(general: list[Finding], own: list[Finding]) -> list[Finding]:
     """Findings of a product; a copy fixes all or, where it cannot be written, nothing."""
     fixable = any(f.certain for f in own)
     return own + [replace(f, certain=f.certain and fixable) for f in general]
-
-
-def _targets(oifits: OIFits) -> list[str]:
-    """Names of the targets that have V² or closure phases, as `observables_of` knows them."""
-    known = targets_of(oifits) if oifits.named("OI_TARGET") else {}
-    names = []
-    for table in oifits.tables:
-        if table.name in DATA_TABLES and len(table):
-            try:
-                ids = integers(oifits, table, "TARGET_ID", 1)[:, 0]
-            except DataError:
-                continue
-            names += [known[i].name if i in known else f"target {i}" for i in set(ids.tolist())]
-    return list(dict.fromkeys(names))
 
 
 def _part(oifits: OIFits, name: str) -> Observables | None:

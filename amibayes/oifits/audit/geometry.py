@@ -143,14 +143,14 @@ def uv_against_stations(oifits: OIFits, parts: Sequence[Observables]) -> Finding
 
 def _factor(part: Observables) -> float:
     """By what the triangles' (u, v) have to be multiplied to be V²'s."""
-    vis2, closure = _rows(part.vis2), _rows(part.closure_phase)
+    vis2, closure = unflagged_rows(part.vis2), unflagged_rows(part.closure_phase)
     sides = np.stack([closure.u_m, closure.v_m], axis=2).reshape(-1, 2, 2)
     return common_factor(np.concatenate([vis2.u_m, vis2.v_m], axis=1), sides)
 
 
 def _legs(part: Observables, factor: float) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Where the two sides of each triangle agree with V²'s (u, v), or with its reverse."""
-    vis2, closure = _rows(part.vis2), _rows(part.closure_phase)
+    vis2, closure = unflagged_rows(part.vis2), unflagged_rows(part.closure_phase)
     n = len(closure)
     agree, reverse, compared = (np.zeros((n, 2), dtype=bool) for _ in range(3))
     if not len(vis2) or not n:
@@ -172,7 +172,7 @@ def _legs(part: Observables, factor: float) -> tuple[BoolArray, BoolArray, BoolA
     return agree & compared, reverse & compared, compared
 
 
-def _rows(m: Measurements) -> Measurements:
+def unflagged_rows(m: Measurements) -> Measurements:
     """One unflagged entry of every row that has one."""
     m = m.select(~m.flag)
     _, first = np.unique(np.stack([m.setup, m.row]), axis=1, return_index=True)
@@ -195,30 +195,6 @@ def _same_baseline(
     first = days <= days.min(axis=1, keepdims=True)
     nearest = np.where(first, np.minimum(*apart), np.inf).argmin(axis=1)
     return nearest, days[np.arange(len(nearest)), nearest]
-
-
-def baselines_longer_than_the_array(oifits: OIFits, parts: Sequence[Observables]) -> Findings:
-    """Projected baselines that are longer than the distance of their stations."""
-    for part in parts:
-        rows = _rows(part.vis2)
-        for number, setup in enumerate(part.setups):
-            ours = rows.select(rows.setup == number)
-            if setup.station_xyz_m is None or not len(ours):
-                continue
-            ends = setup.station_xyz_m[ours.stations]
-            apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-            length = np.hypot(ours.u_m[:, 0], ours.v_m[:, 0])
-            long = length > apart * (1 + SAME_UV) + 1e-3
-            if long.mean() > 0.01:
-                yield Finding(
-                    "error",
-                    "uv-length",
-                    setup.insname,
-                    f"{count(int(long.sum()), 'baseline')} of {len(long)} longer than the "
-                    f"distance of the stations (up to {(length / apart)[long].max():.3g} times)",
-                    "(u, v) are not in metres, or STA_INDEX or STAXYZ is wrong",
-                    "check the unit of UCOORD and the station numbers",
-                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,6 +293,5 @@ def _turned(sums: list[FourTriangles]) -> list[str]:
 CHECKS = (stations_not_given, repeated_stations, uv_in_wavelengths)
 DATA_CHECKS = (
     uv_against_stations,
-    baselines_longer_than_the_array,
     closures_that_do_not_close,
 )

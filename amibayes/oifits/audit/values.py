@@ -57,8 +57,17 @@ def wavelengths(oifits: OIFits) -> Findings:
                     f"{count(int((~good).sum()), 'channel')} with {name} that is not in "
                     f"({limits[0]:g}, {limits[1]:g}) m",
                     "baselines in wavelengths, or bandwidth smearing, will be wrong",
-                    "give metres",
+                    _in_metres(metres[~good]),
                 )
+
+
+def _in_metres(numbers: FloatArray) -> str:
+    """What to do about wavelengths that are none in metres."""
+    for unit, scale in (("micron", 1e-6), ("nm", 1e-9), ("ångström", 1e-10)):
+        metres = numbers * scale
+        if ((metres > 1e-9) & (metres < 3e-5)).all():
+            return f"give metres: they look like {unit}, to be multiplied by {scale:g}"
+    return "give metres"
 
 
 def dates(oifits: OIFits) -> Findings:
@@ -217,51 +226,6 @@ def phase_range(oifits: OIFits) -> Findings:
             )
 
 
-def phases_that_are_radians(oifits: OIFits) -> Findings:
-    """Numbers given as degrees that look like radians.
-
-    Two signs: wrapped phases that fill ±π and end there; and errors that are 57 times too
-    small for those of V² (independent baselines: σ(CP) = √3 σ(V²)/2V²) with phases inside ±π.
-    """
-    for table, kind in data_tables(oifits):
-        if not kind.is_angle or table.units.get(kind.value, "").lower().startswith("rad"):
-            continue
-        number, error = column(table, kind.value), column(table, kind.error)
-        if number is None or error is None or number.shape != error.shape:
-            continue
-        used = unflagged(table, number.shape) & np.isfinite(number) & (error > 0)
-        phases = np.abs(number[used])
-        if len(phases) < 10 or phases.max() > np.pi * (1 + 1e-6):
-            continue
-        fills = phases.max() > 3.0 and phases.max() < 1.9 * np.sqrt((phases**2).mean())
-        ratio = _error_ratio(oifits, table, np.radians(np.median(error[used])))
-        # Radians taken for degrees are 1/57 = 0.017 of what V² lets expect, within a factor of
-        # 2; V² whose errors are those of a flux calibration (MATISSE) give ratios down to 0.04.
-        if fills or (ratio is not None and ratio < 0.035):
-            sign = "fill ±π and end there" if fills else "have errors 57 times too small for V²"
-            yield Finding(
-                "error" if fills else "warning",
-                "phase-in-radians",
-                table.label,
-                f"closure phases given as degrees {sign}",
-                "they look like radians: read as degrees they would be 57 times too small",
-                "convert T3PHI and T3PHIERR to degrees, or set their TUNIT to rad",
-            )
-
-
-def _error_ratio(oifits: OIFits, table: OITable, error: float) -> float | None:
-    """Closure-phase error in units of what the V² errors of the same instrument let expect."""
-    ratios = []
-    for other, kind in data_tables(oifits):
-        pair = None if kind.is_angle else value_and_error(other, kind)
-        if pair is not None and other.keyword("INSNAME") == table.keyword("INSNAME"):
-            value, sigma = pair
-            used = unflagged(other, value.shape) & (value > 5 * sigma) & (sigma > 0)
-            ratios.append((sigma / (2 * np.where(used, value, 1)))[used])
-    pooled = np.concatenate(ratios) if ratios else np.empty(0)
-    return float(error / (np.sqrt(3) * np.median(pooled))) if len(pooled) else None
-
-
 CHECKS = (
     wavelengths,
     dates,
@@ -270,5 +234,4 @@ CHECKS = (
     blank_phases,
     vis2_range,
     phase_range,
-    phases_that_are_radians,
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from amibayes.report.page import Column, Section, Table
-from amibayes.report.words import chance, count, fixed, plain
+from amibayes.report.words import count, fixed, plain, tail
 from amibayes.support.atomic_files import short_names
 
 Json = dict[str, Any]
@@ -84,7 +84,7 @@ def _explained(found: Json) -> str:
         return ""
     text = (
         " Were it all that changes along the ramps, these would be as far from the fit with a "
-        f"probability of {chance(p)} (changes of the current) and {chance(bend)} (other bends)."
+        f"probability of {tail(p)} (changes of the current) and {tail(bend)} (other bends)."
     )
     return text if found["explained"] else f"{text} The ramps change in other ways too."
 
@@ -98,7 +98,7 @@ def _posterior(found: Json | None) -> tuple[Table, ...]:
             plain(q["median"]),
             f"{plain(q['lower'])} to {plain(q['upper'])}",
             f"{plain(q['lower_95'])} to {plain(q['upper_95'])}",
-            chance(q["probability_errors_right"]),
+            tail(q["probability_errors_right"]),
         )
         for key, q in found.items()
     )
