@@ -205,8 +205,7 @@ def _with_disc_elsewhere(likelihood: Likelihood, near: SearchResult) -> SearchRe
         found.append(_search_for_disc(likelihood, trial, size))
     disc = min(found, key=lambda result: result.chi2_binary)
     gain = n * np.log(near.chi2_binary / disc.chi2_binary)
-    sure = gain > SURELY_A_DISC and disc.companion.contrast > DISC_CONTRAST
-    return disc if sure else near
+    return disc if gain > SURELY_A_DISC and disc.companion.contrast > DISC_CONTRAST else near
 
 
 NO_POINT = 2.0
@@ -229,8 +228,7 @@ def _in_wider_field(
     score = _score(first, options)
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
-        found = search(likelihood, field, check=False)
-        found = _with_its_disc(likelihood, found, options, first)
+        found = _with_its_disc(likelihood, search(likelihood, field, check=False), options, first)
         if found.chi2_binary < EXPLAINED * first.chi2_binary or (
             found.chi2_binary < first.chi2_binary
             and score - _score(found, options) > SURELY_NOT_NOISE
