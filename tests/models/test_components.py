@@ -138,3 +138,17 @@ def test_companions_are_smeared_unless_told_otherwise() -> None:
     found = Companion().source(samples, np.array([[20.0], [0.0], [0.1]]))
     np.testing.assert_allclose(found.wave[:, 0], expected, atol=1e-9)
     assert np.abs(expected).min() < 0.9
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.3, 1.1])
+def test_slopes_of_limb_darkened_discs_are_differences_of_bessel_functions(exponent: float) -> None:
+    """Up to the tenth lobe: slopes by Poisson's integral, differences of scipy's J."""
+    frequency = np.linspace(0.0, 330.0 / 1.5e-6, 60)
+    by_diameter, by_exponent = power_law_slopes(frequency, 11.0, exponent)
+    step = 1e-4
+    for slope, (low, high) in (
+        (by_diameter, ((11.0 - step, exponent), (11.0 + step, exponent))),
+        (by_exponent, ((11.0, exponent - step), (11.0, exponent + step))),
+    ):
+        change = power_law_disc(frequency, *high) - power_law_disc(frequency, *low)
+        np.testing.assert_allclose(slope, change / (2.0 * step), atol=1e-7)
