@@ -34,7 +34,7 @@ def power_law_disc(
         θ and α; broadcast against ``frequency``. α = 0 is the uniform disc.
     """
     z = np.pi * MAS * np.asarray(frequency, dtype=float) * diameter_mas
-    return _of_orders(z, 0.5 * np.asarray(exponent, dtype=float) + 1.0, (0.0,))[0]
+    return np.asarray(_of_orders(z, 0.5 * np.asarray(exponent, dtype=float) + 1.0, (0.0,))[0])
 
 
 def power_law_slopes(
