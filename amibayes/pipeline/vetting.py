@@ -38,6 +38,7 @@ from amibayes.likelihood.noise import NoiseModel
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
+from amibayes.pipeline.options import past_first_null
 from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
 from amibayes.support.terminal import equals
 from amibayes.units import BoolArray
@@ -281,6 +282,8 @@ def _by_itself(
     """Search one calibrator for a companion, a disc, and what it rules out."""
     free = resolves_stars(Likelihood(data))
     noise, model = _noise(data), BinaryModel(diameter_mas="free" if free else 0.0)
+    if free and past_first_null(Likelihood(data)):
+        model = replace(model, limb_darkening="free")  # a uniform disc would need a companion
     found = search(Likelihood(data, model, noise=noise), separation_mas)
     # Neither test takes the size of the stated errors for known.
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)

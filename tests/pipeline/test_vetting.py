@@ -19,7 +19,7 @@ from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.models.binary import BinaryModel
-from amibayes.oifits import write_oifits
+from amibayes.oifits import read_oifits, write_oifits
 from amibayes.pipeline.prepare import Prepared, _two_that_disagree
 from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _decided, _LeaveOut, notes, vet
 from amibayes.report import words
@@ -270,3 +270,11 @@ def test_a_night_that_drifts_takes_no_calibrator_along(rng) -> None:
     assert [v.kept for v in vetting.calibrators] == [True] * 3 + [False] * 2
     assert "companion" in vetting.calibrators[3].reason
     assert "resolved" in vetting.calibrators[4].reason
+
+
+def test_a_darkened_star_past_its_null_has_no_companion(data: Path) -> None:
+    """As a uniform disc α Cen A has one of 6.6 mag, which the search does not find."""
+    star = read_oifits(data / "oifits" / "alphacen_pionier_1.fits")
+    (found,) = vet([star], calibrated=True, limits=False, null_draws=1500).calibrators
+    assert not found.shows_companion(0.003)
+    assert found.reason.startswith("resolved: 8.28 mas")
