@@ -288,7 +288,7 @@ def _of_scale(result: SearchResult) -> list[str]:
     ]
 
 
-def _joint_warnings(result: SearchResult) -> list[str]:
+def _joint_warnings(result: SearchResult, *, stated: bool) -> list[str]:
     """Warn of what free contrasts and motion take away, and where the rate is no measurement."""
     model = result.likelihood.model
     if integrable(result.likelihood):
@@ -302,7 +302,7 @@ def _joint_warnings(result: SearchResult) -> list[str]:
         "sampling; limits are of one contrast in every band, at rest"
     ]
     rates = result.theta[result.likelihood.parameters.rates]
-    if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
+    if model.moves and stated and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
         found.append(
             f"the rate is at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
             "raise --fastest"
@@ -348,7 +348,7 @@ def search_warnings(
     stated: bool = True,
 ) -> tuple[str, ...]:
     """Warn of what makes the numbers of a search less than they seem; ``stated`` as they may be."""
-    found = [*result.warnings, *observables.notes, *_joint_warnings(result)]
+    found = [*result.warnings, *observables.notes, *_joint_warnings(result, stated=stated)]
     found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
     if noise.floors:
         found.append(_floor_warning(noise))
