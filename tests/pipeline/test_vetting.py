@@ -179,11 +179,12 @@ def test_one_that_disagrees_with_a_dropped_one_is_not_doubted() -> None:
     assert "either may be wrong" in notes(kept, Vetting((kept, other), 0.003))[0]
 
 
-@pytest.mark.slow
 def test_probabilities_too_small_for_a_number_are_said_to_be_less() -> None:
     one = Vetted("a.oifits", True, "", 0.0, diameter_mas=1.0, diameter_probability=0.0)
     dropped = _decided(one, True, 1e-3)
-    assert dropped.reason == "disagrees with the other calibrators (p < 1e-300)"
+    assert dropped.reason == (
+        "disagrees with the other calibrators (p < 1e-300); resolved: 1.00 mas (p < 1e-300)"
+    )
     shown = vetting_table(Vetting((dropped, replace(one, path="b.oifits", agreement=0.02)), 1e-3))
     assert "< 1e-300" in shown[1]
     assert "0.02" in " ".join(shown[2:])
@@ -192,6 +193,7 @@ def test_probabilities_too_small_for_a_number_are_said_to_be_less() -> None:
     assert words.tail(None) == words.NONE
 
 
+@pytest.mark.slow
 def test_calibrators_of_two_filters_are_judged_among_their_own(rng) -> None:
     """As each filter by itself: no calibrator of the other one is asked."""
     reds = [calibrator(rng, name=f"red{k}") for k in range(3)]
