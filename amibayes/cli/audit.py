@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 from amibayes.cli.options import common
 from amibayes.errors import UsageError
-from amibayes.support.terminal import shortened
+from amibayes.support.terminal import MAX_LINES, shortened
 
 if TYPE_CHECKING:
     from amibayes.kpfits.audit import KernelAudit
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     AnyAudit = Audit | KernelAudit
 
 RESULT = "audit.json"
+
+Rank = Literal["file", "error", "warning"]
+RANKS = get_args(Rank)
+"""Lines of the summary, those that are kept longest first."""
 
 EXAMPLES = """examples:
   amibayes audit target.oifits
@@ -117,15 +121,33 @@ def _summary(
     audits: Sequence[AnyAudit], fixed: list[list[Finding]], copies: dict[str, str], folder: Path
 ) -> list[str]:
     """At most 20 lines: what was found, each kind once for a file; the rest is in the JSON."""
-    lines = []
+    lines: list[tuple[Rank, str]] = []
     for a, done in zip(audits, fixed, strict=True):
-        count = len(a.findings)
-        found = "nothing found" if not count else f"{count} finding{'s' if count > 1 else ''}"
+        found = _counted(a.findings)
         if done:
             found += f", {len(done)} corrected in {folder / copies[a.path]}"
-        lines.append(f"{a.path}: {a.format}, {found}")
-        lines += [_line(group) for group in _alike(a.findings)]
-    return shortened(lines, [f"explained in {folder / RESULT}"])
+        lines.append(("file", f"{a.path}: {a.format}, {found}"))
+        lines += [(group[0].severity, _line(group)) for group in _alike(a.findings)]
+    return shortened(_gravest_first(lines), [f"explained in {folder / RESULT}"])
+
+
+def _counted(findings: Sequence[Finding]) -> str:
+    """Say how many findings there are, and how many of them are errors."""
+    if not findings:
+        return "nothing found"
+    errors = sum(f.severity == "error" for f in findings)
+    text = f"{len(findings)} finding{'s' if len(findings) > 1 else ''}"
+    return f"{text} ({errors} error{'s' if errors > 1 else ''})" if errors else text
+
+
+def _gravest_first(lines: Sequence[tuple[Rank, str]]) -> list[str]:
+    """Put those at the end for which there is no room: warnings first of all, files last."""
+    room = MAX_LINES - 2  # a line that counts the others, and the last one
+    if len(lines) <= room + 1:
+        return [text for _, text in lines]
+    by_weight = sorted(range(len(lines)), key=lambda i: RANKS.index(lines[i][0]))
+    order = sorted(by_weight[:room]) + by_weight[room:]
+    return [lines[i][1] for i in order]
 
 
 def _alike(findings: tuple[Finding, ...]) -> list[list[Finding]]:

@@ -88,6 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     from amibayes.extraction.reading import charge_of, check_together, of_one_visit
     from amibayes.kpfits import write_observables
     from amibayes.pipeline.prepare import read, read_calibrators
+    from amibayes.pipeline.warnings import calibrator_warnings
     from amibayes.report.noise import migration_json, migration_lines
     from amibayes.support.atomic_files import output_folder
 
@@ -115,9 +116,10 @@ def run(arguments: argparse.Namespace) -> int:
         _keep(arguments, calibrators, diameters)
     charge = charge_of([*arguments.targets, *arguments.cal], images)
     migration = migration_json(charge, found)
-    content = _json(arguments, found, folder) | {"charge_migration": migration}
+    warned = calibrator_warnings(targets, calibrators, sized=diameters is not None)
+    content = _json(arguments, found, folder, warned) | {"charge_migration": migration}
     taken_out = migration_lines(migration)
-    common.finish(arguments, content, lambda: _summary(found, folder, taken_out))
+    common.finish(arguments, content, lambda: _summary(found, folder, taken_out, warned))
     return 0
 
 
@@ -169,7 +171,9 @@ def _reading(arguments: argparse.Namespace, images: ImageOptions) -> SearchOptio
     )
 
 
-def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> dict[str, object]:
+def _json(
+    arguments: argparse.Namespace, found: Calibration, folder: Path, warned: list[str]
+) -> dict[str, object]:
     from amibayes import __version__
     from amibayes.support.atomic_files import sha256
 
@@ -190,7 +194,7 @@ def _json(arguments: argparse.Namespace, found: Calibration, folder: Path) -> di
         },
         "calibration": found.as_json(),
         "output": _written(found, folder),
-        "warnings": list(used.notes),
+        "warnings": [*used.notes, *warned],
     }
 
 
@@ -200,7 +204,9 @@ def _written(found: Calibration, folder: Path) -> str:
     return str(folder / (KERNEL_RESULT if kernels else RESULT))
 
 
-def _summary(found: Calibration, folder: Path, taken_out: list[str]) -> list[str]:
+def _summary(
+    found: Calibration, folder: Path, taken_out: list[str], warned: list[str]
+) -> list[str]:
     used = found.observables
     lines = [
         f"data        {used.n_vis2} V2, {used.n_closure_phases} {used.phase_name}s, "
@@ -213,6 +219,7 @@ def _summary(found: Calibration, folder: Path, taken_out: list[str]) -> list[str
     if found.tau_closure_phase_deg is not None:
         tau = found.tau_closure_phase_deg
         lines.append(f"scatter     {tau:.3g} deg in closure phase between calibrators")
+    lines += [row("WARNING", text) for text in warned]
     for use in found.calibrators:
         state = "kept" if use.kept else "not used"
         lines.append(f"calibrator  {use.path}: {state}{', ' if use.reason else ''}{use.reason}")

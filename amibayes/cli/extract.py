@@ -164,6 +164,8 @@ def _geometry(found: dict[str, Any]) -> str:
 
 
 def _summary(content: list[dict[str, Any]]) -> list[str]:
+    from amibayes.extraction.extract import MAPPED
+
     lines = []
     for entry in content:
         lines += [
@@ -180,7 +182,7 @@ def _summary(content: list[dict[str, Any]]) -> list[str]:
             f"  closure phase  σ {entry['sigma_closure_phase_deg']:.3g} deg, photon and read noise "
             f"{entry['sigma_closure_phase_physical_deg']:.3g} deg",
         ]
-        lines += [f"  {note}" for note in entry["notes"]]
+        lines += [f"  {note}" for note in entry["notes"] if not note.startswith(MAPPED)]
     return shortened(lines)
 
 

@@ -243,7 +243,8 @@ def join(parts: Sequence[Observables]) -> Observables:
     """Lay data sets together for one fit.
 
     The kind of the whole covariance is that of its least certain part, in the order
-    given, estimated, assumed, diagonal; its freedom that of `stacked_freedom`.
+    given, estimated, assumed, diagonal (of parts with closure phases, where there are any: V² alone
+    is diagonal by itself); its freedom that of `stacked_freedom`.
     """
     if len(parts) == 1:
         return parts[0]
@@ -253,13 +254,14 @@ def join(parts: Sequence[Observables]) -> Observables:
     shifts = np.cumsum([0, *(len(p.setups) for p in parts)])
     order = vis2_first([(p.n_vis2, p.n_closure_phases) for p in parts])
     kinds: list[CovarianceKind] = ["diagonal", "assumed", "estimated", "given"]
+    closing = [p for p in parts if p.n_closure_phases or p.covariance_kind != "diagonal"]
     known = [p.n_integrations for p in parts if p.n_integrations is not None]
     scatter = stacked_scatter((p.covariance, p.scatter) for p in parts)
     return Observables(
         Measurements.joined([p.vis2 for p in parts], shifts),
         Measurements.joined([p.closure_phase for p in parts], shifts),
         stack_covariances([p.covariance for p in parts]).select(order),
-        min((p.covariance_kind for p in parts), key=kinds.index),
+        min((p.covariance_kind for p in closing or parts), key=kinds.index),
         tuple(s for p in parts for s in p.setups),
         min(known) if known else None,
         tuple(dict.fromkeys(n for p in parts for n in p.notes)),

@@ -44,15 +44,18 @@ class FileResiduals:
 
 @checks_arguments
 def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
-    """Reduced χ² of every file and kind of observable, with the companion and without."""
+    """Reduced χ² of every file and kind of observable, with the companion and without.
+
+    By the covariance of the fit, which has the errors that channels of an exposure share.
+    """
     binary, single = result.likelihood, single_likelihood(result.likelihood)
-    data = binary.observables
+    data, covariance = binary.observables, binary.noise.covariance
     left = binary.difference(result.theta)[:, 0], single.difference(result.single_theta)[:, 0]
     share = result.ndof / binary.n_independent
     out = []
     for file in files_of(data):
         kinds = [np.flatnonzero(file.of_kind(kind)) for kind in ("vis2", "cp")]
-        reduced = [_reduced(data.covariance, r, at, share) for r in left for at in kinds]
+        reduced = [_reduced(covariance, r, at, share) for r in left for at in kinds]
         out.append(FileResiduals(file.source, len(kinds[0]), len(kinds[1]), *reduced))
     return tuple(out)
 

@@ -390,10 +390,9 @@ def _found(tested: Significance) -> str:
 
 def _nothing(tested: Significance) -> str:
     unsure = tested.probability < tested.alpha
-    return (
-        "noise alone gives something as good in the field with a probability of "
-        f"{tested.probability:.2g}"
-    ) + (f", which is not below {tested.alpha:.2g} with 95 % confidence" if unsure else "")
+    more = f", which is not below {tested.alpha:.2g} with 95 % confidence: more null draws may tell"
+    text = "noise alone gives something as good in the field with a probability of "
+    return f"{text}{tested.probability:.2g}{more if unsure else ''}"
 
 
 def _share(p: float) -> str:

@@ -286,6 +286,10 @@ def _unnamed(parts: list[_Part]) -> tuple[str, ...]:
     return (f"{len(parts)} files that name no star are taken as exposures of one",)
 
 
+MAPPED = "pixels taken as the header has them"
+"""Begins the note on the map of the mask."""
+
+
 def _of_headers(parts: list[_Part]) -> tuple[str, ...]:
     """What the headers are in doubt of, and how the images were taken to lie on the sky."""
     notes = dict.fromkeys(note for p in parts for note in p.template.notes)
@@ -293,7 +297,7 @@ def _of_headers(parts: list[_Part]) -> tuple[str, ...]:
     if found is not None:
         a, b = (f"{found.matrix[k, k]:.5f}" for k in (0, 1))
         c, d = (f"{x:+.5f}" for x in (found.matrix[0, 1], found.matrix[1, 0]))
-        text = f"pixels taken as the header has them; mask magnified {a}, {b} and sheared {c}, {d}"
+        text = f"{MAPPED}; mask magnified {a}, {b} and sheared {c}, {d}"
         notes[text] = None
         notes |= dict.fromkeys(far_from_stated(found, parts[0].operator.view.instrument.distortion))
     return tuple(notes)

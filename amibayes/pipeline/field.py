@@ -80,9 +80,8 @@ MAX_LEFT_OUT = 4
 def search_field(observables: Observables, options: SearchOptions) -> FieldSearch:
     """Search the field; the default one is widened where something around it fits better.
 
-    A few rows that the best fit to all others is far from explaining are left out, one after the
-    other. Where leaving out so few does not end it, or one of them is explained in the end, the
-    model is what is wrong: all data are searched as they are.
+    A few rows that the best fit to all others is far from explaining are left out, one by one.
+    Where that does not end it, or one is explained in the end, the model is wrong: all are kept.
     """
     whole = found = _search_field(observables, options)
     if options.keep_outliers or options.robust:
@@ -209,8 +208,7 @@ def _with_disc_elsewhere(likelihood: Likelihood, near: SearchResult) -> SearchRe
 
 
 NO_POINT = 2.0
-"""χ² per datum of the best fit, with the stated errors, from which discs are searched for: one
-that errors too small by 1.4 give is no reason to."""
+"""χ² per datum from which discs are searched for: stated errors too small by 1.4 give as much."""
 
 TRIAL_DISCS = (0.7, 1.0, 1.5)
 """Their diameters in units of λ/B_max: smaller ones are found from where the best point is."""

@@ -330,10 +330,12 @@ def _report(
 
 
 def _warnings(ready: Prepared, found: Found, tests: Tests, posterior: Inference) -> tuple[str, ...]:
+    statement = None if tests.verdict is None else tests.verdict.statement
     warnings = search_warnings(
-        found.observables, found.result, found.noise, tests.first, posterior.samples
-    )
-    told = tests.verdict is not None and tests.verdict.statement == "inconsistent data"
+        found.observables, found.result, found.noise, tests.first, posterior.samples,
+        stated=statement in (None, "companion"),
+    )  # fmt: skip
+    told = statement == "inconsistent data"
     splits = [] if told else consistency_warnings(tests.splits)
     return (*ready.warnings, *found.warnings, *splits, *warnings)
 

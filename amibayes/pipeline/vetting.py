@@ -31,6 +31,7 @@ from amibayes.detection.statistic import statistic_of
 from amibayes.detection.verdict import change_by_companion, within_calibration
 from amibayes.errors import DataError
 from amibayes.likelihood.channel_noise import noise_with_channels
+from amibayes.likelihood.channel_rows import channel_layout
 from amibayes.likelihood.chi2 import chi2_survival
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
@@ -38,6 +39,8 @@ from amibayes.likelihood.noise import NoiseModel
 from amibayes.limits.completeness import detection_limit
 from amibayes.limits.limit import DetectionLimit
 from amibayes.models.binary import BinaryModel
+from amibayes.pipeline.field import search_field
+from amibayes.pipeline.options import SearchOptions, past_first_null
 from amibayes.support.options import SEED, VETTING_ALPHA, VETTING_NULL_DRAWS, CalibrationMethod
 from amibayes.support.terminal import equals
 from amibayes.units import BoolArray
@@ -279,9 +282,8 @@ def _by_itself(
     rng: np.random.Generator,
 ) -> Vetted:
     """Search one calibrator for a companion, a disc, and what it rules out."""
-    free = resolves_stars(Likelihood(data))
-    noise, model = _noise(data), BinaryModel(diameter_mas="free" if free else 0.0)
-    found = search(Likelihood(data, model, noise=noise), separation_mas)
+    noise = _noise(data)
+    found = _searched(data, noise, separation_mas)
     # Neither test takes the size of the stated errors for known.
     found_by_noise = significance(statistic_of(found), null_draws, rng, alpha)
     enough = limits and found_by_noise.detected is not None
@@ -306,6 +308,21 @@ def _by_itself(
         vetted, diameter_mas=float(best[0]), diameter_probability=probability,
         small_disc=within_calibration(data, change[:, 0] - change[:, 1]),
     )  # fmt: skip
+
+
+def _searched(
+    data: Observables, noise: NoiseModel, separation_mas: tuple[float, float] | None
+) -> SearchResult:
+    """Search for a companion; of an interferometer's data as `search_companion` does.
+
+    With a disc, its limb darkening, and the errors that channels share: resolved single stars had
+    companions in their place.
+    """
+    likelihood = Likelihood(data, noise=noise)
+    resolved = resolves_stars(likelihood) or past_first_null(likelihood)
+    if resolved or channel_layout(data.unflagged()).any:
+        return search_field(data, SearchOptions(separation_mas=separation_mas)).result
+    return search(likelihood, separation_mas)
 
 
 def _decided(vetted: Vetted, disagrees: bool, alpha: float) -> Vetted:

@@ -13,6 +13,7 @@ from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
+from amibayes.detection.note import taken_for_a_point
 from amibayes.detection.residuals import correlated
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.extra_noise import ExtraNoise
@@ -287,7 +288,7 @@ def _of_scale(result: SearchResult) -> list[str]:
     ]
 
 
-def _joint_warnings(result: SearchResult) -> list[str]:
+def _joint_warnings(result: SearchResult, *, stated: bool) -> list[str]:
     """Warn of what free contrasts and motion take away, and where the rate is no measurement."""
     model = result.likelihood.model
     if integrable(result.likelihood):
@@ -301,7 +302,7 @@ def _joint_warnings(result: SearchResult) -> list[str]:
         "sampling; limits are of one contrast in every band, at rest"
     ]
     rates = result.theta[result.likelihood.parameters.rates]
-    if model.moves and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
+    if model.moves and stated and np.abs(rates).max() > 0.99 * model.fastest_mas_yr:
         found.append(
             f"the rate is at the edge of what was tried, {model.fastest_mas_yr:.3g} mas/yr: "
             "raise --fastest"
@@ -343,9 +344,11 @@ def search_warnings(
     noise: ExtraNoise,
     tested: Significance | None,
     posterior: Posterior | None,
+    *,
+    stated: bool = True,
 ) -> tuple[str, ...]:
-    """Warn of what makes the numbers of a search less than they seem."""
-    found = [*result.warnings, *observables.notes, *_joint_warnings(result)]
+    """Warn of what makes the numbers of a search less than they seem; ``stated`` as they may be."""
+    found = [*result.warnings, *observables.notes, *_joint_warnings(result, stated=stated)]
     found += [*_of_covariance(result), *_of_errors(result, noise), *_of_bright(result)]
     if noise.floors:
         found.append(_floor_warning(noise))
@@ -367,8 +370,8 @@ def search_warnings(
         found += _drifting(tested.exposures)
     found += _outliers(result, noise)
     found += _correlated(result)
-    if tested is not None and tested.detected:
-        found += _of_scale(result)
+    if tested is not None and tested.detected and stated:
+        found += [*_of_scale(result), *taken_for_a_point(result)]
     excluded = [] if posterior is None else _of_prior(result, posterior.prior)
     found += excluded
     if posterior is not None and not excluded and len(posterior.mode_probability) > 1:

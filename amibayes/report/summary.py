@@ -49,8 +49,7 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
         f"chi2        {result.chi2_single:.1f} single, {result.chi2_binary:.1f} binary "
         f"({result.ndof} dof: reduced {three_digits(result.chi2_single / result.ndof)} -> "
         f"{three_digits(result.chi2_binary / result.ndof)})",
-        f"detection   delta chi2 {result.delta_chi2:.1f}, CANDID n_sigma "
-        f"{result.candid_n_sigma:.1f} (not a false-alarm rate)",
+        _detection(result),
     ]
     lines += [*joint_lines(report), *_shape_lines(report), *_nuisance_lines(report)]
     lines += _noise_lines(report)
@@ -64,6 +63,15 @@ def summary(report: SearchReport, folder: Path) -> list[str]:
     if report.limits is not None:
         lines += _limit_lines(report.limits)
     return with_warnings(lines, report.warnings, row("written to", str(folder)), "result.json")
+
+
+def _detection(result: SearchResult) -> str:
+    """Gain of the fit; twice that in ln L by Student's t is not the difference of two χ²."""
+    gain, difference = result.delta_chi2, result.chi2_single - result.chi2_binary
+    estimated = np.isfinite(result.likelihood.degrees) and gain < 0.99 * difference
+    told = " (2 ln L, as errors are estimated from scatter)" if estimated else ""
+    sigma = f"CANDID n_sigma {result.candid_n_sigma:.1f} (not a false-alarm rate)"
+    return row("detection", f"delta chi2 {gain:.1f}{told}, {sigma}")
 
 
 def _statement(report: SearchReport) -> list[str]:

@@ -158,8 +158,10 @@ def _statement(content: Json) -> Statement:
     label = "COMPANIONS" if n else "NO COMPANION"
     head = f"{n or 'None'} of {alarms['n_tested']} targets {'is' if n < 2 else 'are'} listed"
     head += f" as {'a companion' if n < 2 else 'companions'} at a false-discovery rate of {level:g}"
+    detected = alarms["n_detected"]
+    found = f"{detected} target{' has' if detected == 1 else 's have'}"
     sentences = (
-        f"Taken one by one, {alarms['n_detected']} targets have a companion detected (false-alarm "
+        f"Taken one by one, {found} a companion detected (false-alarm "
         f"probability up to their α); {alarms['expected_false_detections']:.2g} such detections "
         "are expected of noise.",
         f"The smallest false-alarm probability is {alarms['smallest_probability']:.2g}. Were none "

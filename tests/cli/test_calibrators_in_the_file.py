@@ -132,3 +132,20 @@ def test_what_is_refused(
     ]
     assert run(command, *named, "--out", tmp_path / "out") == status
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("sized", [False, True])
+def test_calibrate_warns_of_calibrators_taken_for_points(
+    night: Path, tmp_path: Path, sized: bool, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    """`search` did; the file that `calibrate` writes has the same diameters in it."""
+    monkeypatch.setattr("amibayes.pipeline.warnings.NOTABLE_LOSS", 0.001)  # of short baselines
+    words = ["calibrate", night, "--target", "sci", "--cal", night, "--out", tmp_path / "out"]
+    if sized:
+        words += ["--calibrator-diameters", "0.3,0.3,0.3"]
+    assert run(*words, "--json") == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert any("taken for points" in text for text in warnings) is not sized
+    assert run(*words, "--overwrite") == 0
+    said = capsys.readouterr().out
+    assert ("WARNING     calibrators were taken for points" in said) is not sized

@@ -195,6 +195,29 @@ def test_audit_says_at_most_twenty_lines(data: Path, tmp_path: Path, capsys) -> 
     assert len(capsys.readouterr().out.splitlines()) <= 20
 
 
+def test_audit_of_many_files_names_each_and_its_errors(
+    files: list[str], tmp_path: Path, capsys
+) -> None:  # type: ignore[no-untyped-def]
+    """A summary cut at its end named the first files alone, whatever was wrong with the others."""
+    copies = [tmp_path / f"copy{k}.oifits" for k in range(12)]
+    for k, copy in enumerate(copies):
+        with fits.open(files[0]) as hdus:
+            hdus["OI_ARRAY"].header["FRAME"] = "GEOCENTRIC"
+            hdus["OI_VIS2"].header.pop("DATE-OBS", None)
+            hdus["OI_VIS2"].columns["UCOORD"].unit = "METERS"
+            if k == 11:
+                hdus["OI_VIS2"].data["VIS2DATA"][2, 1] = np.nan
+            hdus.writeto(copy)
+    assert run("audit", *map(str, copies), "--out", str(tmp_path / "out")) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 20
+    assert all(any(line.startswith(f"{copy}: ") for line in lines) for copy in copies)
+    last = next(k for k, line in enumerate(lines) if line.startswith(f"{copies[-1]}: "))
+    assert "(1 error)" in lines[last]
+    assert lines[last + 1].startswith("  error   ")
+    assert lines[-2].startswith("and ")
+
+
 def test_unreadable_is_three_and_one_line(data: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "empty.fits").touch()
     (tmp_path / "text.fits").write_text("no FITS")

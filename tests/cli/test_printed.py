@@ -378,6 +378,8 @@ def test_images_made_and_measured_in_words(tmp_path: Path, capsys) -> None:
     assert f"integrations   {entry['n_used']} of 6 used" in said
     assert f"closure phase  σ {entry['sigma_closure_phase_deg']:.3g} deg" in said
     assert len(said.splitlines()) <= 20
+    assert said.count("mask magnified") == 1  # by the geometry, not by a note again
+    assert any("mask magnified" in note for note in entry["notes"])
     single = next((tmp_path / "e").glob("*_integrations.oifits"))
     assert read_oifits(single).n_vis2 == 21 * entry["n_used"]
     twin = tmp_path / "twin" / cube.name

@@ -38,6 +38,7 @@ from amibayes.likelihood.residuals import files_of
 from amibayes.models.bands import band_numbers, bands_of, dates
 from amibayes.models.binary import BinaryModel
 from amibayes.models.parameters import Box
+from amibayes.pipeline.warnings import search_warnings
 from amibayes.posterior.ensemble import sample
 from amibayes.posterior.evidence import log_evidence_importance
 from amibayes.posterior.grid import affordable
@@ -108,6 +109,15 @@ def test_model_of_bands_and_motion_is_that_of_each_epoch_by_itself() -> None:
         expected = Likelihood(part).predict([own])[:, 0]
         vis2, closure = np.arange(21) + 21 * k, 63 + np.arange(35) + 35 * k
         np.testing.assert_allclose(predicted[np.r_[vis2, closure]], expected, atol=1e-12)
+
+
+def test_a_rate_at_its_edge_is_told_of_a_companion_that_is_stated(rng) -> None:
+    """Of α Cen A, "no companion", the summary asked for a faster one."""
+    data = three_epochs(rng)  # which moves by 23 mas a year
+    result = search(free(data, motion=True, fastest_mas_yr=5.0), FIELD)
+    for stated in (True, False):
+        said = search_warnings(data, result, ExtraNoise(), None, None, stated=stated)
+        assert any("raise --fastest" in text for text in said) is stated
 
 
 def with_response(data: Observables, rng) -> Observables:

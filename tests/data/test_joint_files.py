@@ -287,3 +287,13 @@ def test_what_is_said_of_every_file_stands_once() -> None:
     notes = [("the header lacks NGROUPS", "1 of 10 integrations not used"), ("another",)]
     parts = [replace(niriss(), notes=(first, *more)) for first, *more in [*notes, notes[0][:1]]]
     assert join(parts).notes == (*notes[0], *notes[1])
+
+
+def test_v2_in_a_file_of_its_own_leaves_the_kind_of_the_covariance_to_closure_phases() -> None:
+    """V² and closure phases in two files made a "diagonal covariance" of correlated triangles."""
+    sheet = niriss()
+    vis2, closing = replace(sheet.only(["vis2"]), covariance_kind="diagonal"), sheet.only(["cp"])
+    assert join([vis2, closing]).covariance_kind == sheet.covariance_kind == "assumed"
+    alone = replace(closing, covariance_kind="diagonal")
+    assert join([vis2, alone]).covariance_kind == "diagonal"
+    assert join([vis2, vis2]).covariance_kind == "diagonal"

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import niriss, simulated
+from interferometer import four_telescopes
 
 from amibayes.companion_search.search import search
-from amibayes.detection.residuals import channel_correlation
+from amibayes.data.observables import join
+from amibayes.detection.residuals import channel_correlation, file_residuals
+from amibayes.likelihood.channel_noise import ChannelShare, Correlation, noise_with_channels
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.pipeline.warnings import search_warnings
@@ -40,3 +45,22 @@ def test_common_errors_of_channels_are_measured(share, rng) -> None:
 def test_one_channel_says_nothing(rng) -> None:
     result = search(Likelihood(simulated(niriss(), TRUTH, rng)), (50.0, 400.0))
     assert channel_correlation(result) == (0.0, 0)
+
+
+def test_chi2_of_files_adds_up_where_channels_share_errors(rng) -> None:
+    """By stated errors alone files had a worst reduced χ² of 0.87 beside 0.25 of the whole fit."""
+    parts = []
+    for name in "ab":
+        sheet = four_telescopes(3)
+        data = replace(sheet, setups=tuple(replace(s, source=name) for s in sheet.setups))
+        parts.append(simulated(data, [4.0, 5.0, 0.1], rng))
+    data = join(parts)
+    noise = noise_with_channels(data, [ChannelShare(*[Correlation(0.5, 0.0, 0.5, 0.1)] * 2)])
+    result = search(Likelihood(data).with_noise(noise), (2.0, 12.0))
+    files = file_residuals(result)
+    share = result.ndof / result.likelihood.n_independent
+    # 3 exposures in 3 channels: 6 baselines, and 3 independent closure phases of 4 triangles.
+    total = sum(share * (54 * f.vis2 + 27 * f.closure_phase) for f in files)
+    assert total == pytest.approx(result.chi2_binary, rel=1e-9)
+    single = sum(share * (54 * f.single_vis2 + 27 * f.single_closure_phase) for f in files)
+    assert single == pytest.approx(result.chi2_single, rel=1e-9)

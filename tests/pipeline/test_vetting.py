@@ -19,7 +19,7 @@ from amibayes.data.observables import Observables
 from amibayes.errors import DataError
 from amibayes.likelihood.extra_noise import ExtraNoise, add_noise
 from amibayes.models.binary import BinaryModel
-from amibayes.oifits import write_oifits
+from amibayes.oifits import read_oifits, write_oifits
 from amibayes.pipeline.prepare import Prepared, _two_that_disagree
 from amibayes.pipeline.vetting import Vetted, Vetting, _compare, _decided, _LeaveOut, notes, vet
 from amibayes.report import words
@@ -179,11 +179,12 @@ def test_one_that_disagrees_with_a_dropped_one_is_not_doubted() -> None:
     assert "either may be wrong" in notes(kept, Vetting((kept, other), 0.003))[0]
 
 
-@pytest.mark.slow
 def test_probabilities_too_small_for_a_number_are_said_to_be_less() -> None:
     one = Vetted("a.oifits", True, "", 0.0, diameter_mas=1.0, diameter_probability=0.0)
     dropped = _decided(one, True, 1e-3)
-    assert dropped.reason == "disagrees with the other calibrators (p < 1e-300)"
+    assert dropped.reason == (
+        "disagrees with the other calibrators (p < 1e-300); resolved: 1.00 mas (p < 1e-300)"
+    )
     shown = vetting_table(Vetting((dropped, replace(one, path="b.oifits", agreement=0.02)), 1e-3))
     assert "< 1e-300" in shown[1]
     assert "0.02" in " ".join(shown[2:])
@@ -192,6 +193,7 @@ def test_probabilities_too_small_for_a_number_are_said_to_be_less() -> None:
     assert words.tail(None) == words.NONE
 
 
+@pytest.mark.slow
 def test_calibrators_of_two_filters_are_judged_among_their_own(rng) -> None:
     """As each filter by itself: no calibrator of the other one is asked."""
     reds = [calibrator(rng, name=f"red{k}") for k in range(3)]
@@ -270,3 +272,14 @@ def test_a_night_that_drifts_takes_no_calibrator_along(rng) -> None:
     assert [v.kept for v in vetting.calibrators] == [True] * 3 + [False] * 2
     assert "companion" in vetting.calibrators[3].reason
     assert "resolved" in vetting.calibrators[4].reason
+
+
+@pytest.mark.parametrize(
+    "name", ["alphacen_pionier_1", "canopus_matisse", "arcturus_iota", "alphacol_amber"]
+)
+def test_resolved_single_stars_have_no_companion(name: str, data: Path) -> None:
+    """α Cen A had one of 6.6 mag, Canopus of 2.3, Arcturus and α Col of 0.0: `search` has none."""
+    star = read_oifits(data / "oifits" / f"{name}.fits")
+    (found,) = vet([star], calibrated=True, limits=False, null_draws=1500).calibrators
+    assert not found.shows_companion(0.003)
+    assert found.reason.startswith("resolved: ")

@@ -9,6 +9,7 @@ import hashlib
 import json
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,10 @@ from trial_answers import PLAN, answers
 
 from amibayes.cli import main
 from amibayes.cli.options import common
+from amibayes.companion_search.search import search
+from amibayes.data.degrees_of_freedom import Freedom
 from amibayes.errors import DataError
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.oifits import write_oifits
 from amibayes.pipeline.options import SearchOptions
 from amibayes.pipeline.report_types import Stages
@@ -32,6 +36,7 @@ from amibayes.report.page import Sky, page_html, read_figure
 from amibayes.report.search_page import SECTIONS
 from amibayes.report.sections.joint import RESIDUALS
 from amibayes.report.statement import sky_of, statement_of
+from amibayes.report.summary import _detection
 from amibayes.report.validation import validation_page, validation_pictures
 from amibayes.report.words import chance, count, measured, plain
 from amibayes.validation.tally import tally
@@ -482,3 +487,16 @@ def test_the_command_line_keeps_what_decides_the_numbers() -> None:
     ]
     plain = argparse.Namespace(words=["search", "t"], seed=1)
     assert common.command_line(plain) == "amibayes search t --seed 1"
+
+
+def test_a_gain_that_is_no_difference_of_two_chi2_says_why(rng) -> None:
+    """With 40 integrations χ² fell by 180 000 and "delta chi2" was 657, without a word."""
+    truth = [150.0, -80.0, 0.02]
+    sheet = niriss()
+    known = search(Likelihood(simulated(sheet, truth, rng)), (50.0, 400.0))
+    assert "2 ln L" not in _detection(known)
+    few = replace(sheet, freedom=Freedom(40.0, 39.0), covariance_kind="estimated")
+    found = search(Likelihood(simulated(few, truth, rng)), (50.0, 400.0))
+    assert found.delta_chi2 < 0.99 * (found.chi2_single - found.chi2_binary)
+    line = _detection(found)
+    assert f"delta chi2 {found.delta_chi2:.1f} (2 ln L, as errors are estimated" in line

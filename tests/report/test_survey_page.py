@@ -73,6 +73,7 @@ def test_the_page_needs_nothing_else(page: Path) -> None:
     assert 'href="HD%203/report.html"' in text
     assert text.index("&lt;b&gt;") < text.index("HD 3")  # failed ones first
     assert "1 of 8 targets is listed as a companion" in text
+    assert "1 target has a companion detected" in page.read_text()
 
 
 def test_rows_past_what_a_browser_sorts_are_in_the_table(tmp_path: Path) -> None:
