@@ -283,8 +283,8 @@ def _of_scale(result: SearchResult) -> list[str]:
         return []
     return [
         "lengths on the sky go with the wavelengths that the data state: if these are off by "
-        f"{WAVELENGTH_SCALE:.1%}, the separation is off by {change:.2g} mas; its error leaves that "
-        "out"
+        f"{100.0 * WAVELENGTH_SCALE:.1g} %, the separation is off by {change:.2g} mas; its error "
+        "leaves that out"
     ]
 
 

@@ -54,10 +54,10 @@ def image_plot(image: ReconstructedImage) -> Figure:
     blurred, dirty = image.convolved(), image.dirty_image()
     norm = PowerNorm(0.5, 0.0, top)
     _sky(figure, axes[0, 0], image, image.light, "Flux per pixel", cmap=SEQUENTIAL, norm=norm)
-    axes[0, 0].set_title("Reconstruction")
+    axes[0, 0].set_title("Reconstruction (root scale)")
     norm = PowerNorm(0.5, 0.0, float(blurred.max()) or 1.0)
     _sky(figure, axes[0, 1], image, blurred, "Flux per pixel", cmap=SEQUENTIAL, norm=norm)
-    axes[0, 1].set_title("with a beam of λ/2B")
+    axes[0, 1].set_title("with a beam of λ/2B (root scale)")
     reach = 0.5 * image.grid.n * image.grid.pixel_mas
     place, radius = (0.82 * reach, -0.82 * reach), 0.5 * image.beam_mas
     axes[0, 1].add_patch(Circle(place, radius, fill=False, ec="white", lw=1.5))
