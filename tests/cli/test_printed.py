@@ -21,6 +21,7 @@ from amibayes.detection.false_alarm import Significance
 from amibayes.detection.verdict import Verdict
 from amibayes.likelihood.averaged_noise import NoisePosterior
 from amibayes.likelihood.extra_noise import ExtraNoise
+from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.oifits import read_oifits, write_oifits
 from amibayes.parallel import spawn
@@ -89,6 +90,14 @@ def test_two_companions_and_a_disc_are_told(report: SearchReport) -> None:
     assert "1: ln Z" in line(report, "evidence")
     assert repr(report.evidence).startswith("<Evidence: 1 companions ln Z ")
     assert len(summary(report, Path("out"))) <= 20
+
+
+def test_a_disc_of_closure_phases_alone_is_told_as_such(report: SearchReport) -> None:
+    assert "closure phases alone" not in line(report, "diameter")
+    seen = report.result.likelihood
+    phases = Likelihood(seen.observables.only("cp"), seen.model)
+    told = replace(report, result=replace(report.result, likelihood=phases))
+    assert line(told, "diameter").endswith("mas (closure phases alone hardly tell it)")
 
 
 def test_what_was_not_tested_is_written_so(report: SearchReport) -> None:
