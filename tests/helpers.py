@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -61,6 +62,18 @@ def simulated(
         data = data + sheet.covariance.draw(rng, 1)[:, 0]
     data[len(sheet.vis2) :] += shift_closure
     return sheet.with_data(data)
+
+
+def named_star(sheet: Observables, name: str, rng: np.random.Generator) -> Observables:
+    """A noisy star of V² 0.8 in the coverage of a sheet of one setup."""
+    noise = sheet.covariance.draw(rng, 1)[:, 0]
+    n = len(sheet.vis2)
+    return replace(
+        sheet,
+        vis2=replace(sheet.vis2, value=0.8 + noise[:n]),
+        closure_phase=replace(sheet.closure_phase, value=noise[n:]),
+        setups=(replace(sheet.setups[0], target=name),),
+    )
 
 
 def error_of(capsys: pytest.CaptureFixture[str]) -> str:

@@ -158,8 +158,7 @@ def without_disc(
     if diameter_mas == 0.0:
         return calibrator
     m = calibrator.vis2
-    frequency = np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m
-    amplitude, slope = uniform_disc(frequency, diameter_mas)
+    amplitude, slope = uniform_disc(m.frequency, diameter_mas)
     factor = 1.0 / amplitude**2
     every = np.concatenate([factor[~m.flag], np.ones(calibrator.n_closure_phases)])
     scatter = calibrator.scatter

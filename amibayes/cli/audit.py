@@ -135,9 +135,11 @@ def _counted(findings: Sequence[Finding]) -> str:
     """Say how many findings there are, and how many of them are errors."""
     if not findings:
         return "nothing found"
+    from amibayes.oifits.audit.finding import count
+
     errors = sum(f.severity == "error" for f in findings)
-    text = f"{len(findings)} finding{'s' if len(findings) > 1 else ''}"
-    return f"{text} ({errors} error{'s' if errors > 1 else ''})" if errors else text
+    text = count(len(findings), "finding")
+    return f"{text} ({count(errors, 'error')})" if errors else text
 
 
 def _gravest_first(lines: Sequence[tuple[Rank, str]]) -> list[str]:

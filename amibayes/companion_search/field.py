@@ -23,6 +23,11 @@ from amibayes.units import MAS, FloatArray
 SURELY_NOT_NOISE = 30.0
 """Δχ² that noise alone does not give anywhere in a field of a few thousand positions."""
 
+DISC_CONTRAST = 0.03
+"""Contrast below which a companion's disc is not tried unasked: as large as the star's it would
+have a surface brightness of 3 % of it, and what looks resolved is rather light lost in the
+channel's width."""
+
 PERHAPS_NOT_NOISE = 20.0
 """Δχ² from which a companion may be stated."""
 
@@ -63,6 +68,11 @@ def refuse_no_length(likelihood: Likelihood) -> None:
 def resolution_mas(likelihood: Likelihood) -> float:
     """λ/B of the longest baseline in wavelengths, mas."""
     return float(1.0 / likelihood.samples.frequency.max() / MAS)
+
+
+def box_of(grid: Grid, likelihood: Likelihood) -> Box:
+    """Bounds of a fit inside the field of a grid."""
+    return Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
 
 
 def look_inside(result: SearchResult) -> float | None:

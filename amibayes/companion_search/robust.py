@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.field import box_of, resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.search import search
@@ -187,7 +187,7 @@ class RobustFits:
         place, stretch = np.full(2, np.nan), self._stretch(white)[0]
         for _ in range(MAX_SEARCHES):
             result = search(self.stretched(stretch), self.field)
-            stretch, _ = self.steps(result.theta, self._box(result))
+            stretch, _ = self.steps(result.theta, box_of(result.grid, self.likelihood))
             here = np.array([result.companion.east_mas, result.companion.north_mas])
             moved, place = np.hypot(*(here - place)), here
             if moved < CONVERGED * resolution_mas(self.likelihood):
@@ -222,13 +222,9 @@ class RobustFits:
 
     def _of_modes(self, result: SearchResult) -> tuple[list[FloatArray], FloatArray]:
         """Fits near every solution with weights of their own, and their log-likelihoods."""
-        box = self._box(result)
+        box = box_of(result.grid, self.likelihood)
         fits = [result.theta, *(self.steps(np.array(m.theta), box)[1] for m in result.modes[1:])]
         return fits, np.array([self.log_prob(theta) for theta in fits])
-
-    def _box(self, result: SearchResult) -> Box:
-        grid = result.grid
-        return Box(grid.inner_mas, grid.outer_mas, resolution_mas(self.likelihood))
 
     def stretched(self, stretch: FloatArray) -> Likelihood:
         """The Gaussian likelihood of stretched errors (n_data,)."""

@@ -10,7 +10,7 @@ from typing import Any
 import nlopt
 import numpy as np
 
-from amibayes.companion_search.field import default_separation, resolution_mas
+from amibayes.companion_search.field import box_of, default_separation, resolution_mas
 from amibayes.companion_search.grid import Grid, make_grid, rates_per_axis
 from amibayes.companion_search.modes import (
     NEARLY_EQUAL,
@@ -145,7 +145,7 @@ def with_global_check(result: SearchResult) -> SearchResult:
     if result.global_check is not None:
         return result
     likelihood, grid, single = result.likelihood, result.grid, result.single_theta
-    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    box = box_of(grid, likelihood)
     coarse = coarse_likelihood(likelihood, box)
     deviance = float(likelihood.deviance(np.array(result.chi2_single)))
     found = _checked(likelihood, coarse, grid, box, single, deviance)

@@ -76,6 +76,16 @@ class Measurements:
         present = {name: column[keep] for name, column in columns.items() if column is not None}
         return Measurements(**present)
 
+    @property
+    def baseline_m(self) -> FloatArray:
+        """Lengths (n,) of baselines; of closure phases those of the first one."""
+        return np.hypot(self.u_m[:, 0], self.v_m[:, 0])
+
+    @property
+    def frequency(self) -> FloatArray:
+        """The same in cycles per radian, (n,)."""
+        return np.asarray(self.baseline_m / self.wavelength_m)
+
     @cached_property
     def sets(self) -> tuple[IntArray, ...]:
         """Of closure phases: the entries of each exposure and channel, which share baselines."""

@@ -274,10 +274,8 @@ def beside_bright(tested: Significance, result: SearchResult, noise: ExtraNoise)
     """
     if tested.detected is not False:
         return tested
-    if (
-        noise.exceeds_stated
-        and result.chi2_binary > (1.0 - EXPLAINED_BESIDE_NOISE) * result.chi2_single
-    ):
+    most = (1.0 - EXPLAINED_BESIDE_NOISE) * result.chi2_single
+    if noise.exceeds_stated and result.chi2_binary > most:
         return tested
     bound = bright_probability(result, tested.test)
     if bound is None or 2.0 * bound >= tested.probability:

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.field import DISC_CONTRAST, box_of, resolution_mas
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
-from amibayes.models.parameters import Box
 
 LARGEST_STAR_MAS = 60.0
 """No star but the Sun looks larger: R Doradus has 57 ± 5 mas (Bedding et al. 1997,
@@ -46,23 +45,18 @@ def note_of(result: SearchResult, *, compared: bool = False) -> str:
     return ""
 
 
-LIKE_A_STAR = 0.03
-"""Contrast from which the disc of a companion may matter."""
-
-
 def taken_for_a_point(result: SearchResult) -> list[str]:
     """Warn where a disc that the data do not show would change the contrast by more than its error.
 
     A companion of the star's surface brightness is smaller than it by the root of the contrast.
     """
-    likelihood, found, grid = result.likelihood, result.companion, result.grid
+    likelihood, found = result.likelihood, result.companion
     size = result.nuisance("diameter_mas") * float(np.sqrt(max(found.contrast, 0.0)))
     fixed = likelihood.model.companion_diameter_mas != 0.0
-    if fixed or found.contrast < LIKE_A_STAR or not size > 0.0:
+    if fixed or found.contrast < DISC_CONTRAST or not size > 0.0:
         return []
     disc = likelihood.with_model(replace(likelihood.model, companion_diameter_mas=size))
-    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
-    fit = refine(disc, result.theta, box, 0.0)
+    fit = refine(disc, result.theta, box_of(result.grid, likelihood), 0.0)
     if not abs(fit.companion.contrast - found.contrast) > found.contrast_error:
         return []
     return [

@@ -254,12 +254,14 @@ def _kernel_phases(
     return [kernel_observables(path, **options) for path in paths]
 
 
+OIFITS = InputFormat("OIFITS", lambda contents: True, _oifits)
+
 FORMATS: tuple[InputFormat, ...] = (
     InputFormat("kernel phases (KPFITS)", _has_kernel_phases, _kernel_phases),
     InputFormat("JWST stage-3 product", _is_product, _products),
     InputFormat("fitted images", _is_fitted_image, _fitted_images),
     InputFormat("image cube", _is_cube, _extracted),
-    InputFormat("OIFITS", lambda contents: True, _oifits),
+    OIFITS,
 )
 """Every kind of input, by the order in which they are tried; the last takes what is left."""
 

@@ -84,10 +84,8 @@ class ChannelLayout:
 
         Orthonormal; 0 where a group has none.
         """
-        rows, place = (
-            self._plain,
-            np.arange(len(self.order)) - np.flatnonzero(self.starts)[self.group],
-        )
+        rows, n = self._plain, len(self.order)
+        place = np.arange(n) - np.flatnonzero(self.starts)[self.group]
         wanted = [level for level, one in zip((SLOPE, CURVE), which, strict=True) if one]
         level = rows.level[self.order]
         turn = csr_array(rows.rotation[self.order][:, self.order])
@@ -96,7 +94,7 @@ class ChannelLayout:
             for own in wanted
             for k in np.unique(place[level == own])
         ]
-        return np.array(found).reshape(-1, len(self.order))
+        return np.array(found).reshape(-1, n)
 
     @cached_property
     def _plain(self) -> ChannelRows:
@@ -127,11 +125,7 @@ class ChannelLayout:
             )
 
     def turned(
-        self,
-        common: FloatArray,
-        neighbour: FloatArray,
-        further: FloatArray,
-        smooth: FloatArray,
+        self, common: FloatArray, neighbour: FloatArray, further: FloatArray, smooth: FloatArray
     ) -> ChannelRows:
         """Rows for shares ρ, correlations φ (rank,) and variances of further errors (2, rank).
 

@@ -128,11 +128,9 @@ class ExtraNoise:
 
         The largest of all files; see `amibayes.likelihood.channel_noise.Correlation`.
         """
-        found = [(sum(c.vis2.smooth), sum(c.closure_phase.smooth)) for c in self.channels]
-        vis2, closure = (
-            np.sqrt(np.max(found, axis=0, initial=0.0)).tolist() if found else (0.0, 0.0)
-        )
-        return vis2, closure
+        vis2 = max((sum(c.vis2.smooth) for c in self.channels), default=0.0)
+        closure = max((sum(c.closure_phase.smooth) for c in self.channels), default=0.0)
+        return float(np.sqrt(vis2)), float(np.sqrt(closure))
 
     @property
     def exceeds_stated(self) -> bool:

@@ -195,8 +195,7 @@ def _row_in_use(m: Measurements) -> BoolArray:
 def _image(whole: Observables, program: ImagingProgram) -> tuple[float, float, int]:
     """Pixel and width in mas, and number of pixels."""
     m = whole.vis2.select(~whole.vis2.flag)
-    frequency = np.hypot(m.u_m[:, 0], m.v_m[:, 0]) / m.wavelength_m
-    frequency = frequency[frequency > 0]
+    frequency = m.frequency[m.frequency > 0]
     pixel = 1.0 / (PIXELS_PER_RESOLUTION * frequency.max() * MAS)
     digits = 10.0 ** (1 - np.floor(np.log10(pixel)))
     pixel = np.floor(pixel * digits) / digits

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amibayes.companion_search.field import (
+    DISC_CONTRAST,
     EXPLAINED,
     SURELY_NOT_NOISE,
+    box_of,
     choose_field,
     default_separation,
     look_inside,
@@ -38,12 +40,7 @@ from amibayes.detection.outlying_rows import (
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood, joint_likelihood, single_likelihood
 from amibayes.likelihood.noise_fit import noise_beside
-from amibayes.models.parameters import Box
 from amibayes.pipeline.options import SearchOptions, is_past_null, model_of, noise_prior
-
-DISC_CONTRAST = 0.03
-"""Contrast below which a disc is not tried unasked: as large as the star's it would have a surface
-brightness of 3 % of it, and what looks resolved is rather light lost in the channel's width."""
 
 SURELY_A_DISC = 25.0
 """2Δln L that one more parameter does not gain by chance, even where channels err together."""
@@ -313,7 +310,7 @@ def _with_disc_of_star(
 def _disc_decides(likelihood: Likelihood, point: SearchResult) -> bool:
     """Whether the contrast beside a disc differs from that beside a point by its error."""
     model = replace(likelihood.model, diameter_mas=USUAL_DISC_MAS)
-    box = Box(point.grid.inner_mas, point.grid.outer_mas, resolution_mas(likelihood))
+    box = box_of(point.grid, likelihood)
     fit = refine(likelihood.with_model(model), np.array(point.theta), box, 0.0)
     change = abs(fit.companion.contrast - point.companion.contrast)
     return bool(change > point.companion.contrast_error)
@@ -342,7 +339,7 @@ def shows_disc(likelihood: Likelihood, result: SearchResult) -> bool:
         return False
     disc = likelihood.with_model(replace(likelihood.model, companion_diameter_mas="free"))
     grid = result.grid
-    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    box = box_of(grid, likelihood)
     point = refine(likelihood, result.theta, box, 0.0)
     larger = refine(disc, with_disc(disc, np.array(point.theta), box), box, 0.0)
     fits = (likelihood, point), (disc, larger)
@@ -359,7 +356,7 @@ def _search_for_disc(
     """
     free = replace(likelihood.model, companion_diameter_mas="free")
     disc, grid = likelihood.with_model(free), point.grid
-    box = Box(grid.inner_mas, grid.outer_mas, resolution_mas(likelihood))
+    box = box_of(grid, likelihood)
     known = np.array([with_disc(disc, np.array(m.theta), box, size) for m in point.modes])
     return search(disc, (grid.inner_mas, grid.outer_mas), known=known, check=False)
 

@@ -24,7 +24,7 @@ from amibayes.data.observables import Observables, join
 from amibayes.errors import DataError, UsageError
 from amibayes.extraction.charge import CubeMigration
 from amibayes.extraction.reading import (
-    FORMATS,
+    OIFITS,
     charge_of,
     check_together,
     first_file,
@@ -45,7 +45,7 @@ from amibayes.pipeline.warnings import (
     vetting_warnings,
 )
 from amibayes.support.options import VETTING_ALPHA
-from amibayes.support.shared_results import shared
+from amibayes.support.shared_results import shared, shared_of_file
 
 MIN_TO_VET = 3
 """Of two calibrators that disagree the bad one cannot be known."""
@@ -198,9 +198,9 @@ def read_calibrators(
 
 def stars_of(path: str | Path) -> list[str]:
     """Names of the targets that an OIFITS file has data of; none of a file of another format."""
-    if format_of(path) is not FORMATS[-1]:
+    if format_of(path) is not OIFITS:
         return []
-    return names_of_targets(open_oifits(path))
+    return shared_of_file(lambda: names_of_targets(open_oifits(path)), path, "stars")
 
 
 def _chosen(path: str, stars: list[str], wanted: Sequence[str], targets: set[str]) -> list[str]:

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from amibayes.calibration import Calibration
 from amibayes.companion_search.result import SearchResult
-from amibayes.data.measurements import Measurements
 from amibayes.data.observables import Observables
+from amibayes.detection.consistency import EPOCH_GAP_DAYS
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.note import taken_for_a_point
@@ -57,8 +57,6 @@ def calibration_warnings(calibration: Calibration | None) -> list[str]:
 USUAL_CALIBRATOR_MAS, NOTABLE_LOSS = 0.3, 0.01
 """Diameter that calibrators of interferometers have, and a change of V² that diameters notice."""
 
-SAME_NIGHT_DAYS = 0.5
-
 
 def calibrator_warnings(
     targets: Sequence[Observables], references: Sequence[Observables], *, sized: bool
@@ -76,7 +74,7 @@ def calibrator_warnings(
         return []
     found = []
     used = [data.vis2.select(~data.vis2.flag) for data in targets]
-    longest = max((float(np.max(_frequency(m), initial=0.0)) for m in used), default=0.0)
+    longest = max((float(np.max(m.frequency, initial=0.0)) for m in used), default=0.0)
     # V² of a small disc: 1 − x²/4.
     loss = 0.25 * (np.pi * USUAL_CALIBRATOR_MAS * MAS * longest) ** 2
     if loss > NOTABLE_LOSS and not sized:
@@ -88,7 +86,7 @@ def calibrator_warnings(
     dates = np.concatenate([_dates(data) for data in references])
     for data in targets if len(dates) else ():
         days = float(np.abs(_dates(data)[:, None] - dates).min(axis=1).max(initial=0.0))
-        if days > SAME_NIGHT_DAYS:
+        if days > EPOCH_GAP_DAYS:
             found.append(
                 f"{data.source} has exposures {days:.1f} days from the nearest one of a "
                 "calibrator: nothing tells how the instrument changed from night to night"
@@ -100,12 +98,6 @@ def _dates(observables: Observables) -> FloatArray:
     """Dates of exposures, without those of a file that tells none."""
     dates = np.unique(np.concatenate([observables.vis2.mjd, observables.closure_phase.mjd]))
     return np.asarray(dates[dates > 1.0])
-
-
-def _frequency(measurements: Measurements) -> FloatArray:
-    """Spatial frequency (n,) of V²."""
-    length = np.hypot(measurements.u_m[:, 0], measurements.v_m[:, 0])
-    return np.asarray(length / measurements.wavelength_m)
 
 
 def unused_calibrators(calibration: Calibration | None, given: Sequence[str]) -> list[str]:
@@ -185,11 +177,9 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
     """Warn where the errors are so large that CANDID's nσ has lost its meaning."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
-    which = (
-        "the errors, with the noise that was added,"
-        if noise.exceeds_stated
-        else "the stated errors"
-    )
+    which = "the stated errors"
+    if noise.exceeds_stated:
+        which = "the errors, with the noise that was added,"
     if noise.floors:
         which = "the errors, with the calibration errors of the instrument,"
     return [

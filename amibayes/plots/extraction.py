@@ -134,8 +134,7 @@ def observables_plot(extraction: Extraction) -> Figure:
     sigma = data.errors
     figure = new_figure(7.2)
     upper, lower = figure.subplots(2, 1)
-    baseline = np.hypot(data.vis2.u_m[:, 0], data.vis2.v_m[:, 0])
-    _errors(upper, np.asarray(baseline), data.vis2.value, sigma[0], photons[:n])
+    _errors(upper, data.vis2.baseline_m, data.vis2.value, sigma[0], photons[:n])
     upper.set_xlabel("Baseline (m)")
     upper.set_ylabel("V²")
     number = np.linspace(1.0, len(data.closure_phase), len(data.closure_phase))

@@ -137,7 +137,7 @@ def _residuals(ax: Axes, image: ReconstructedImage) -> None:
     left = DataTerm.of(data, image.samples).residual(image.visibility)
     sigma, n = np.sqrt(data.covariance.variance), data.n_vis2
     white = left / sigma
-    length = np.hypot(data.vis2.u_m, data.vis2.v_m)[:, 0] / data.vis2.wavelength_m / 1e6
+    length = data.vis2.frequency / 1e6
     ax.axhspan(-1.0, 1.0, color=LIGHT_GREY, alpha=0.5, lw=0, zorder=0)
     ax.axhline(0.0, color=GREY, lw=0.8, zorder=0)
     if n:

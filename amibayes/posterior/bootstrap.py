@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amibayes.companion_search.field import resolution_mas
+from amibayes.companion_search.field import box_of
 from amibayes.companion_search.optimise import refine
 from amibayes.companion_search.result import SearchResult
 from amibayes.data.measurements import DAY_S, exposure_labels
@@ -22,7 +22,7 @@ from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.student import reweighted
-from amibayes.models.parameters import Box, Parameters
+from amibayes.models.parameters import Parameters
 from amibayes.parallel import Progress
 from amibayes.posterior.derived import DERIVED, derived, interval
 from amibayes.units import (
@@ -108,7 +108,7 @@ def bootstrap(
             source=likelihood.observables.source,
             remedy=f"leave --bootstrap out below {MIN_EXPOSURES}",
         )
-    box = Box(result.grid.inner_mas, result.grid.outer_mas, resolution_mas(likelihood))
+    box = box_of(result.grid, likelihood)
     samples = []
     for k in range(n):
         drawn = _drawn(likelihood, noise, label, rng)

@@ -12,7 +12,7 @@ from amibayes.imaging import ReconstructedImage
 from amibayes.pipeline.imaging import ImagingReport
 from amibayes.report.common import inputs_json
 from amibayes.support.atomic_files import atomic_path
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, position_angle_deg, separation
 
 
 def imaging_json(report: ImagingReport, request: str) -> dict[str, Any]:
@@ -91,10 +91,10 @@ def _brightest(content: dict[str, Any]) -> str:
     """Light at the brightest place, which is less than that of the image."""
     found = content["brightest"]
     east, north = found["east_mas"], found["north_mas"]
-    angle = np.degrees(np.arctan2(east, north)) % 360.0
+    where = f"{separation(east, north):.4g} mas, PA {position_angle_deg(east, north):.0f} deg"
     return (
-        f"brightest   {found['flux']:.3g} within λ/2B of {np.hypot(east, north):.4g} mas, PA "
-        f"{angle:.0f} deg; the rest is spread over the field, as noise is too"
+        f"brightest   {found['flux']:.3g} within λ/2B of {where}; the rest is spread over the "
+        "field, as noise is too"
     )
 
 

@@ -12,6 +12,7 @@ from urllib.parse import quote
 from amibayes import __version__
 from amibayes.report.page import Fact, Figure, Kind, Page, Section, Statement, environment
 from amibayes.report.page import read_figure as read_png
+from amibayes.report.words import count
 from amibayes.support.atomic_files import write_text
 
 Json = dict[str, Any]
@@ -158,8 +159,7 @@ def _statement(content: Json) -> Statement:
     label = "COMPANIONS" if n else "NO COMPANION"
     head = f"{n or 'None'} of {alarms['n_tested']} targets {'is' if n < 2 else 'are'} listed"
     head += f" as {'a companion' if n < 2 else 'companions'} at a false-discovery rate of {level:g}"
-    detected = alarms["n_detected"]
-    found = f"{detected} target{' has' if detected == 1 else 's have'}"
+    found = count(alarms["n_detected"], "target has", "targets have")
     sentences = (
         f"Taken one by one, {found} a companion detected (false-alarm "
         f"probability up to their α); {alarms['expected_false_detections']:.2g} such detections "

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import run
+from helpers import named_star
 
 from amibayes.data.observables import Observables, join
 from amibayes.data.point_source import point_source
@@ -22,14 +22,7 @@ def star(rng: np.random.Generator, name: str, mjd: float) -> Observables:
     sheet = point_source(
         HOLES, [1.6e-6, 1.7e-6], [1e-7] * 2, vis2_error=0.01, closure_error_rad=0.01, mjd=mjd
     )
-    noise = sheet.covariance.draw(rng, 1)[:, 0]
-    n = len(sheet.vis2)
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=0.8 + noise[:n]),
-        closure_phase=replace(sheet.closure_phase, value=noise[n:]),
-        setups=(replace(sheet.setups[0], target=name),),
-    )
+    return named_star(sheet, name, rng)
 
 
 STARS = ("SCI", "Cal 1", "Cal 2", "Cal 3")

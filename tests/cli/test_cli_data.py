@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 from commands import run
+from helpers import named_star
 
 from amibayes.calibration import calibrate
 from amibayes.data.observables import Observables
@@ -25,14 +25,7 @@ def star(rng: np.random.Generator, name: str) -> Observables:
     sheet = point_source(
         HOLES, [4.3e-6, 4.8e-6], [1e-7] * 2, vis2_error=0.01, closure_error_rad=0.01
     )
-    noise = sheet.covariance.draw(rng, 1)[:, 0]
-    n = len(sheet.vis2)
-    return replace(
-        sheet,
-        vis2=replace(sheet.vis2, value=0.8 + noise[:n]),
-        closure_phase=replace(sheet.closure_phase, value=noise[n:]),
-        setups=(replace(sheet.setups[0], target=name),),
-    )
+    return named_star(sheet, name, rng)
 
 
 @pytest.fixture(scope="module")

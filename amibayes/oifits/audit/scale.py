@@ -166,13 +166,8 @@ def _amplitudes(oifits: OIFits, table: OITable) -> Iterator[tuple[str, FloatArra
         total = np.log(vis2)[rows].sum(axis=1)
         total[(rows < 0).any(axis=1)] = np.nan
         known = np.isfinite(total) & np.isfinite(amplitude)
-        yield (
-            name if name == "VISAMP" else "T3AMP of its triangles",
-            *(
-                np.log(amplitude[known]),
-                total[known],
-            ),
-        )
+        what = name if name == "VISAMP" else "T3AMP of its triangles"
+        yield what, np.log(amplitude[known]), total[known]
 
 
 def _positive(table: OITable, name: str) -> FloatArray | None:
@@ -249,7 +244,7 @@ def _longer_than_the_array(rows: Measurements, setup: Setup) -> Finding | None:
     """Projected baselines that are longer than the distance of their stations."""
     ends = np.asarray(setup.station_xyz_m)[rows.stations[:, :2]]
     apart = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    length = np.hypot(rows.u_m[:, 0], rows.v_m[:, 0])
+    length = rows.baseline_m
     long = length > apart * (1 + SAME_UV) + 1e-3
     if not long.mean() > 0.01:
         return None
@@ -324,7 +319,7 @@ def _outside_array(oifits: OIFits, rows: Measurements, setup: Setup) -> str:
     if array is None:
         return ""
     low, high = lengths()[array]
-    length = np.hypot(rows.u_m[:, 0], rows.v_m[:, 0])
+    length = rows.baseline_m
     if low <= length.max() and length.min() <= high:
         return ""
     span = f"{length.min():.3g} to {length.max():.3g} m"
