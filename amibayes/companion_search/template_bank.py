@@ -31,6 +31,8 @@ from amibayes.companion_search.matched_filter import (
 from amibayes.companion_search.reduction import Reduction, reduction_of
 from amibayes.companion_search.scan import GroupWeights, RunningMaximum, ScanResult
 from amibayes.companion_search.templates import (
+    COARSE_GAIN,
+    MANY_ROWS,
     BandTemplates,
     CoarseTemplates,
     DataRows,
@@ -38,15 +40,11 @@ from amibayes.companion_search.templates import (
     Templates,
 )
 from amibayes.likelihood.likelihood import Likelihood
-from amibayes.likelihood.linear_response import Part, linear_response, nuisance_directions
+from amibayes.likelihood.linear_response import common_rows, linear_response, nuisance_directions
 from amibayes.units import FloatArray, IntArray, SingleArray
 
 NUMBERS_KEPT = 12_000_000
 """Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
-
-
-MANY_ROWS = 128
-"""Numbers of data from which on products of matrices take longer than what is done with them."""
 
 
 class TemplateBank:
@@ -94,7 +92,7 @@ class TemplateBank:
         self._even, self._odd, self._primary = response.even, response.odd, response.star
         self._fringes = CompanionFringes.of(samples, response, smearing=model.smearing)
         self._offset = response.offset
-        self._shared = _shared(self._even, self._odd)
+        self._shared = common_rows(self._even, self._odd)
         if beside is None:
             self.nuisance_basis = nuisance_directions(likelihood, nuisance)
         else:
@@ -102,6 +100,12 @@ class TemplateBank:
 
     def __len__(self) -> int:
         return len(self.grid)
+
+    def on(self, grid: Grid) -> Self:
+        """Make the same of other places."""
+        new = copy.copy(self)
+        new.grid, new._kept, new._coarse = grid, None, None
+        return new
 
     @property
     def joint(self) -> bool:
@@ -112,6 +116,11 @@ class TemplateBank:
     def work(self) -> float:
         """Products that the search of one data set takes."""
         return float(len(self)) * self.n_rows * self.n_contrasts * len(self.rates_mas_yr)
+
+    @property
+    def work_of_many(self) -> float:
+        """The same of each of many data sets, which coarse templates show most places for."""
+        return self.work / (COARSE_GAIN if self._coarse_first else 1.0)
 
     @property
     def n_nuisance(self) -> int:
@@ -143,13 +152,12 @@ class TemplateBank:
         found = reduction_of(templates, half, self.nuisance_basis, label)
         if found is None:
             return self
-        new = copy.copy(self)
+        new = self.on(self.grid)
         new.reduction, new.n_rows = found, len(found.label)
-        new._kept = new._coarse = None
         new._even, new._offset = found.of_part(self._even, self._offset, self.n_data)
         new._odd, _ = found.of_part(self._odd, np.zeros(len(self._odd.rows)), self.n_data)
         new.nuisance_basis = found.combined(self.nuisance_basis)
-        new._shared = _shared(new._even, new._odd)
+        new._shared = common_rows(new._even, new._odd)
         return new
 
     def reduce(self, white: FloatArray) -> FloatArray:
@@ -203,6 +211,10 @@ class TemplateBank:
             if self._moves:
                 tail[at, n:] = rate[better]
         return ScanResult(contrast, sigma, gain, tail, n)
+
+    def gains(self, residuals: FloatArray) -> FloatArray:
+        """Largest gain in χ² of whitened residuals (n_data,) everywhere, for positive contrasts."""
+        return self.survey(residuals).gain
 
     def largest_gain(
         self, data: SingleArray, weights: GroupWeights | None = None
@@ -386,9 +398,3 @@ class TemplateBank:
             template[self._even.rows] = np.tile(even, len(signs))
             template[self._odd.rows] += np.hstack([sign * odd for sign in signs])
         return BandTemplates.beside(out, self.nuisance_basis)
-
-
-def _shared(even: Part, odd: Part) -> tuple[IntArray, IntArray]:
-    """Which rows of each part are data that the other touches too."""
-    _, *both = np.intersect1d(even.rows, odd.rows, return_indices=True)
-    return both[0], both[1]

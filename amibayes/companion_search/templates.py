@@ -312,6 +312,13 @@ class MirroredTemplates:
             yield score, turned
 
 
+MANY_ROWS = 128
+"""Numbers of data from which on products of matrices take longer than what is done with them."""
+
+COARSE_GAIN = 5.0
+"""How much faster many data sets are searched where coarse templates rule out most places."""
+
+
 @dataclass(frozen=True, eq=False)
 class CoarseTemplates:
     """Templates at every second position along each axis, tile by tile of a lattice.

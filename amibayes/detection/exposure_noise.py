@@ -35,6 +35,7 @@ from amibayes.likelihood.exposure_rows import (
     Drift,
     Series,
     SeriesAxes,
+    SeriesStack,
     drift_of,
     series_of,
     turned_rows,
@@ -172,10 +173,6 @@ class Exposures:
         """Standard deviations (rank,) of the mean covariance."""
         return np.asarray(np.sqrt((self.sizes**2).mean(axis=0)))
 
-    def noise(self, likelihood: Likelihood, theta: FloatArray) -> GaussianNoise:
-        """Noise with the mean of the covariance, by the residuals of a fit."""
-        return self.noise_of(self.turned(*self.drifts(likelihood, theta))[0])
-
     def noise_of(self, rows: ChannelRows) -> GaussianNoise:
         """Noise whose rows are turned."""
         return noise_with_rows(self.data, rows, floor=self.floor)
@@ -185,9 +182,39 @@ class Exposures:
     ) -> tuple[Drift | None, Drift | None]:
         """What exposures share of V² and of closure phases, by the residuals of a fit."""
         fit = likelihood.with_noise(self.noise_of(self.rows))
-        both = np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)])
+        return self.drifts_in(np.column_stack([fit.residuals(theta)[:, 0], fit.jacobian(theta)]))
+
+    def drifts_in(self, both: FloatArray) -> tuple[Drift | None, Drift | None]:
+        """The same of data that are whitened as independent exposures; see `drift_of`."""
         vis2, closure = (None if axes is None else drift_of(axes, both) for axes in self._axes)
         return vis2, closure
+
+    def whitened(self, drifts: tuple[Drift | None, Drift | None], white: FloatArray) -> FloatArray:
+        """Whiten data (n_rows, n) by the mean covariance, given as those of `drifts_in` are.
+
+        The mean of exposures is over the posterior itself, not over its nodes.
+        """
+        out = white / np.sqrt(self._variance)[:, None]
+        for kind, stack in self._stacks:
+            drift = drifts[0 if kind else 1]
+            if drift is not None:
+                covariance = stack.covariance(drift.lasting)
+                out[stack.rows] = np.linalg.solve(np.linalg.cholesky(covariance), white[stack.rows])
+        return out
+
+    @cached_property
+    def _variance(self) -> FloatArray:
+        """Mean variances (rank,) of rows in units of those of independent exposures."""
+        return np.asarray((self._mean / self.rows.sigma) ** 2)
+
+    @cached_property
+    def _stacks(self) -> list[tuple[bool, SeriesStack]]:
+        """Series as long as each other, of V² and of closure phases."""
+        relative = self.sizes / self.rows.sigma
+        alike: dict[tuple[bool, int], list[Series]] = {}
+        for one in self.series:
+            alike.setdefault((one.vis2, len(one.rows)), []).append(one)
+        return [(kind, SeriesStack.of(few, relative)) for (kind, _), few in alike.items()]
 
     @cached_property
     def _axes(self) -> list[SeriesAxes | None]:

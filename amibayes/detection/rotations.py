@@ -16,7 +16,7 @@ import numpy as np
 from amibayes.companion_search.scan import RunningMaximum, best_positive
 from amibayes.companion_search.template_bank import TemplateBank
 from amibayes.companion_search.templates import highest_of
-from amibayes.detection.treatments import ErrorTreatment, KnownErrors, Searched
+from amibayes.detection.treatments import ErrorTreatment, KnownErrors, Places, Searched
 from amibayes.likelihood.rotation_null import RotationNull
 from amibayes.units import FloatArray, SingleArray
 
@@ -42,7 +42,7 @@ class Rotations(ErrorTreatment):
         """Search data sets (n_data, n) that the bank's own estimate whitened."""
         return KnownErrors().search(bank, white)
 
-    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+    def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain in χ² of one data set (n_data,) at every position, and its χ²."""
         return KnownErrors().field(bank, white)
 

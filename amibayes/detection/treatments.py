@@ -8,6 +8,7 @@ data (kinds and files) scatter by its own amount; `StudentScores` bounds every r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, Self
 
@@ -40,6 +41,30 @@ class Searched:
     chi2: FloatArray
 
 
+class Places(Protocol):
+    """What a field is made of: a template bank, or a few places."""
+
+    @property
+    def n_data(self) -> int:
+        """Number of independent data."""
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number of nuisance directions."""
+
+    def __len__(self) -> int:
+        """Number of places."""
+
+    def project(self, data: FloatArray) -> FloatArray:
+        """Take the nuisance directions out of whitened data (n_rows, …)."""
+
+    def gains(self, residuals: FloatArray) -> FloatArray:
+        """Largest gain in χ² of whitened residuals (n_rows,) everywhere, for positive contrasts."""
+
+    def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (m,) and templates of unit norm of each band (n_bands, n_rows, m)."""
+
+
 class ErrorTreatment(Protocol):
     """How data sets are searched, and how null sets are made."""
 
@@ -49,7 +74,7 @@ class ErrorTreatment(Protocol):
     def search(self, bank: TemplateBank, white: FloatArray) -> Searched:
         """Search data sets (n_data, n), whitened by the bank's own covariance."""
 
-    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+    def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain in χ² of one data set (n_data,) at every position, and its χ²."""
 
     def search_simulated(
@@ -124,10 +149,10 @@ class KnownErrors(ErrorTreatment):
         gain, position = bank.largest_gain(data.astype(np.float32))
         return Searched(gain, position, (data**2).sum(axis=0))
 
-    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+    def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere; see `ErrorTreatment`."""
         data = bank.project(white)
-        return bank.survey(data).gain, float(data @ data)
+        return bank.gains(data), float(data @ data)
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""
@@ -170,7 +195,7 @@ class FreeScale(ErrorTreatment):
         variance = np.maximum(groups.variances(bank.project(residuals)[:, None])[:, 0], least)
         return cls(groups, np.sqrt(variance)[groups.label], least)
 
-    def _total(self, bank: TemplateBank, chi2: FloatArray) -> FloatArray:
+    def _total(self, bank: Places, chi2: FloatArray) -> FloatArray:
         """χ² of data sets, not below what the least variance makes of their number."""
         return np.maximum(chi2, max(self.least * (bank.n_data - bank.n_nuisance), NO_SCATTER))
 
@@ -200,7 +225,7 @@ class FreeScale(ErrorTreatment):
         gain, position = bank.largest_gain(rows.astype(np.float32), own)
         return Searched(gain * chi2 / self._total(bank, total), position, chi2)
 
-    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+    def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere in weighted χ² of one data set (n_data,), and its weighted χ²."""
         if not self.groups.several:
             gain, chi2 = KnownErrors().field(bank, white)
@@ -214,7 +239,7 @@ class FreeScale(ErrorTreatment):
         return gain, float(self._total(bank, total)[0])
 
     def _weighted(
-        self, bank: TemplateBank, data: FloatArray
+        self, bank: Places, data: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Weigh data (n_data, n) by the scatter of their groups: (n_data, n), (n_groups, n), χ²."""
         weight = 1.0 / np.maximum(self.groups.variances(data), max(self.least, NO_SCATTER))
@@ -313,7 +338,7 @@ class StudentScores(ErrorTreatment):
     whitening: SymmetricWhitening
     least: float = 0.0
 
-    def _scores(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _scores(self, bank: Places, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Scores (n_data, n), and what their sum of squares (n,) is at least.
 
         That is what normal residuals of the least scale would give.
@@ -328,7 +353,7 @@ class StudentScores(ErrorTreatment):
         found = KnownErrors().search(bank, rows)
         return replace(found, chi2=np.maximum(found.chi2, least))
 
-    def field(self, bank: TemplateBank, white: FloatArray) -> tuple[FloatArray, float]:
+    def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere; see `ErrorTreatment`."""
         rows, least = self._scores(bank, white[:, None])
         gain, chi2 = KnownErrors().field(bank, rows[:, 0])

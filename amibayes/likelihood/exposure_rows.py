@@ -171,7 +171,28 @@ def _named(data: Observables, table: Measurements, k: int) -> tuple[object, ...]
     return tuple(sorted(own[i] for i in table.stations[k]))
 
 
-_Stack = tuple[IntArray, FloatArray, FloatArray]
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """What exposures that share noise of one τ are independent in.
+
+    Parameters
+    ----------
+    stacks : list of (rows (m, n), vectors (m, n, n))
+        Eigenvectors of exp(−Δt/τ) of series that are as long as each other.
+    precision : (n_shares, n_rows) float array
+        Inverse variances along them, of all stacks, for `SHARES`.
+    logdet : (n_shares,) float array
+        Of the covariances.
+    """
+
+    stacks: list[tuple[IntArray, FloatArray]]
+    precision: FloatArray
+    logdet: FloatArray
+
+    def along(self, white: FloatArray) -> FloatArray:
+        """Whitened data (n_independent, n) along the eigenvectors, (n_rows, n)."""
+        turned = [vectors.swapaxes(1, 2) @ white[rows] for rows, vectors in self.stacks]
+        return np.concatenate([part.reshape(-1, white.shape[1]) for part in turned])
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,12 +201,11 @@ class SeriesAxes:
 
     Parameters
     ----------
-    nodes : tuple
-        For each of `HOURS` the rows (m, n), eigenvalues (m, n) and eigenvectors (m, n, n) of
-        series that are as long as each other.
+    nodes : tuple of _Node
+        One of each of `HOURS`.
     """
 
-    nodes: tuple[list[_Stack], ...]
+    nodes: tuple[_Node, ...]
 
     @classmethod
     def of(cls, series: Sequence[Series]) -> SeriesAxes:
@@ -195,15 +215,45 @@ class SeriesAxes:
         rows = [np.array([one.rows for one in few]) for few in alike]
         hours = [np.array([one.hours for one in few]) for few in alike]
         apart = [np.abs(when[:, :, None] - when[:, None]) for when in hours]
-        return cls(
-            tuple(
-                [
-                    (at, *np.linalg.eigh(np.exp(-dt / tau)))
-                    for at, dt in zip(rows, apart, strict=True)
-                ]
-                for tau in HOURS
-            )
-        )
+        nodes = []
+        for tau in HOURS:
+            values, vectors = zip(*(np.linalg.eigh(np.exp(-dt / tau)) for dt in apart), strict=True)
+            size = np.concatenate([one.ravel() for one in values])
+            variance = 1.0 + SHARES[:, None] * (size - 1.0)
+            stacks = list(zip(rows, vectors, strict=True))
+            nodes.append(_Node(stacks, 1.0 / variance, np.log(variance).sum(axis=1)))
+        return cls(tuple(nodes))
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesStack:
+    """Series as long as each other.
+
+    Parameters
+    ----------
+    rows : (m, n) int array
+    lasting : (n_hours, m, n, n) float array
+        Covariance of their rows where these share all that lasts for each of `HOURS`.
+    apart : (m, n, n) float array
+        The same where they share nothing.
+    """
+
+    rows: IntArray
+    lasting: FloatArray
+    apart: FloatArray
+
+    @classmethod
+    def of(cls, series: Sequence[Series], sizes: FloatArray) -> SeriesStack:
+        """Of standard deviations of rows, (n_sizes, n_rows), of equal probability."""
+        rows = np.array([one.rows for one in series])
+        own = sizes[:, rows]
+        square = np.einsum("kmi,kmj->mij", own, own) / len(sizes)
+        every = np.array([one.correlation(np.ones(len(HOURS)), HOURS) for one in series])
+        return cls(rows, every.swapaxes(0, 1) * square, square * np.eye(rows.shape[1]))
+
+    def covariance(self, lasting: Sequence[float]) -> FloatArray:
+        """Mean covariances (m, n, n) over a posterior; see `Drift.lasting`."""
+        return np.tensordot(lasting, self.lasting, 1) + (1.0 - sum(lasting)) * self.apart
 
 
 def drift_of(axes: SeriesAxes, both: FloatArray) -> Drift:
@@ -215,14 +265,12 @@ def drift_of(axes: SeriesAxes, both: FloatArray) -> Drift:
     both : (n_independent, 1 + n_dim) float array
         Whitened residual of a fit, and slopes of its parameters.
     """
-    loss = np.empty((len(HOURS), len(SHARES)))
-    for i, stacks in enumerate(axes.nodes):
-        size = np.concatenate([values.ravel() for _, values, _ in stacks])
-        turned = [vectors.swapaxes(1, 2) @ both[rows] for rows, _, vectors in stacks]
-        along = np.concatenate([part.reshape(-1, both.shape[1]) for part in turned])
-        variance = 1.0 + SHARES[:, None] * (size - 1.0)
-        product = along.T / variance[:, None] @ along
-        loss[i] = restricted_loss(product, len(size), np.log(variance).sum(axis=1))
+    along = [node.along(both) for node in axes.nodes]
+    product = [
+        (own.T * node.precision[:, None]) @ own for own, node in zip(along, axes.nodes, strict=True)
+    ]
+    logdet = np.array([node.logdet for node in axes.nodes])
+    loss = restricted_loss(np.array(product), len(along[0]), logdet)
     prior = np.full(len(SHARES), (1.0 - PRIOR_INDEPENDENT) / (len(SHARES) - 1))
     prior[0] = PRIOR_INDEPENDENT
     mass = np.exp(-0.5 * (loss - loss.min())) * prior

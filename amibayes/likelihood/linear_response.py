@@ -39,6 +39,12 @@ def _part(matrix: csr_array) -> Part:
     return Part(kept.toarray() if dense else kept, rows)
 
 
+def common_rows(even: Part, odd: Part) -> tuple[IntArray, IntArray]:
+    """Which rows of each of two parts are data that the other touches too."""
+    _, *both = np.intersect1d(even.rows, odd.rows, return_indices=True)
+    return both[0], both[1]
+
+
 @dataclass(frozen=True, eq=False)
 class WhitenedResponse:
     """Matrices A, B with template = A·D·Re(E) + B·Im(−D·E) − offset.

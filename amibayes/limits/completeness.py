@@ -213,7 +213,7 @@ def _without_companion(
             test, known = statistic_of(result, companion_known=True), known[:0]
         test = test.with_noise_of(test.likelihood.residuals(result.theta)[:, 0])
         known = known[:0] if test.null_rests_on_residuals else known
-    n = max(min(NULL_DRAWS - len(known), int(FRESH_WORK / test.bank.work)), 0)
+    n = max(min(NULL_DRAWS - len(known), int(FRESH_WORK / test.bank.work_of_many)), 0)
     n = max(n, draws_needed(significance.alpha) if not len(known) else 0)
     own = np.random.default_rng(spawn(rng, 1)[0])
     journal = journals.of("threshold") if journals else None

@@ -8,22 +8,29 @@ searched with the drift of the data at hand: here some of them are searched as r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy.special import ndtri
 
 from amibayes.companion_search.grid import Grid
+from amibayes.companion_search.scan import scale_groups
+from amibayes.companion_search.template_bank import TemplateBank
+from amibayes.companion_search.templates import BandTemplates
 from amibayes.detection.exposure_noise import Exposures, exposures_of
-from amibayes.detection.statistic import Statistic, make_statistic
+from amibayes.detection.ratio import Ratio
+from amibayes.detection.statistic import Statistic
+from amibayes.detection.treatments import FreeScale
+from amibayes.likelihood.exposure_rows import Drift
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.critical import CriticalContrasts
 from amibayes.limits.rings import Rings
 from amibayes.parallel import Executor, Journals, SerialExecutor, run_job
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
-TRIALS, LEAST, MOST = 128, 3, 32
+TRIALS, LEAST, MOST = 400, 3, 96
 """Companions in all, and on a ring. They go with 1/separation, as drift does: on the innermost ring
 one companion differs by 0.3 of the logarithm from the next, beyond 2 λ/B by 0.05."""
 
@@ -78,15 +85,15 @@ def with_own_drift(
     log_error : (n_rings, n_shares) float array
         Of the logarithms of contrasts at which shares are detected.
     """
-    exposures = None if test.exposures is None else exposures_of(test.likelihood)
-    if exposures is None or not exposures.series:
+    searched = _Searched.of(test)
+    if searched is None:
         return critical, np.zeros((len(rings.separation_mas), len(shares)))
     far = rings.separation_mas.max()
     inverse = far / np.maximum(rings.separation_mas, 1e-3 * far)
     number = np.clip(TRIALS * inverse / inverse.sum(), LEAST, MOST).astype(int)
     pieces = [_some_places(rings, critical, k, n, seed) for k, n in enumerate(number)]
     done = run_job(
-        partial(_piece, test, exposures, threshold), pieces, executor or SerialExecutor(),
+        partial(_piece, searched, threshold), pieces, executor or SerialExecutor(),
         journal=journals.of("drift") if journals else None,
     )  # fmt: skip
     kept, own = zip(*[(piece["kept"], piece["own"]) for piece in done], strict=True)
@@ -146,62 +153,189 @@ def _some_places(rings: Rings, critical: CriticalContrasts, ring: int, n: int, s
     return places, float(np.median(known)) if len(known) else 1.0, rng
 
 
-def _piece(
-    test: Statistic, exposures: Exposures, threshold: float, piece: _Piece
-) -> dict[str, FloatArray]:
+def _piece(searched: _Searched, threshold: float, piece: _Piece) -> dict[str, FloatArray]:
     """Logarithms of critical contrasts at places, with drift as it was and fitted again."""
     places, typical, rng = piece
-    noise, goal = test.likelihood.noise.draw(len(places), rng).T, float(np.sqrt(threshold))
-    found = []
-    for place, own in zip(places, noise, strict=True):
-        trial = _Trial(test, exposures, place, own)
-        kept = _crossing(trial.root, goal, float(np.log(typical)))
-        found.append((kept, _crossing(trial.root_by_own_drift, goal, kept)))
-    return dict(zip(("kept", "own"), np.array(found).T, strict=True))
+    noise, goal = searched.test.likelihood.noise.draw(len(places), rng), float(np.sqrt(threshold))
+    trials = _Trials(searched, places, noise, [searched.units(place) for place in places])
+    kept = _crossing(trials.roots, goal, np.full(len(places), np.log(typical)))
+    return {"kept": kept, "own": _crossing(trials.roots_by_own_drift, goal, kept)}
 
 
-def _crossing(root: Callable[[float], float], goal: float, start: float) -> float:
-    """Logarithm of the contrast, 1 at most, at which a root of the statistic is ``goal``."""
-    x, slope, before = start, 1.0, None
+def _crossing(
+    roots: Callable[[IntArray, FloatArray], FloatArray], goal: float, start: FloatArray
+) -> FloatArray:
+    """Logarithms (n,) of the contrasts, 1 at most, at which roots of the statistic are ``goal``.
+
+    ``roots`` gives those of some trials at contrasts of theirs.
+    """
+    x, slope = np.array(start), np.ones(len(start))
+    before = np.full((2, len(start)), np.nan)
+    todo = np.arange(len(start))
     for _ in range(LOOKS):
-        off = float(np.log(max(root(x), 1e-9) / goal))
-        if before is not None and x != before[0]:
-            slope = float(np.clip((off - before[1]) / (x - before[0]), *SLOPES))
-        step = float(np.clip(-off / slope, -FARTHEST, min(FARTHEST, -x)))
-        before, x = (x, off), x + step
-        if abs(step) < CLOSE:
+        here = x[todo]
+        off = np.log(np.maximum(roots(todo, here), 1e-9) / goal)
+        moved, risen = here - before[0, todo], off - before[1, todo]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            new = np.clip(risen / moved, *SLOPES)
+        slope[todo] = np.where(np.isfinite(moved) & (moved != 0.0), new, slope[todo])
+        step = np.clip(-off / slope[todo], -FARTHEST, np.minimum(FARTHEST, -here))
+        before[:, todo], x[todo] = (here, off), here + step
+        todo = todo[np.abs(step) >= CLOSE]
+        if not len(todo):
             break
     return x
 
 
-class _Trial:
-    """A companion at a place with noise of its own, searched there and opposite."""
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """A statistic, and what of it does not depend on drift.
 
-    def __init__(
-        self, test: Statistic, exposures: Exposures, place: FloatArray, noise: FloatArray
-    ) -> None:
-        self.test, self.exposures, self.place, self.noise = test, exposures, place, noise
-        self.star = single_likelihood(test.likelihood).predict(np.atleast_2d(test.single))[:, 0]
-        grid = test.bank.grid
+    Parameters
+    ----------
+    test : Statistic
+    exposures : Exposures
+    drifts : tuple of (Drift or None)
+        Of V² and of closure phases, in the data at hand.
+    likelihood : Likelihood
+        Exposures are independent.
+    bank : TemplateBank
+        The same, of no place of its own.
+    slopes : (n_rows, n_nuisance) float array
+        Of the fit without a companion.
+    treatment : FreeScale
+    ratio : Ratio
+    """
+
+    test: Statistic
+    exposures: Exposures
+    drifts: tuple[Drift | None, Drift | None]
+    likelihood: Likelihood
+    bank: TemplateBank
+    slopes: FloatArray
+    treatment: FreeScale
+    ratio: Ratio
+
+    @classmethod
+    def of(cls, test: Statistic) -> _Searched | None:
+        """None where exposures are taken to be independent."""
+        exposures = None if test.exposures is None else exposures_of(test.likelihood)
+        if test.exposures is None or exposures is None or not exposures.series:
+            return None
+        likelihood = test.likelihood.with_noise(exposures.noise_of(exposures.rows))
+        bank = TemplateBank(likelihood, test.bank.grid, test.single)
+        slopes = single_likelihood(likelihood).jacobian(test.single)
+        groups = scale_groups(likelihood.observables, bank.n_nuisance, exposures.rows)
+        least = 1.0 if test.likelihood.noise.floor else 0.0
+        treatment = FreeScale(groups, np.ones(bank.n_data), least)
+        drifts = test.exposures.vis2, test.exposures.closure_phase
+        ratio = Ratio.scale_free(bank.n_data - bank.n_nuisance)
+        return cls(test, exposures, drifts, likelihood, bank, slopes, treatment, ratio)
+
+    def units(self, place: FloatArray) -> list[FloatArray]:
+        """Templates (n_contrasts, n_rows, 2) of a place (2,), mas, and its opposite, at all rates.
+
+        Exposures are independent.
+        """
+        grid = self.bank.grid
         step = grid.step_mas / FINER
         half = np.rint(place / step).astype(int)[:, None]
-        self.grid = Grid(step, grid.inner_mas, grid.outer_mas, *np.hstack([half, -half]))
-        self.kept = make_statistic(test.likelihood, self.grid, test.single)
+        there = Grid(step, grid.inner_mas, grid.outer_mas, *np.hstack([half, -half]))
+        return [unit for _, unit in self.bank.on(there).by_band()]
 
-    def root(self, log_contrast: float) -> float:
-        """Root of the statistic with drift as in the data at hand."""
-        likelihood = self.test.likelihood
-        residual = likelihood.wrapped((self._change(log_contrast) + self.noise)[:, None])
-        return float(np.sqrt(self.kept.evaluate(likelihood.noise.whiten(residual))[0]))
 
-    def root_by_own_drift(self, log_contrast: float) -> float:
-        """Root of the statistic with drift fitted to residuals that hold the companion."""
-        likelihood, single = self.test.likelihood, self.test.single
-        data = self.star + self._change(log_contrast) + self.noise
-        sheet = likelihood.observables.with_data(data)
-        searched = Likelihood(sheet, likelihood.model, likelihood.noise, likelihood.samples)
-        noise = self.exposures.noise(single_likelihood(searched), single)
-        return float(np.sqrt(make_statistic(searched.with_noise(noise), self.grid, single).value))
+@dataclass(frozen=True, eq=False)
+class _Trials:
+    """Companions at places with noise of their own, searched there and opposite.
 
-    def _change(self, log_contrast: float) -> FloatArray:
-        return self.test.change_by(np.array([[*self.place, np.exp(log_contrast)]]))[:, 0]
+    Parameters
+    ----------
+    searched : _Searched
+    places : (n, 2) float array
+    noise : (n_data, n) float array
+    units : list of list of float array
+        As `_Searched.units` gives them for each place.
+    """
+
+    searched: _Searched
+    places: FloatArray
+    noise: FloatArray
+    units: list[list[FloatArray]]
+
+    def roots(self, which: IntArray, log_contrast: FloatArray) -> FloatArray:
+        """Roots of the statistic of some trials with drift as in the data at hand."""
+        white = self._white(which, log_contrast)
+        pairs = zip(which.tolist(), white.T, strict=True)
+        return np.array([self._root(k, own, self.searched.drifts) for k, own in pairs])
+
+    def roots_by_own_drift(self, which: IntArray, log_contrast: FloatArray) -> FloatArray:
+        """Roots of the statistic with drift fitted to residuals that hold the companion."""
+        found = []
+        for k, own in zip(which.tolist(), self._white(which, log_contrast).T, strict=True):
+            both = np.column_stack([own, self.searched.slopes])
+            found.append(self._root(k, own, self.searched.exposures.drifts_in(both)))
+        return np.array(found)
+
+    def _white(self, which: IntArray, log_contrast: FloatArray) -> FloatArray:
+        """Residuals of some trials, whitened as independent exposures."""
+        likelihood = self.searched.likelihood
+        companions = np.column_stack([self.places[which], np.exp(log_contrast)])
+        residual = self.searched.test.change_by(companions) + self.noise[:, which]
+        return likelihood.noise.whiten(likelihood.wrapped(residual))
+
+    def _root(
+        self, trial: int, white: FloatArray, drifts: tuple[Drift | None, Drift | None]
+    ) -> float:
+        searched, units = self.searched, self.units[trial]
+        columns = [white[:, None], searched.bank.nuisance_basis]
+        columns += [np.hstack(list(unit)) for unit in units]
+        turned = searched.exposures.whitened(drifts, np.hstack(columns))
+        first = 1 + searched.bank.n_nuisance
+        basis = np.linalg.qr(turned[:, 1:first])[0]
+        rates = np.split(turned[:, first:], len(units), axis=1)
+        bands = [one.reshape(len(white), -1, 2).swapaxes(0, 1) for one in rates]
+        places = _Two([BandTemplates.beside(templates, basis) for templates in bands], basis)
+        gain, chi2 = searched.treatment.field(places, turned[:, 0])
+        return float(np.sqrt(searched.ratio(gain, chi2).max()))
+
+
+@dataclass(frozen=True, eq=False)
+class _Two:
+    """A place and its opposite: templates of every rate, and what a fit of the star takes out.
+
+    Parameters
+    ----------
+    rates : list of BandTemplates
+    basis : (n_rows, n_nuisance) float array
+        Orthonormal.
+    """
+
+    rates: list[BandTemplates]
+    basis: FloatArray
+
+    def __len__(self) -> int:
+        return 2
+
+    @property
+    def n_data(self) -> int:
+        """Number of independent data."""
+        return len(self.basis)
+
+    @property
+    def n_nuisance(self) -> int:
+        """Number of nuisance directions."""
+        return int(self.basis.shape[1])
+
+    def project(self, data: FloatArray) -> FloatArray:
+        """Take the nuisance directions out of data (n_rows, …)."""
+        return data - self.basis @ (self.basis.T @ data)
+
+    def gains(self, residuals: FloatArray) -> FloatArray:
+        """Largest gain in χ² of residuals (n_rows,), without nuisance directions, at both."""
+        every = [one.best([residuals @ unit for unit in one.unit])[1] for one in self.rates]
+        return np.asarray(np.max(every, axis=0))
+
+    def by_band(self) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield positions (2,) and templates of unit norm of each band (n_bands, n_rows, 2)."""
+        for one in self.rates:
+            yield np.arange(2), one.unit

@@ -8,11 +8,11 @@ from helpers import simulated
 from interferometer import four_telescopes
 
 from amibayes.companion_search.search import search
-from amibayes.detection.exposure_noise import exposure_noise, exposures_of
+from amibayes.detection.exposure_noise import exposure_noise
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.limits.critical import CriticalContrasts
-from amibayes.limits.own_drift import _crossing, _piece, _smooth, _spread
+from amibayes.limits.own_drift import _crossing, _piece, _Searched, _smooth, _spread
 
 
 def test_errors_of_mean_changes_are_those_of_many_draws() -> None:
@@ -78,12 +78,15 @@ def test_logarithms_are_spread_about_the_median_of_their_ring() -> None:
 @pytest.mark.parametrize("noise", [0.0, 1.5])
 def test_the_contrast_of_detection_is_found_from_anywhere(start: float, noise: float) -> None:
     """Of a root that is noise at first, and goes with the contrast then."""
-    found = _crossing(lambda x: float(np.hypot(np.exp(x) / 0.004, noise)), 5.0, start)
-    assert found == pytest.approx(np.log(0.004 * np.sqrt(25.0 - noise**2)), abs=0.03)
+    scale = np.array([0.004, 0.001, 0.02])
+    found = _crossing(
+        lambda which, x: np.hypot(np.exp(x) / scale[which], noise), 5.0, np.full(3, start)
+    )
+    assert found == pytest.approx(np.log(scale * np.sqrt(25.0 - noise**2)), abs=0.03)
 
 
 def test_what_is_never_detected_ends_at_equal_stars() -> None:
-    assert _crossing(lambda x: float(np.exp(0.5 * x)), 5.0, -3.0) == 0.0
+    assert _crossing(lambda which, x: np.exp(0.5 * x), 5.0, np.array([-3.0])) == 0.0
 
 
 def test_contrasts_of_detection_are_those_of_searches_of_real_data(rng) -> None:
@@ -93,9 +96,7 @@ def test_contrasts_of_detection_are_those_of_searches_of_real_data(rng) -> None:
     result = search(likelihood, (2.0, 8.0))
     test, goal = statistic_of(result), 4.0
     places = np.array([[3.0, 1.0], [-4.0, 4.0]])
-    found = _piece(
-        test, exposures_of(likelihood), goal**2, (places, 0.02, np.random.default_rng(7))
-    )
+    found = _piece(_Searched.of(test), goal**2, (places, 0.02, np.random.default_rng(7)))
     noise = test.likelihood.noise.draw(2, np.random.default_rng(7)).T
     contrast = np.geomspace(0.003, 0.3, 40)
     for place, own, after in zip(places, noise, found["own"], strict=True):
