@@ -40,7 +40,7 @@ FEW = 0.02
 """Share of the trials for which no further look at the whole bank is taken: theirs is then the
 contrast on the last straight line."""
 
-NUMBERS_AT_ONCE, MOST_AT_ONCE = 8_000_000, 4096
+NUMBERS_AT_ONCE, MOST_AT_ONCE = 8_000_000, 1024
 """Numbers of data, and data sets, that are searched together."""
 
 
