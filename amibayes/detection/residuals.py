@@ -60,6 +60,19 @@ def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
     return tuple(out)
 
 
+def chi2_of_kinds(result: SearchResult) -> dict[str, tuple[float, float]]:
+    """χ² of V² and of closure phases with the companion, and degrees of freedom, of those seen."""
+    fit, kinds = result.likelihood, {"V2": "vis2", "closure phases": "cp"}
+    left, share = fit.difference(result.theta)[:, 0], result.ndof / fit.n_independent
+    out = {}
+    for name, kind in kinds.items():
+        at = np.flatnonzero(sum(file.of_kind(kind) for file in files_of(fit.observables)))
+        if len(at):
+            chi2, rank = chi2_of_part(fit.noise.covariance, at, left)
+            out[name] = chi2, share * rank
+    return out
+
+
 def _reduced(covariance: Covariance, difference: FloatArray, at: np.ndarray, share: float) -> float:
     if not len(at):
         return float("nan")

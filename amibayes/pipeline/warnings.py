@@ -14,7 +14,7 @@ from amibayes.detection.consistency import EPOCH_GAP_DAYS
 from amibayes.detection.exposure_noise import ExposureNoise
 from amibayes.detection.false_alarm import Significance, draws_needed
 from amibayes.detection.note import taken_for_a_point
-from amibayes.detection.residuals import correlated
+from amibayes.detection.residuals import chi2_of_kinds, correlated
 from amibayes.detection.splits import Consistency
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.pipeline.vetting import Vetting, notes
@@ -177,14 +177,20 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
     """Warn where the errors are so large that CANDID's nσ has lost its meaning."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
-    which = "the stated errors"
+    of, size, dof = "", result.chi2_binary, float(result.ndof)
+    # Errors of the other kind may be too small at the same time.
+    kinds = chi2_of_kinds(result)
+    large = [kind for kind, fit in kinds.items() if chi2.cdf(*fit) <= FAR_TOO_SMALL]
+    if len(large) < len(kinds) and large:
+        of, (size, dof) = f" of {large[0]}", kinds[large[0]]
+    which = f"the stated errors{of}"
     if noise.exceeds_stated:
-        which = "the errors, with the noise that was added,"
+        which = f"the errors{of}, with the noise that was added,"
     if noise.floors:
-        which = "the errors, with the calibration errors of the instrument,"
+        which = f"the errors{of}, with the calibration errors of the instrument,"
     return [
-        f"{which} are far too large: chi2 is {result.chi2_binary:.0f} for {result.ndof} degrees "
-        "of freedom with the companion; CANDID's n_sigma, a ratio of two such chi2, means nothing"
+        f"{which} are far too large: chi2 is {size:.0f} for {dof:.0f} degrees of freedom with the "
+        "companion; CANDID's n_sigma, a ratio of two chi2, means nothing"
     ]
 
 

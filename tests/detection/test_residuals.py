@@ -11,7 +11,7 @@ from interferometer import four_telescopes
 
 from amibayes.companion_search.search import search
 from amibayes.data.observables import join
-from amibayes.detection.residuals import channel_correlation, file_residuals
+from amibayes.detection.residuals import channel_correlation, chi2_of_kinds, file_residuals
 from amibayes.likelihood.channel_noise import ChannelShare, Correlation, noise_with_channels
 from amibayes.likelihood.extra_noise import ExtraNoise
 from amibayes.likelihood.likelihood import Likelihood
@@ -64,3 +64,24 @@ def test_chi2_of_files_adds_up_where_channels_share_errors(rng) -> None:
     assert total == pytest.approx(result.chi2_binary, rel=1e-9)
     single = sum(share * (54 * f.single_vis2 + 27 * f.single_closure_phase) for f in files)
     assert single == pytest.approx(result.chi2_single, rel=1e-9)
+
+
+@pytest.mark.parametrize("large", ["V2", "closure phases"])
+def test_errors_that_are_far_too_large_are_those_of_one_kind(large: str, rng) -> None:
+    """Four times too large for one kind, right for the other: χ² of both is a third too small."""
+    size = {"V2": (0.08, 1.0), "closure phases": (0.02, 4.0)}[large]
+    stated = four_telescopes(20, vis2_error=size[0], closure_error_deg=size[1])
+    truth = four_telescopes(20, vis2_error=0.02, closure_error_deg=1.0)
+    data = stated.with_data(simulated(truth, [4.0, 5.0, 0.1], rng).data)
+    result = search(Likelihood(data), (2.0, 12.0))
+    kinds = chi2_of_kinds(result)
+    n = {"V2": len(data.vis2), "closure phases": data.covariance.rank - len(data.vis2)}
+    left = result.likelihood.difference(result.theta)[:, 0] / np.concatenate(data.errors)
+    assert kinds["V2"][0] == pytest.approx((left[: n["V2"]] ** 2).sum())
+    assert sum(chi2 for chi2, _ in kinds.values()) == pytest.approx(result.chi2_binary)
+    for kind, (chi2, dof) in kinds.items():
+        expected = dof / (16.0 if kind == large else 1.0)
+        assert dof == pytest.approx(n[kind], rel=0.02)
+        assert chi2 == pytest.approx(expected, abs=5.0 * expected * np.sqrt(2.0 / dof))
+    said = [w for w in search_warnings(data, result, ExtraNoise(), None, None) if "far too" in w]
+    assert [f"errors of {kind}" in said[0] for kind in kinds] == [kind == large for kind in kinds]
