@@ -70,8 +70,8 @@ def test_chi2_of_files_adds_up_where_channels_share_errors(rng) -> None:
 def test_errors_that_are_far_too_large_are_those_of_one_kind(large: str, rng) -> None:
     """Four times too large for one kind, right for the other: χ² of both is a third too small."""
     size = {"V2": (0.08, 1.0), "closure phases": (0.02, 4.0)}[large]
-    stated = four_telescopes(20, vis2_error=size[0], closure_error_deg=size[1])
-    truth = four_telescopes(20, vis2_error=0.02, closure_error_deg=1.0)
+    stated = four_telescopes(32, vis2_error=size[0], closure_error_deg=size[1])
+    truth = four_telescopes(32, vis2_error=0.02, closure_error_deg=1.0)
     data = stated.with_data(simulated(truth, [4.0, 5.0, 0.1], rng).data)
     result = search(Likelihood(data), (2.0, 12.0))
     kinds = chi2_of_kinds(result)
