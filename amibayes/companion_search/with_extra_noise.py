@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from amibayes.companion_search.search import BETTER, search, with_global_check
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.data.observables import Observables
 from amibayes.likelihood.averaged_noise import averaged_noise
-from amibayes.likelihood.channel_noise import ChannelShare
 from amibayes.likelihood.extra_noise import (
     CONVERGED,
     MAX_ROUNDS,
@@ -149,7 +147,7 @@ def noise_averaged(
     *,
     extra_noise: bool = True,
     per_file: bool = False,
-    channels: Sequence[ChannelShare] = (),
+    noise: ExtraNoise | None = None,
     prior: NoisePrior | None = None,
 ) -> tuple[SearchResult, TwoCompanions | None]:
     """Give search and second companion a likelihood averaged over the unknown extra noise.
@@ -165,8 +163,8 @@ def noise_averaged(
         Student's t distribution all the same.
     per_file : bool
         The noise of every file is unknown by itself.
-    channels : sequence of ChannelShare
-        What channels of an exposure share, as the search found it.
+    noise : ExtraNoise, optional
+        That the search found.
     prior : NoisePrior, optional
     """
     if not extra_noise and result.robustness is None:
@@ -175,7 +173,7 @@ def noise_averaged(
     fits = [(profile, result.theta), (single_likelihood(profile), result.single_theta)]
     fits += [(two.likelihood, two.theta)] if two else []
     if result.robustness is not None:
-        noise = averaged_student_noise(
+        mean = averaged_student_noise(
             profile.noise,
             result.robustness.stated,
             fits,
@@ -184,11 +182,11 @@ def noise_averaged(
             per_file=per_file,
         )
     else:
-        noise = averaged_noise(
+        mean = averaged_noise(
             profile.noise, _expected(stated.unflagged(), profile.observables), fits,
-            per_file=per_file, channels=channels, prior=prior,
+            per_file=per_file, noise=noise, prior=prior,
         )  # fmt: skip
-    averaged = profile.with_noise(noise)
+    averaged = profile.with_noise(mean)
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two

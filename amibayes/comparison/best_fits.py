@@ -180,7 +180,7 @@ def _averaged(
         clean.expecting(best.theta).observables,
         [(fit.model.likelihood, fit.theta) for fit in fits],
         per_file=setting.per_file,
-        channels=found.channels,
+        noise=found,
         prior=setting.prior,
     )
     return [

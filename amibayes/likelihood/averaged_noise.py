@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import logsumexp
 
@@ -23,7 +23,6 @@ from amibayes.data.covariance import Covariance
 from amibayes.data.observables import Observables
 from amibayes.likelihood.channel_noise import (
     ChannelCovariance,
-    ChannelShare,
     noise_with_channels,
 )
 from amibayes.likelihood.extra_noise import ExtraNoise, NoisePrior, add_noise
@@ -147,7 +146,7 @@ def averaged_noise(
     fits: Sequence[tuple[Likelihood, FloatArray]],
     *,
     per_file: bool = False,
-    channels: Sequence[ChannelShare] = (),
+    noise: ExtraNoise | None = None,
     prior: NoisePrior | None = None,
 ) -> AveragedNoise:
     """Average over the extra noise of each kind of observable.
@@ -163,8 +162,9 @@ def averaged_noise(
     per_file : bool
         The noise of every file is unknown by itself; files that share errors (through their
         calibrators) are unknown together.
-    channels : sequence of ChannelShare
-        What channels of an exposure share, of the stated errors and of extra noise alike.
+    noise : ExtraNoise, optional
+        That was fitted: what channels of an exposure share, of the stated errors and of extra
+        noise alike, and how much extra noise there is.
     prior : NoisePrior, optional
 
     Notes
@@ -173,7 +173,7 @@ def averaged_noise(
     error has Jeffreys' prior of a scale, from the stated error to `MAX_INFLATION` times that,
     times the half-normal one of `NoisePrior`.
     """
-    prior = prior or NoisePrior()
+    prior, noise = prior or NoisePrior(), noise or ExtraNoise()
     differences = differences_of(fits)
     data = stated.unflagged()
     parts = groups_of(data, per_file=per_file)
@@ -181,7 +181,7 @@ def averaged_noise(
     whole = len(parts) > 1 and files_share_errors(data)
     parts = [("", np.ones(data.covariance.size, dtype=bool))] if whole else parts
     found = [
-        _term(data, name, *kind, channels, prior)
+        _term(data, name, *kind, noise, prior)
         for name, here in parts
         for kind in kinds_of(data, here)
     ]
@@ -209,7 +209,7 @@ def _term(
     kind: str,
     which: BoolArray,
     typical: dict[str, float],
-    channels: Sequence[ChannelShare],
+    noise: ExtraNoise,
     prior: NoisePrior,
 ) -> NoiseTerm:
     """Whiten some of the data and make their extra noise diagonal, block by block."""
@@ -218,8 +218,14 @@ def _term(
     extra = csr_array(add_noise(part, _amount(typical)).covariance.sparse - part.covariance.sparse)
     sources = {s.source for s in part.setups}
     floors = [f for f in prior.floors if f.source in sources]
-    covariance = noise_with_channels(part, channels, floors)
-    whitening, share = _together(covariance.covariance, extra)
+    fitted = add_noise(part, noise)
+    covariance = noise_with_channels(fitted, noise.channels, floors).covariance
+    if isinstance(covariance, ChannelCovariance):
+        added = csr_array(fitted.covariance.sparse - part.covariance.sparse)
+        whitening, share, log_det = _about(covariance, added, extra)
+    else:
+        whitening, share = _together(part.covariance, extra)
+        log_det = part.covariance.logdet()
     columns = np.flatnonzero(which)
     place = csr_array(
         (np.ones(len(columns)), (np.arange(len(columns)), columns)),
@@ -230,7 +236,7 @@ def _term(
         csr_array(whitening @ place),
         share,
         typical,
-        covariance.covariance.logdet(),
+        log_det,
         part.degrees_of_freedom,
         source=source,
         width={name: prior.width(part, name) for name in typical},
@@ -238,19 +244,31 @@ def _term(
 
 
 def _together(covariance: Covariance, extra: csr_array) -> tuple[csr_array, FloatArray]:
-    """Whitening that makes another covariance diagonal as well, and that diagonal.
-
-    Where channels share some of the noise, they share as much of the extra one: its diagonal
-    is then that of the turned rows, exact where errors are alike over an exposure.
-    """
-    if isinstance(covariance, ChannelCovariance):
-        white = covariance.base.whitening
-        share = np.asarray((white @ extra).multiply(white).sum(axis=1))
-        # A turned row is a mean of channels, and so is its share.
-        return covariance.whitening, np.asarray(covariance.rows.rotation.power(2) @ share)
+    """Whitening that makes another covariance diagonal as well, and that diagonal."""
     white = covariance.whitening
     turn, share = _diagonal(csr_array(white @ extra @ white.T))
     return csr_array(turn @ white), share
+
+
+def _about(
+    covariance: ChannelCovariance, added: csr_array, extra: csr_array
+) -> tuple[csr_array, FloatArray, float]:
+    """The same where channels share some of the noise, and ln of the determinant.
+
+    ``covariance`` has the noise ``added`` that was fitted. Channels share as much of the extra
+    noise as of the errors, and which combinations of them err independently goes with its amount:
+    they are those of the fitted amount, which the posterior is about. There the likelihood is
+    that of the fit. Elsewhere a row has its own variance.
+    """
+    white, rows = covariance.base.whitening, covariance.rows
+
+    def of_rows(matrix: csr_array) -> FloatArray:
+        channels = np.asarray((white @ matrix).multiply(white).sum(axis=1))
+        return np.asarray(rows.growing * (rows.rotation.power(2) @ channels))
+
+    stated = 1.0 - of_rows(added)
+    whitening = csr_array(diags_array(1.0 / np.sqrt(stated)) @ covariance.whitening)
+    return whitening, of_rows(extra) / stated, covariance.logdet() + float(np.log(stated).sum())
 
 
 def _amount(typical: dict[str, float]) -> ExtraNoise:

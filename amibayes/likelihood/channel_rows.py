@@ -141,7 +141,7 @@ class ChannelLayout:
         for first, last in pairwise(cuts):
             if last == first + 1:
                 parts.append((np.array([first]), np.array([first]), np.ones(1)))
-                variance[first] += floor[first]
+                added[first] = floor[first]
                 continue
             others = first + np.flatnonzero(self.gap[first:last] == APART)
             basis = smooth_basis(self.weight[first:last], np.diff([first, *others, last]).tolist())
@@ -196,7 +196,7 @@ class ChannelRows:
         `OFFSET` of rows along an error that is common to the channels, `SLOPE` of those along one
         that changes evenly across them, `CURVE` of curves over all of them, 0 of all others.
     floor : (rank,) float array
-        Variance by further errors, of several channels.
+        Variance by further errors.
     apart : ChannelRows, optional
         The rows as they were before those that exposures share were turned.
     """
@@ -206,6 +206,15 @@ class ChannelRows:
     level: IntArray
     floor: FloatArray
     apart: ChannelRows | None = None
+
+    @property
+    def growing(self) -> FloatArray:
+        """Share of the variance (rank,) that grows with the size of the errors: no floor does."""
+        apart = self.apart or self
+        own = 1.0 - apart.floor / apart.sigma**2
+        if self.apart is None:
+            return own
+        return np.asarray(csr_array(self.rotation @ apart.rotation.T).power(2) @ own)
 
     def part(self, inside: BoolArray) -> ChannelRows:
         """Those of some of the whitened data (rank,), which share nothing with the others."""

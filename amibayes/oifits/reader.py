@@ -73,12 +73,14 @@ def observables_of(
 
 
 def _unused(oifits: OIFits) -> list[str]:
-    """Say which tables are not used; those that are called the same in one line."""
+    """Say in one line which tables are not used; those that are called the same once."""
     names = (t for t in oifits.unused if t.name not in (RESPONSE, SCATTER, SHARED))
     count = Counter(f"{t.name or 'unnamed'} {t.extver}" for t in names)
-    return [
-        f"{name} is not used" + (f" ({n} tables)" if n > 1 else "") for name, n in count.items()
-    ]
+    if not count:
+        return []
+    told = [name + (f" ({n} tables)" if n > 1 else "") for name, n in count.items()]
+    are = "are" if len(told) > 1 else "is"
+    return [f"{', '.join(told)} {are} not used"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -247,7 +247,7 @@ def _inferred(
         found.observables.only(options.observables),
         extra_noise=options.extra_noise,
         per_file=options.file_noise is not False,
-        channels=found.noise.channels,
+        noise=found.noise,
         prior=noise_prior(found.observables.only(options.observables), options),
     )
     prior, counts = _prior(result, options), _counts(options)

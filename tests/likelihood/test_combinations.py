@@ -171,7 +171,11 @@ def fit(stated: Likelihood, asked: Combination, *, per_file: bool):
         )
     else:
         noise = averaged_noise(
-            profile.noise, stated.observables, fits, per_file=per_file, channels=shares
+            profile.noise,
+            stated.observables,
+            fits,
+            per_file=per_file,
+            noise=ExtraNoise(channels=tuple(shares)),
         )
     n_files = (
         2

@@ -216,7 +216,7 @@ def test_noise_averaged_over_its_amount(num_regression) -> None:
     for name, data, options in (
         ("two", of_two_files(), {"per_file": True}),
         ("one", of_two_files(), {"prior": NoisePrior(0.01, 0.01)}),
-        ("channels", of_channels(), {"channels": [share(0.4, 0.3)]}),
+        ("channels", of_channels(), {"noise": ExtraNoise(channels=(share(0.4, 0.3),))}),
         ("estimated", estimated(of_two_files()), {}),
     ):
         likelihood = Likelihood(data)
