@@ -100,23 +100,49 @@ def channel_correlation(result: SearchResult) -> tuple[float, int]:
     n_pairs : int
         Pairs of data it rests on; by chance it scatters by 1/√n_pairs.
     """
-    data, noise = result.likelihood.observables, result.likelihood.noise
-    # What the noise model knows of the correlation of channels is taken out by the whitening:
-    # what is left shows between neighbours.
-    white = result.likelihood.residuals(result.theta)
-    residuals = symmetric_whitening(data, noise.covariance).residuals(white)[:, 0]
-    vis2, closure = _neighbours(data.vis2), _neighbours(data.closure_phase) + data.n_vis2
-    first, second = residuals[np.concatenate([vis2, closure], axis=1)]
+    residuals, pairs = _channels(result)
+    first, second = residuals[np.concatenate(pairs, axis=1)]
     norm = float(np.sqrt((first @ first) * (second @ second)))
     return (float(first @ second) / norm if norm else 0.0), len(first)
 
 
 def correlated(result: SearchResult) -> float | None:
-    """Correlation between channels beyond the model of the noise; None where it does not matter."""
+    """Correlation between channels beyond the model of the noise; None where it does not matter.
+
+    It does not where errors are so large that means over channels scatter by less than they say.
+    """
     correlation, n_pairs = channel_correlation(result)
     if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
         return None
-    return correlation
+    data, (residuals, pairs) = result.likelihood.observables, _channels(result)
+    tables = (data.vis2, data.closure_phase)
+    kinds = zip(tables, np.split(residuals, [data.n_vis2]), pairs, strict=True)
+    beyond = [_beyond_errors(table, own, residuals[at]) for table, own, at in kinds if len(table)]
+    return correlation if any(beyond) else None
+
+
+def _beyond_errors(table: Measurements, own: FloatArray, pairs: FloatArray) -> bool:
+    """Whether means over the channels of a row scatter by more than errors say, and by chance.
+
+    ``pairs`` (2, n) are residuals of neighbouring channels: what they have in common, all have.
+    """
+    n_rows = len(np.unique(np.stack([table.setup, table.row]), axis=1).T)
+    variance = float((own**2).mean() + (pairs[0] * pairs[1]).sum() / n_rows)
+    return bool(variance > np.exp(CHANCE * np.sqrt(2.0 / n_rows)))
+
+
+CHANCE = 2.0
+"""Errors of ln of a variance that it has to be off by."""
+
+
+def _channels(result: SearchResult) -> tuple[FloatArray, list[IntArray]]:
+    """Residuals (n_data,) in units of their errors, and pairs (2, n) of each kind's neighbours."""
+    data, noise = result.likelihood.observables, result.likelihood.noise
+    # What the noise model knows of the correlation of channels is taken out by the whitening:
+    # what is left shows between neighbours.
+    white = result.likelihood.residuals(result.theta)
+    residuals = symmetric_whitening(data, noise.covariance).residuals(white)[:, 0]
+    return residuals, [_neighbours(data.vis2), _neighbours(data.closure_phase) + data.n_vis2]
 
 
 def _neighbours(data: Measurements) -> IntArray:

@@ -20,9 +20,12 @@ from amibayes.pipeline.warnings import search_warnings
 TRUTH = [150.0, -80.0, 0.02]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.6])
-def test_common_errors_of_channels_are_measured(share, rng) -> None:
-    """Six channels; variance ``share`` in common. 280 pairs: within 5/√280 of the truth."""
+@pytest.mark.parametrize(("share", "large"), [(0.0, 1.0), (0.6, 1.0), (0.6, 4.0)])
+def test_common_errors_of_channels_are_measured(share, large, rng) -> None:
+    """Six channels; variance ``share`` in common. 280 pairs: within 5/√280 of the truth.
+
+    Where stated errors are four times too large a mean of channels is within them: 4/16.
+    """
     sheet = niriss(channels=6)
     data = simulated(sheet, TRUTH, rng)
     clean = Likelihood(sheet).predict([TRUTH])[:, 0]
@@ -33,13 +36,14 @@ def test_common_errors_of_channels_are_measured(share, rng) -> None:
         common = rng.standard_normal(table.row.max() + 1)[table.row] * error
         parts.append(np.sqrt(1.0 - share) * own + np.sqrt(share) * common)
     values = clean + np.concatenate(parts)
-    data = data.with_data(values)
+    covariance = niriss(0.005 * large, 0.3 * large, channels=6).covariance
+    data = replace(data.with_data(values), covariance=covariance)
     result = search(Likelihood(data), (50.0, 400.0))
     correlation, n_pairs = channel_correlation(result)
     assert n_pairs == 5 * 56
     assert correlation == pytest.approx(share, abs=0.3)
     said = search_warnings(data, result, ExtraNoise(), None, None)
-    assert any("neighbouring channels" in text for text in said) == (share > 0)
+    assert any("neighbouring channels" in text for text in said) == (share > 0 and large == 1.0)
 
 
 def test_one_channel_says_nothing(rng) -> None:
