@@ -46,6 +46,7 @@ from amibayes.pipeline.warnings import (
 )
 from amibayes.support.options import VETTING_ALPHA
 from amibayes.support.shared_results import shared, shared_of_file
+from amibayes.support.terminal import equals
 
 MIN_TO_VET = 3
 """Of two calibrators that disagree the bad one cannot be known."""
@@ -284,7 +285,7 @@ def _two_that_disagree(ready: Prepared) -> list[str]:
     if p is None or p >= VETTING_ALPHA:
         return []
     return [
-        f"the calibrators {first.source} and {second.source} disagree (p = {p:.1g}): one of them "
+        f"the calibrators {first.source} and {second.source} disagree (p {equals(p)}): one of them "
         "may be no point, and which cannot be told (see amibayes vet, and give a third)"
     ]
 
