@@ -16,14 +16,14 @@ from amibayes.companion_search.search import search
 from amibayes.companion_search.with_extra_noise import search_with_noise
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
-from amibayes.detection.exposure_noise import exposure_noise
+from amibayes.detection.exposure_noise import exposure_noise, exposures_of
 from amibayes.detection.false_alarm import significance
 from amibayes.detection.statistic import make_statistic, statistic_of
 from amibayes.likelihood.channel_noise import noise_with_channels
 from amibayes.likelihood.channel_rows import OFFSET, SLOPE, ChannelRows, channel_layout
 from amibayes.likelihood.exposure_rows import HOURS, SHARES, Series, SeriesAxes, drift_of, series_of
 from amibayes.likelihood.extra_noise import NoisePrior
-from amibayes.likelihood.likelihood import Likelihood
+from amibayes.likelihood.likelihood import Likelihood, single_likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.units import MAS
 
@@ -293,3 +293,34 @@ def test_a_night_that_is_worse_than_the_table_gives_no_companions(
     else:
         error = np.sqrt(wanted * (1.0 / 10_000 + 1.0 / 20_000))
         assert (np.abs(often - wanted) < 4.5 * error).all(), often
+
+
+@pytest.mark.parametrize("floor", [False, True])
+def test_data_are_whitened_by_the_mean_over_the_posterior(floor, rng) -> None:
+    """The covariance added up node by node, and of sizes of floors one by one."""
+    sheet = four_telescopes(5, channels=3)
+    data = of_drifting_gains(sheet, 0.05, 0.02, 2.0, rng)
+    floors = (Systematics(data.setups[0].source, 0.03, np.radians(0.5)),) if floor else ()
+    prior = NoisePrior(floors=floors)
+    result, _ = search_with_noise(Likelihood(data), (3.0, 12.0), prior=prior)
+    exposures, single = exposures_of(result.likelihood), single_likelihood(result.likelihood)
+    drifts = exposures.drifts(single, result.single_theta)
+    relative = exposures.sizes / exposures.rows.sigma
+    covariance = np.diag((relative**2).mean(axis=0))
+    for one in exposures.series:
+        drift, own = drifts[0 if one.vis2 else 1], relative[:, one.rows]
+        mean = sum(
+            mass * one.correlation(np.array(share), np.array(tau))
+            for row, tau in zip(drift.mass, HOURS, strict=True)
+            for mass, share in zip(row, SHARES, strict=True)
+        )
+        covariance[np.ix_(one.rows, one.rows)] = mean * (own.T @ own) / len(own)
+    white = rng.normal(size=(len(covariance), 4))
+    found = exposures.whitened(drifts, white)
+    assert found.T @ found == pytest.approx(white.T @ np.linalg.solve(covariance, white))
+    # Means over the nodes that null sets are drawn with are nearly the same.
+    turned = exposures.noise_of(exposures.turned(*drifts)[0])
+    apart = exposures.noise_of(exposures.rows)
+    data_of_rows = apart.covariance.dense() @ apart.covariance.whitening.T @ white
+    by_nodes = turned.whiten(data_of_rows)
+    assert (by_nodes**2).sum(axis=0) == pytest.approx((found**2).sum(axis=0), rel=0.05)
