@@ -27,7 +27,6 @@ from amibayes.likelihood.channel_rows import (
     OFFSET,
     SLOPE,
     ChannelLayout,
-    ChannelRows,
     channel_layout,
 )
 from amibayes.likelihood.chi2 import chi2_survival
@@ -154,15 +153,9 @@ class _Kind:
         base = self._with(amount)
         if not (shared.any or self.floors):
             return base
-        if shared not in self._rows:
-            shares = [ChannelShare(shared, shared)]
-            self._rows[shared] = noise_rows(self.data, self._layout, shares, self._own_floors)
-        return ChannelCovariance(base, self._rows[shared])
-
-    @cached_property
-    def _rows(self) -> dict[Correlation, ChannelRows]:
-        """Of the shares that were tried: the amount of noise does not change them."""
-        return {}
+        shares = [ChannelShare(shared, shared)]
+        layout = self._layout(amount)
+        return ChannelCovariance(base, noise_rows(self.data, layout, shares, self._own_floors))
 
     def _with(self, amount: float) -> BlockCovariance:
         """With an amount of extra noise, channels independent."""
@@ -180,17 +173,24 @@ class _Kind:
 
     @property
     def _own_floors(self) -> list[Systematics]:
-        return [f for f in self.floors if f.source in self._layout.names]
+        return [f for f in self.floors if f.source in self._layout(0.0).names]
+
+    def _layout(self, amount: float) -> ChannelLayout:
+        """With an amount of extra noise: floors are smaller in units of the errors then."""
+        if amount not in self._layouts:
+            self._layouts[amount] = channel_layout(
+                replace(self.data, covariance=self._with(amount))
+            )
+        return self._layouts[amount]
 
     @cached_property
-    def _layout(self) -> ChannelLayout:
-        """Of the stated errors: extra noise hardly changes their shape over an exposure."""
-        return channel_layout(self.data)
+    def _layouts(self) -> dict[float, ChannelLayout]:
+        return {}
 
     @cached_property
     def _axes(self) -> SeriesAxes | None:
         """Of exposures that may err alike: no amount of noise changes which they are."""
-        series = series_of(self.data, self._layout)
+        series = series_of(self.data, self._layout(0.0))
         return SeriesAxes.of(series) if series else None
 
     def explained(self, shared: Correlation) -> bool:
@@ -223,7 +223,11 @@ class _Kind:
         low, high = 1e-2 * typical, min(10.0 * largest, BOUND * width)
         if high <= low:  # the stated errors are beyond what the prior allows already
             return 0.0
-        bounds = float(np.log(low)), float(np.log(high))
+        # Where errors of channels are unequal, what these share changes with the amount, and there
+        # may be another minimum next to no noise.
+        tried = np.linspace(np.log(low), np.log(high), TRIED)
+        k = int(np.argmin([loss(x) for x in tried]))
+        bounds = float(tried[max(k - 1, 0)]), float(tried[min(k + 1, TRIED - 1)])
         best = optimize.minimize_scalar(
             loss, bounds=bounds, method="bounded", options={"xatol": 1e-3}
         )
@@ -254,7 +258,8 @@ class _Kind:
         """What channels share, given an amount of extra noise and `Correlation.smooth`."""
         base = self._with(amount)
         white, slopes = base.whiten(self.residual), base.whiten(self.jacobian)
-        return correlation_of(self._layout, white, slopes, self._own_floors, changing=_some(smooth))
+        layout = self._layout(amount)
+        return correlation_of(layout, white, slopes, self._own_floors, changing=_some(smooth))
 
     def with_larger_floors(
         self, amount: float, shared: Correlation, prior: NoisePrior
@@ -268,7 +273,7 @@ class _Kind:
         if not floor or not width:
             return shared
         base = self._with(amount)
-        layout = channel_layout(replace(self.data, covariance=base))
+        layout = self._layout(amount)
         rows = channel_rows(layout, [ChannelShare(shared, shared)], self._own_floors)
         square = (rows.rotation @ base.whiten(self.residual)) ** 2
         found = [
@@ -287,7 +292,7 @@ class _Kind:
         if self._floor or not width:
             return shared
         base = self._with(amount)
-        layout = channel_layout(replace(self.data, covariance=base))
+        layout = self._layout(amount)
         rows, with_one = (
             channel_rows(layout, [ChannelShare(own, own)])
             for own in (replace(shared, smooth=(size, size, size)) for size in (NEXT_TO_NONE, 1.0))
@@ -319,7 +324,7 @@ class _Kind:
         if self._axes is None:
             return shared
         alone = replace(shared, lasting=())
-        rows = channel_rows(self._layout, [ChannelShare(alone, alone)], self._own_floors)
+        rows = channel_rows(self._layout(amount), [ChannelShare(alone, alone)], self._own_floors)
         noise = ChannelCovariance(self._with(amount), rows)
         white = noise.whiten(np.column_stack([self.residual, self.jacobian]))
         return replace(shared, lasting=drift_of(self._axes, white).lasting)
@@ -347,6 +352,9 @@ class _Kind:
 
 NEXT_TO_NONE = 1e-9
 """Variance of smooth errors beside which all others are what they are beside larger ones."""
+
+TRIED = 9
+"""Amounts of extra noise, of equal ratios, about the best of which it is sought."""
 
 MIN_ROWS = 6
 """Gains (of baselines in exposures) from which on their scatter is known to a third."""
