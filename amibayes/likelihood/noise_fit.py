@@ -353,7 +353,7 @@ class _Kind:
 NEXT_TO_NONE = 1e-9
 """Variance of smooth errors beside which all others are what they are beside larger ones."""
 
-TRIED = 9
+TRIED = 16
 """Amounts of extra noise, of equal ratios, about the best of which it is sought."""
 
 MIN_ROWS = 6

@@ -70,6 +70,10 @@ def _log_prior(centre: FloatArray, parameters: Parameters, prior: Prior) -> floa
     return float(prior.log_density(moved[None])[0])
 
 
+SHORTEST = 1e-4
+"""Least length of an axis of a mode, in errors of the parameters along it."""
+
+
 def gaussian_of(
     likelihood: Likelihood, theta: FloatArray, prior: Prior, widest: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
@@ -89,7 +93,10 @@ def gaussian_of(
     # Data that say nothing of a contrast leave it as wide as the prior.
     known = np.log(prior.contrast_max / prior.contrast_min) / np.sqrt(np.diag(errors)[bright])
     stretch[bright] = np.minimum(1.0 / theta[bright], known)
-    values, vectors = np.linalg.eigh(errors * np.outer(stretch, stretch))
+    covariance = errors * np.outer(stretch, stretch)
+    # A closure phase at a null of the visibility turns at once: no axis is as short as it says.
+    covariance += SHORTEST**2 * np.diag(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance)
     theta[bright] = np.log(theta[bright])
     limit = max(widest * prior.outer_mas, 1.0)
     return theta, vectors * np.sqrt(np.clip(values, 1e-20, limit**2))
