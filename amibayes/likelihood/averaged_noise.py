@@ -7,6 +7,8 @@ With even odds there is none, else the total error is log-uniform from the state
 the likelihood is the mean over that. Both covariances, C as stated and N of the extra noise,
 are made diagonal together once (W C Wᵀ = 1, W N Wᵀ = Λ), so that χ² and determinant for any
 amount s² of noise are Σ y²/(1 + s²Λ) and Π (1 + s²Λ): all amounts cost one product of matrices.
+Where channels share noise no rows are independent for all amounts: those of the fitted one are
+taken, with their variances for any other.
 """
 
 from __future__ import annotations
