@@ -62,11 +62,11 @@ def file_residuals(result: SearchResult) -> tuple[FileResiduals, ...]:
 
 def chi2_of_kinds(result: SearchResult) -> dict[str, tuple[float, float]]:
     """χ² of V² and of closure phases with the companion, and degrees of freedom, of those seen."""
-    fit, kinds = result.likelihood, {"V2": "vis2", "closure phases": "cp"}
+    fit = result.likelihood
     left, share = fit.difference(result.theta)[:, 0], result.ndof / fit.n_independent
+    vis2, closure = np.split(np.arange(len(left)), [fit.observables.n_vis2])
     out = {}
-    for name, kind in kinds.items():
-        at = np.flatnonzero(sum(file.of_kind(kind) for file in files_of(fit.observables)))
+    for name, at in (("V2", vis2), ("closure phases", closure)):
         if len(at):
             chi2, rank = chi2_of_part(fit.noise.covariance, at, left)
             out[name] = chi2, share * rank
@@ -100,7 +100,11 @@ def channel_correlation(result: SearchResult) -> tuple[float, int]:
     n_pairs : int
         Pairs of data it rests on; by chance it scatters by 1/√n_pairs.
     """
-    residuals, pairs = _channels(result)
+    return _correlation(*_channels(result))
+
+
+def _correlation(residuals: FloatArray, pairs: list[IntArray]) -> tuple[float, int]:
+    """The same of what `_channels` gives."""
     first, second = residuals[np.concatenate(pairs, axis=1)]
     norm = float(np.sqrt((first @ first) * (second @ second)))
     return (float(first @ second) / norm if norm else 0.0), len(first)
@@ -111,10 +115,10 @@ def correlated(result: SearchResult) -> float | None:
 
     It does not where errors are so large that means over channels scatter by less than they say.
     """
-    correlation, n_pairs = channel_correlation(result)
+    data, (residuals, pairs) = result.likelihood.observables, _channels(result)
+    correlation, n_pairs = _correlation(residuals, pairs)
     if correlation < NOTABLE or correlation * np.sqrt(n_pairs) < SURE:
         return None
-    data, (residuals, pairs) = result.likelihood.observables, _channels(result)
     tables = (data.vis2, data.closure_phase)
     kinds = zip(tables, np.split(residuals, [data.n_vis2]), pairs, strict=True)
     beyond = [_beyond_errors(table, own, residuals[at]) for table, own, at in kinds if len(table)]
