@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -102,6 +102,21 @@ class ChannelLayout:
         n = np.zeros(len(self.order))
         return self.turned(n, n, np.zeros((2, len(n))), np.zeros((3, len(n))))
 
+    @cached_property
+    def _series(self) -> list[tuple[tuple[int, ...], IntArray]]:
+        """Groups of several rows: lengths of their spectra, and where they are, (n_groups, n)."""
+        spectra = np.flatnonzero(self.starts | (self.gap == APART))
+        lengths = np.diff(spectra, append=len(self.order))
+        alike: dict[tuple[int, ...], list[int]] = {}
+        for _, own in groupby(range(len(spectra)), lambda k: self.group[spectra[k]]):
+            parts = list(own)
+            alike.setdefault(tuple(lengths[parts].tolist()), []).append(int(spectra[parts[0]]))
+        return [
+            (own, np.array(firsts)[:, None] + np.arange(sum(own)))
+            for own, firsts in alike.items()
+            if sum(own) > 1
+        ]
+
     def sums(self, values: FloatArray) -> FloatArray:
         """Sums of (rank, …) over the groups, (n_groups, …)."""
         at = np.flatnonzero(self.starts)
@@ -134,43 +149,37 @@ class ChannelLayout:
         All are sorted likewise.
         """
         n = len(self.order)
-        cuts = np.append(np.flatnonzero(self.starts), n).tolist()
-        variance, level, floor = np.ones(n), np.zeros(n, dtype=np.intp), further.sum(axis=0)
-        parts: list[tuple[IntArray, IntArray, FloatArray]] = []
-        added = np.zeros(n)
-        for first, last in pairwise(cuts):
-            if last == first + 1:
-                parts.append((np.array([first]), np.array([first]), np.ones(1)))
-                added[first] = floor[first]
-                continue
-            others = first + np.flatnonzero(self.gap[first:last] == APART)
-            basis = smooth_basis(self.weight[first:last], np.diff([first, *others, last]).tolist())
-            parts.append((basis.row + first, basis.column + first, basis.value))
-            rho, phi = common[first], neighbour[first]
+        variance, level, added = np.ones(n), np.zeros(n, dtype=np.intp), further.sum(axis=0)
+        # A floor says that exposures are too few to tell: no errors then shrink by a fit. Nor
+        # do they where smooth errors are beside them, and not a share of them.
+        beside = added + smooth.sum(axis=0) > 0.0
+        single = np.flatnonzero(self.count[self.group] == 1)
+        rows, columns, values = [single], [single], [np.ones(len(single))]
+        for lengths, at in self._series:
+            first, count = at[:, 0], at.shape[1]
+            basis = smooth_basis(self.weight[at], lengths)
+            rows.append(at[:, basis.row].ravel())
+            columns.append(at[:, basis.column].ravel())
+            values.append(basis.value.ravel())
             # Differences of neighbours are never trusted more than independent channels are:
             # what makes neighbours alike (overlap on the detector) blurs the signal there too.
-            rest = np.maximum(basis.variance(phi), 1.0)
-            rest = (1.0 - rho) * rest
-            # A floor says that exposures are too few to tell: no errors then shrink by a fit. Nor
-            # do they where smooth errors are beside them, and not a share of them.
-            beside = floor[first] + smooth[:, first].sum() > 0.0
-            variance[first:last] = np.maximum(rest, 1.0) if beside else rest
-            added[first] = further[0, first] * (last - first)
-            added[first:last] += further[1, first] * basis.slope_share
-            variance[first] += rho * (last - first)
+            rest = np.maximum(basis.variance(neighbour[first]), 1.0)
+            rest *= 1.0 - common[first, None]
+            variance[at] = np.where(beside[first, None], np.maximum(rest, 1.0), rest)
+            variance[first] += common[first] * count
+            added[at] = further[1, first, None] * basis.slope_share
+            added[first] += further[0, first] * count
             if basis.slope:
-                level[first : first + 2] = OFFSET, SLOPE
-                level[first + np.flatnonzero(basis.curves)] = CURVE
+                level[at[:, :2]] = OFFSET, SLOPE
+                level[at[:, basis.curves]] = CURVE
         variance += added
         for own, size in zip((OFFSET, SLOPE, CURVE), smooth, strict=True):
             here = (level == own).astype(float)
             number = np.maximum(self.sums(here), 1.0)
             variance += here * size * (self.count / number)[self.group]
-        places = tuple(np.concatenate([p[k] for p in parts]) for k in (0, 1))
-        rotation = csr_array((np.concatenate([p[2] for p in parts]), places), shape=(n, n))
-        sort = csr_array((np.ones(n), (np.arange(n), self.order)), shape=(n, n))
+        places = tuple(self.order[np.concatenate(p)] for p in (rows, columns))
         return ChannelRows(
-            csr_array(sort.T @ rotation @ sort),
+            csr_array((np.concatenate(values), places), shape=(n, n)),
             self._unsorted(np.sqrt(variance)),
             self._unsorted(level),
             self._unsorted(added),

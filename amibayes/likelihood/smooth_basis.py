@@ -23,11 +23,13 @@ LEAF = (4, 16)
 class SmoothBasis:
     """Orthonormal rows of n channels: an offset, a slope, and details of ever shorter ranges.
 
+    Of many series of channels at once: they differ in their values alone.
+
     Parameters
     ----------
     row, column : (n_entries,) int arrays
         Sorted by row, and by column within one.
-    value : (n_entries,) float array
+    value : (…, n_entries) float array
     depth : (n,) int array
         How often a row's range was halved; −1 of offset, slope and differences of polarisations.
     spectrum : (n,) int array
@@ -62,28 +64,28 @@ class SmoothBasis:
         share[int(self.slope)] = 1.0
         return np.asarray(len(depth) * share)
 
-    def variance(self, phi: float) -> FloatArray:
-        """Variance of the rows where channels, of unit variance, are correlated by φ^|i−j|.
+    def variance(self, phi: FloatArray | float) -> FloatArray:
+        """Variance of the rows, (…, n), where channels are correlated by φ^|i−j|, φ (…).
 
-        Those of different spectra are not.
+        Channels have unit variance. Those of different spectra are not correlated.
         """
-        row, value, n = self.row, self.value, len(self.depth)
-        if phi == 0.0:
-            return np.asarray(np.bincount(row, value**2, minlength=n), dtype=float)
-        # Sum of all channels before, each times φ to the power of its distance, by doubling.
-        run = row * (self.spectrum.max() + 1) + self.spectrum[self.column]
-        before = np.concatenate([[0.0], phi * value[:-1]]) * (np.diff(run, prepend=-1) == 0)
-        step, power = 1, phi
-        longest = int(np.bincount(run).max(initial=1))
-        while step < longest:
-            same = run[step:] == run[:-step]
-            before[step:] += np.where(same, power * before[:-step], 0.0)
-            step, power = 2 * step, power**2
-        return np.asarray(np.bincount(row, value**2 + 2.0 * value * before), dtype=float)
+        row, value, power = self.row, self.value, np.asarray(phi)[..., None]
+        before = np.zeros_like(value)
+        if power.any():
+            # Sum of all channels before, each times φ to the power of its distance, by doubling.
+            run = row * (self.spectrum.max() + 1) + self.spectrum[self.column]
+            before[..., 1:] = power * value[..., :-1] * (np.diff(run) == 0)
+            step, longest = 1, int(np.bincount(run).max(initial=1))
+            while step < longest:
+                same = run[step:] == run[:-step]
+                before[..., step:] += power * before[..., :-step] * same
+                step, power = 2 * step, power**2
+        begins = np.flatnonzero(np.diff(row, prepend=-1))
+        return np.asarray(np.add.reduceat(value * (value + 2.0 * before), begins, axis=-1))
 
 
 def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis:
-    """Rows of which the first is along ``weight`` (n,) and the second a slope of it.
+    """Rows of which the first is along ``weight`` (…, n) and the second a slope of it.
 
     All others see neither: differences within a range of channels that are orthogonal to both,
     those between the halves of these, and so on (multiwavelets: Alpert 1993, SIAM J. Math.
@@ -91,42 +93,49 @@ def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis
 
     Parameters
     ----------
-    weight : (n,) float array
+    weight : (…, n) float array
+        Of any number of series of channels.
     lengths : sequence of int, optional
         Channels of each of the spectra that ``weight`` is made of: offset and slope are common to
         these, and their differences come next.
     """
-    content = np.ascontiguousarray(weight, dtype=float).tobytes()
-    return _smooth_basis(content, tuple(lengths) or (len(weight),))
+    weight = np.ascontiguousarray(weight, dtype=float)
+    n = weight.shape[-1]
+    return _smooth_basis(weight.tobytes(), weight.shape[:-1], tuple(lengths) or (n,))
 
 
-@lru_cache(maxsize=8192)
-def _smooth_basis(content: bytes, lengths: tuple[int, ...]) -> SmoothBasis:
+@lru_cache(maxsize=256)
+def _smooth_basis(content: bytes, series: tuple[int, ...], lengths: tuple[int, ...]) -> SmoothBasis:
     """`smooth_basis`, remembered: it is asked for at every noise that is tried."""
-    weight = np.frombuffer(content)
-    n, longest = len(weight), max(lengths)
+    n, longest = sum(lengths), max(lengths)
+    weight = np.frombuffer(content).reshape(*series, n)
     across = [np.linspace(-1.0, 1.0, k) if k > 1 else np.zeros(1) for k in lengths]
-    wanted = np.column_stack([weight, weight * np.concatenate(across)])[:, : 1 + (longest > 1)]
+    shapes = [weight, weight * np.concatenate(across)]
+    wanted = np.stack(shapes[: 1 + (longest > 1)], axis=-1)
     details: list[tuple[int, int, FloatArray]] = []
     leaf = int(np.clip(longest // 16, *LEAF))
 
     def kept(turned: FloatArray, first: int, depth: int) -> FloatArray:
         """What is wanted of a range; the rest becomes details."""
-        n_wanted = wanted.shape[1]
-        details.extend((depth, first, detail) for detail in turned[:, n_wanted:].T)
-        return turned[:, :n_wanted]
+        n_wanted = wanted.shape[-1]
+        details.extend((depth, first, turned[..., k]) for k in range(n_wanted, turned.shape[-1]))
+        return turned[..., :n_wanted]
 
     def joined(left: FloatArray, right: FloatArray, first: int) -> FloatArray:
         """Basis of what is wanted in two ranges that follow each other from ``first`` on."""
-        middle, cut = first + len(left), left.shape[1]
-        products = left.T @ wanted[first:middle], right.T @ wanted[middle : middle + len(right)]
-        mixed = np.linalg.qr(np.concatenate(products), mode="complete")[0]
-        return np.concatenate([left @ mixed[:cut], right @ mixed[cut:]])
+        middle, cut = first + left.shape[-2], left.shape[-1]
+        last = middle + right.shape[-2]
+        parts = (left, wanted[..., first:middle, :]), (right, wanted[..., middle:last, :])
+        products = np.concatenate([np.swapaxes(q, -1, -2) @ w for q, w in parts], axis=-2)
+        mixed = np.linalg.qr(products, mode="complete")[0]
+        turned = left @ mixed[..., :cut, :], right @ mixed[..., cut:, :]
+        return np.concatenate(turned, axis=-2)
 
     def along(first: int, last: int, depth: int) -> FloatArray:
-        """Basis of what is wanted in a range, (length, 1 or 2)."""
+        """Basis of what is wanted in a range, (…, length, 1 or 2)."""
         if last - first <= leaf:
-            return kept(np.linalg.qr(wanted[first:last], mode="complete")[0], first, depth)
+            turned = np.linalg.qr(wanted[..., first:last, :], mode="complete")[0]
+            return kept(turned, first, depth)
         middle = (first + last) // 2
         halves = along(first, middle, depth + 1), along(middle, last, depth + 1)
         return kept(joined(*halves, first), first, depth)
@@ -135,10 +144,16 @@ def _smooth_basis(content: bytes, lengths: tuple[int, ...]) -> SmoothBasis:
     whole, *others = [along(first, last, 0) for first, last in pairwise(cuts)]
     for other in others:
         whole = kept(joined(whole, other, 0), 0, -1)
-    rows = [(-1, 0, part * np.sign(part @ w)) for part, w in zip(whole.T, wanted.T, strict=False)]
+    whole = whole[..., : min(n, wanted.shape[-1])]
+    sense = np.sign((whole * wanted).sum(axis=-2, keepdims=True))
+    whole = whole * sense
+    rows = [(-1, 0, whole[..., k]) for k in range(whole.shape[-1])]
     rows += sorted(details, key=lambda d: d[:2])
-    length = [len(values) for _, _, values in rows]
-    column = np.concatenate([first + np.arange(len(values)) for _, first, values in rows])
-    value, depth = np.concatenate([v for *_, v in rows]), np.array([d for d, *_ in rows])
+    length = [values.shape[-1] for _, _, values in rows]
+    column = np.concatenate(
+        [first + np.arange(k) for (_, first, _), k in zip(rows, length, strict=True)]
+    )
+    value = np.concatenate([values for *_, values in rows], axis=-1)
+    depth = np.array([d for d, *_ in rows])
     row, spectrum = np.repeat(np.arange(n), length), np.repeat(np.arange(len(lengths)), lengths)
     return SmoothBasis(row, column, value, depth, spectrum, longest > 1)
