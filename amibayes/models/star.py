@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from amibayes.models.limb_darkening import power_law_disc, power_law_slopes
+from amibayes.models.limb_darkening import power_law_disc, power_law_with_slopes
 from amibayes.models.parameters import Parameter
 from amibayes.models.source import Slope, Source
 from amibayes.models.uv_points import UVPoints
@@ -58,9 +58,10 @@ class Star:
         if self.limb_darkening == 0.0:
             wave, by_diameter = uniform_disc(frequency, diameter)
             found = [by_diameter]
+        elif slopes:
+            wave, *found = power_law_with_slopes(frequency, diameter, exponent)
         else:
-            wave = power_law_disc(frequency, diameter, exponent)
-            found = list(power_law_slopes(frequency, diameter, exponent)) if slopes else []
+            wave, found = power_law_disc(frequency, diameter, exponent), []
         free = (self.diameter_mas == "free", self.limb_darkening == "free")
         kept = [Slope(wave=s) for s, wanted in zip(found, free, strict=False) if wanted]
         return Source(1.0, wave.astype(complex), slopes=kept if slopes else ())

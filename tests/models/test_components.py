@@ -14,7 +14,7 @@ from amibayes.data.point_source import point_source
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.companion import Companion
-from amibayes.models.limb_darkening import power_law_disc, power_law_slopes
+from amibayes.models.limb_darkening import power_law_disc, power_law_with_slopes
 from amibayes.models.uv_points import uv_points_of
 from amibayes.scene.disc import uniform_disc
 from amibayes.units import MAS
@@ -47,7 +47,7 @@ def test_power_law_disc_without_darkening_is_uniform() -> None:
     frequency = np.concatenate([[0.0, 1e2, 1e5], np.geomspace(1e6, 1e9, 40)])
     found = power_law_disc(frequency, np.array([2.0]), np.array([0.0]))
     np.testing.assert_allclose(found, uniform_disc(frequency, 2.0)[0], atol=1e-10)
-    by_diameter = power_law_slopes(frequency, np.array([2.0]), np.array([0.0]))[0]
+    by_diameter = power_law_with_slopes(frequency, np.array([2.0]), np.array([0.0]))[1]
     np.testing.assert_allclose(by_diameter, uniform_disc(frequency, 2.0)[1], atol=1e-9)
 
 
@@ -144,7 +144,7 @@ def test_companions_are_smeared_unless_told_otherwise() -> None:
 def test_slopes_of_limb_darkened_discs_are_differences_of_bessel_functions(exponent: float) -> None:
     """Up to the tenth lobe: slopes by Poisson's integral, differences of scipy's J."""
     frequency = np.linspace(0.0, 330.0 / 1.5e-6, 60)
-    by_diameter, by_exponent = power_law_slopes(frequency, 11.0, exponent)
+    _, by_diameter, by_exponent = power_law_with_slopes(frequency, 11.0, exponent)
     step = 1e-4
     for slope, (low, high) in (
         (by_diameter, ((11.0 - step, exponent), (11.0 + step, exponent))),

@@ -21,7 +21,7 @@ from amibayes.models.binary import BinaryModel
 from amibayes.models.brightness import brightness, points
 from amibayes.models.extended import Extended
 from amibayes.models.light_points import light_points
-from amibayes.models.limb_darkening import power_law_disc, power_law_slopes
+from amibayes.models.limb_darkening import power_law_disc, power_law_with_slopes
 from amibayes.models.projection import Projection
 
 TOLERANCE = {"rtol": 0.0, "atol": 1e-6}
@@ -158,7 +158,7 @@ def test_discs_and_projections(num_regression) -> None:
     )
     numbers = numbers_of(
         disc=power_law_disc(frequency, diameter, exponent),
-        slopes=power_law_slopes(frequency, diameter, exponent),
+        slopes=power_law_with_slopes(frequency, diameter, exponent)[1:],
         plane=plane,
         length=plane.length,
         length_slopes=plane.length_slopes(),
