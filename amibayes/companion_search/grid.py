@@ -9,7 +9,7 @@ import numpy as np
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.units import MAS, BoolArray, FloatArray, IntArray
 
-WIDTHS, CACHED = (16, 128), 65536
+WIDTHS, CACHED = (64, 128), 65536
 """Fewest and most positions that are worked on at once, and numbers that fit a processor's cache,
 several times."""
 

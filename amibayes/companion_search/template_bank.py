@@ -43,8 +43,9 @@ from amibayes.likelihood.likelihood import Likelihood
 from amibayes.likelihood.linear_response import common_rows, linear_response, nuisance_directions
 from amibayes.units import FloatArray, IntArray, SingleArray
 
-NUMBERS_KEPT = 12_000_000
-"""Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other."""
+NUMBERS_KEPT, KEPT_SINGLE = 12_000_000, 64_000_000
+"""Numbers of templates that are kept in memory, 96 MB: those of one half plane tell the other. And
+in single precision, 256 MB: many telescopes have large fields, whose templates take a minute."""
 
 
 class TemplateBank:
@@ -212,10 +213,6 @@ class TemplateBank:
                 tail[at, n:] = rate[better]
         return ScanResult(contrast, sigma, gain, tail, n)
 
-    def gains(self, residuals: FloatArray) -> FloatArray:
-        """Largest gain in χ² of whitened residuals (n_data,) everywhere, for positive contrasts."""
-        return self.survey(residuals).gain
-
     def largest_gain(
         self, data: SingleArray, weights: GroupWeights | None = None
     ) -> tuple[FloatArray, IntArray]:
@@ -334,16 +331,16 @@ class TemplateBank:
     @property
     def _coarse_first(self) -> bool:
         """Whether products with the data are most of the work, and templates are kept."""
-        return not self.joint and self.n_rows >= MANY_ROWS and self._fits
+        return not self.joint and self.n_rows >= MANY_ROWS and self._n_numbers <= KEPT_SINGLE
 
     @property
-    def _fits(self) -> bool:
-        """Whether templates of the whole grid are kept."""
-        return len(self) * self.n_rows <= 2 * NUMBERS_KEPT
+    def _n_numbers(self) -> int:
+        """Numbers of the templates of one half plane."""
+        return len(self) // 2 * self.n_rows
 
     def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, MirroredTemplates]]:
         """Yield the same of companions at rest, alike in every band; made once where they fit."""
-        if not self._fits:
+        if self._n_numbers > KEPT_SINGLE:
             yield from self._made()
             return
         if self._kept is None:
@@ -357,7 +354,9 @@ class TemplateBank:
     def _made(self) -> Iterator[tuple[IntArray, FloatArray, MirroredTemplates]]:
         half, still = len(self.grid) // 2, np.zeros((1, 2))
         for index, cosine, sine in self._half_plane():
-            yield np.concatenate([index, index + half]), still, self._mirrored(cosine, sine)
+            templates = self._mirrored(cosine, sine)
+            both = np.concatenate([index, index + half])
+            yield both, still, templates.single() if self._n_numbers > NUMBERS_KEPT else templates
 
     def _at(self, position: FloatArray) -> Templates:
         """Templates of one place at all rates."""

@@ -8,7 +8,7 @@ contrasts of their own there is one template of each band.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -153,8 +153,9 @@ class MirroredTemplates:
 
     Parameters
     ----------
-    even, odd : (n_rows, m) float array
-        Of the data that each part touches; nuisance directions are still in them.
+    even, odd : (n_rows, m) array of floats
+        Of the data that each part touches; nuisance directions are still in them. In single
+        precision where they are very many.
     even_rows, odd_rows : (n_rows,) int array
         Those data.
     norm : (2m,) float array
@@ -165,8 +166,8 @@ class MirroredTemplates:
         Sums of squares over groups of data that were asked for.
     """
 
-    even: FloatArray
-    odd: FloatArray
+    even: NDArray[Any]
+    odd: NDArray[Any]
     even_rows: IntArray
     odd_rows: IntArray
     norm: FloatArray
@@ -191,6 +192,11 @@ class MirroredTemplates:
             along = at_both(basis[rows[0]].T @ even, basis[rows[1]].T @ odd)
             left = both - (along**2).sum(axis=0)
         return cls(even, odd, *rows, floored(left, both), basis)
+
+    def single(self) -> MirroredTemplates:
+        """The same in single precision, in half of the memory."""
+        even, odd = (part.astype(np.float32) for part in (self.even, self.odd))
+        return replace(self, even=even, odd=odd, squares={})
 
     @property
     def sigma(self) -> FloatArray:
