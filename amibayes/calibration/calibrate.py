@@ -150,7 +150,7 @@ def calibrate(
     calibrators : sequence of Observables
     method : {"hierarchical", "weighted", "population"}, optional
         Inverse-variance means; random effects (`amibayes.calibration.hierarchical`), the default
-        where 3 share a baseline; or many that drift (`amibayes.calibration.population`).
+        where 2 share a baseline; or many that drift (`amibayes.calibration.population`).
     clip : float, optional
         Leave out values that differ from the other calibrators' by more standard deviations.
     diameters_mas : sequence of float or (diameter, error), optional
@@ -221,7 +221,7 @@ def _method(
             source=target.source,
             remedy="give more of them, or use the weighted method",
         )
-    return method or ("hierarchical" if together >= 3 else "weighted")
+    return method or ("hierarchical" if together >= 2 else "weighted")
 
 
 def _joined(parts: list[Observables], calibrators: list[Observables]) -> Observables:

@@ -220,18 +220,21 @@ def _in_wider_field(
         return first, []
     capped = [(inner, farthest_searched(likelihood, inner, edge)) for inner, edge in fields]
     fields = [(inner, edge) for inner, edge in dict.fromkeys(capped) if edge >= outer]
-    score = _score(first, options)
+    score, edge = _score(first, options), first.grid.inner_mas if on_inner_edge(first) else 0.0
     for field in fields:
         # With its disc, as the first one has: a point in its place may fit worse than that.
         found = _with_its_disc(likelihood, search(likelihood, field, check=False), options, first)
+        place, gain = found.companion.separation_mas, score - _score(found, options)
+        # The edge alone stopped a fit that is better still inside, by however little.
+        least, why = 0.0, "the best in the default one is on its inner edge"
+        if place >= edge:
+            least, why = SURELY_NOT_NOISE, "none in the default one fits"
         if found.chi2_binary < EXPLAINED * first.chi2_binary or (
-            found.chi2_binary < first.chi2_binary
-            and score - _score(found, options) > SURELY_NOT_NOISE
+            found.chi2_binary < first.chi2_binary and gain > least
         ):
-            place = found.companion.separation_mas
             return found, [
-                f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: none in the default "
-                f"one fits, and a companion at {place:.1f} mas does far better"
+                f"the field was widened to {field[0]:.3g}:{field[1]:.4g} mas: {why}, and a "
+                f"companion at {place:.1f} mas does {'far ' if least else ''}better"
             ]
     return first, []
 

@@ -72,7 +72,7 @@ class SearchOptions:
     closure_covariance : {"assumed", "diagonal"}
         For files that give errors and no correlations.
     calibration : {"hierarchical", "weighted", "population"}, optional
-        By default population with a library, else hierarchical where 3 calibrators or more share
+        By default population with a library, else hierarchical where 2 calibrators or more share
         a baseline.
     library : Path, optional
         Calibrators of other nights that are used beside those that are given

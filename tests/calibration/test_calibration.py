@@ -521,6 +521,26 @@ def test_scatter_is_found_and_the_target_has_it_too(rng: np.random.Generator) ->
     assert weighted.observables.errors[0].mean() < found.observables.errors[0].mean()
 
 
+@pytest.mark.parametrize("tau", [0.0, 3.0])
+def test_two_calibrators_that_scatter_give_the_target_their_scatter(tau: float) -> None:
+    """χ² per datum of stars that are points, whose true errors the instrument here draws.
+
+    That of one star has a standard deviation of 0.24 by its noise and of 0.4 by what 21 and 15
+    differences of two calibrators tell of the scatter: the mean of 15 is known to 0.12. Of the
+    means of two calibrators alone, without the target's own scatter, it is 5.
+    """
+    ratio = []
+    for seed in range(15):
+        instrument = Instrument(np.random.default_rng([seed, 2]), tau=tau)
+        found = calibrate(instrument.star(), [instrument.star() for _ in range(2)])
+        assert found.method == "hierarchical"
+        data = found.observables
+        white = data.covariance.whiten(data.data - np.r_[np.ones(21), np.zeros(35)])
+        ratio.append((white**2).sum() / 36.0)
+    # Without scatter its prior still allows some: errors are then up to a tenth too large.
+    assert (0.7 if tau else 0.6) < np.mean(ratio) < 1.4
+
+
 @pytest.mark.slow
 def test_dependence_on_charge_level(rng: np.random.Generator) -> None:
     """A response that grows with charge, and a target beyond the calibrators."""

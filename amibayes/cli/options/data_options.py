@@ -35,7 +35,7 @@ def add_calibration(group: argparse._ActionsContainer) -> None:
         "--calibration",
         choices=choices(CalibrationMethod),
         help="how calibrators are combined (default: population with --library, else hierarchical "
-        "where 3 or more share a baseline)",
+        "where 2 or more share a baseline)",
     )
     group.add_argument(
         "--library",
