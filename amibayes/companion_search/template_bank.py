@@ -213,6 +213,10 @@ class TemplateBank:
                 tail[at, n:] = rate[better]
         return ScanResult(contrast, sigma, gain, tail, n)
 
+    def gains(self, residuals: FloatArray) -> FloatArray:
+        """Largest gain in χ² of whitened residuals (n_data,) everywhere, for positive contrasts."""
+        return self.survey(residuals).gain
+
     def largest_gain(
         self, data: SingleArray, weights: GroupWeights | None = None
     ) -> tuple[FloatArray, IntArray]:
@@ -340,12 +344,9 @@ class TemplateBank:
 
     def _at_rest(self) -> Iterator[tuple[IntArray, FloatArray, MirroredTemplates]]:
         """Yield the same of companions at rest, alike in every band; made once where they fit."""
-        if self._n_numbers > KEPT_SINGLE:
-            yield from self._made()
-            return
-        if self._kept is None:
+        if self._kept is None and self._n_numbers <= KEPT_SINGLE:
             self._kept = list(self._made())
-        yield from self._kept
+        yield from self._made() if self._kept is None else self._kept
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave to every process to make its own templates."""

@@ -152,7 +152,7 @@ class KnownErrors(ErrorTreatment):
     def field(self, bank: Places, white: FloatArray) -> tuple[FloatArray, float]:
         """Gain everywhere; see `ErrorTreatment`."""
         data = bank.project(white)
-        return bank.survey(data).gain, float(data @ data)
+        return bank.gains(data), float(data @ data)
 
     def contrast_error(self, bank: TemplateBank, places: FloatArray) -> FloatArray:
         """Error of the contrast at places; see `ErrorTreatment`."""
