@@ -103,7 +103,7 @@ def test_joint_fit_is_in_the_result_whatever_the_order_of_files(files, tmp_path,
 
 @pytest.mark.parametrize(
     ("many", "method"),
-    [((2, 2), "weighted"), pytest.param((3, 1), "hierarchical", marks=pytest.mark.slow)],
+    [((2, 2), "hierarchical"), pytest.param((3, 1), "hierarchical", marks=pytest.mark.slow)],
 )
 def test_each_filter_has_its_calibrators(many, method, files, tmp_path) -> None:
     """Files of one name in two folders; a filter's calibrators say nothing of the other's."""
