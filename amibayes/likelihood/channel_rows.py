@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
 from amibayes.data.setup import rows_of_exposures
-from amibayes.likelihood.smooth_basis import smooth_basis
+from amibayes.likelihood.smooth_basis import SmoothBasis, smooth_basis
 from amibayes.units import BoolArray, FloatArray, IntArray
 
 
@@ -103,19 +103,23 @@ class ChannelLayout:
         return self.turned(n, n, np.zeros((2, len(n))), np.zeros((3, len(n))))
 
     @cached_property
-    def _series(self) -> list[tuple[tuple[int, ...], IntArray]]:
-        """Groups of several rows: lengths of their spectra, and where they are, (n_groups, n)."""
+    def _bases(self) -> list[tuple[IntArray, SmoothBasis]]:
+        """Where groups of several rows are, (n_groups, n), and bases of these: groups alike as one.
+
+        Kept, since they are asked for with every share that is tried.
+        """
         spectra = np.flatnonzero(self.starts | (self.gap == APART))
         lengths = np.diff(spectra, append=len(self.order))
         alike: dict[tuple[int, ...], list[int]] = {}
         for _, own in groupby(range(len(spectra)), lambda k: self.group[spectra[k]]):
             parts = list(own)
             alike.setdefault(tuple(lengths[parts].tolist()), []).append(int(spectra[parts[0]]))
-        return [
-            (own, np.array(firsts)[:, None] + np.arange(sum(own)))
+        places = {
+            own: np.array(firsts)[:, None] + np.arange(sum(own))
             for own, firsts in alike.items()
             if sum(own) > 1
-        ]
+        }
+        return [(at, smooth_basis(self.weight[at], own)) for own, at in places.items()]
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Sums of (rank, …) over the groups, (n_groups, …)."""
@@ -155,9 +159,8 @@ class ChannelLayout:
         beside = added + smooth.sum(axis=0) > 0.0
         single = np.flatnonzero(self.count[self.group] == 1)
         rows, columns, values = [single], [single], [np.ones(len(single))]
-        for lengths, at in self._series:
+        for at, basis in self._bases:
             first, count = at[:, 0], at.shape[1]
-            basis = smooth_basis(self.weight[at], lengths)
             rows.append(at[:, basis.row].ravel())
             columns.append(at[:, basis.column].ravel())
             values.append(basis.value.ravel())

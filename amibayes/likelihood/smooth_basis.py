@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -99,16 +98,8 @@ def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis
         Channels of each of the spectra that ``weight`` is made of: offset and slope are common to
         these, and their differences come next.
     """
-    weight = np.ascontiguousarray(weight, dtype=float)
-    n = weight.shape[-1]
-    return _smooth_basis(weight.tobytes(), weight.shape[:-1], tuple(lengths) or (n,))
-
-
-@lru_cache(maxsize=256)
-def _smooth_basis(content: bytes, series: tuple[int, ...], lengths: tuple[int, ...]) -> SmoothBasis:
-    """`smooth_basis`, remembered: it is asked for at every noise that is tried."""
+    lengths = tuple(lengths) or (weight.shape[-1],)
     n, longest = sum(lengths), max(lengths)
-    weight = np.frombuffer(content).reshape(*series, n)
     across = [np.linspace(-1.0, 1.0, k) if k > 1 else np.zeros(1) for k in lengths]
     shapes = [weight, weight * np.concatenate(across)]
     wanted = np.stack(shapes[: 1 + (longest > 1)], axis=-1)
@@ -144,9 +135,7 @@ def _smooth_basis(content: bytes, series: tuple[int, ...], lengths: tuple[int, .
     whole, *others = [along(first, last, 0) for first, last in pairwise(cuts)]
     for other in others:
         whole = kept(joined(whole, other, 0), 0, -1)
-    whole = whole[..., : min(n, wanted.shape[-1])]
-    sense = np.sign((whole * wanted).sum(axis=-2, keepdims=True))
-    whole = whole * sense
+    whole = whole * np.sign((whole * wanted).sum(axis=-2, keepdims=True))
     rows = [(-1, 0, whole[..., k]) for k in range(whole.shape[-1])]
     rows += sorted(details, key=lambda d: d[:2])
     length = [values.shape[-1] for _, _, values in rows]
