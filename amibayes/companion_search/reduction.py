@@ -183,9 +183,12 @@ def _span(columns: FloatArray, least: float) -> tuple[FloatArray, bool]:
     And whether they hold more columns of the kind as well: they are few, or all there are.
     """
     columns = columns[:, (columns != 0.0).any(axis=0)]
-    values, vectors = np.linalg.eigh(columns.T @ columns)
+    tall = len(columns) > columns.shape[1]
+    values, vectors = np.linalg.eigh(columns.T @ columns if tall else columns @ columns.T)
     kept = values > least
     if kept.sum() > WORTH * len(columns):
         return np.eye(len(columns)), True
-    basis = columns @ (vectors[:, kept] / np.sqrt(values[kept]))
+    basis = vectors[:, kept]
+    if tall:
+        basis = columns @ (basis / np.sqrt(values[kept]))
     return np.asarray(basis), bool(kept.sum() <= WORTH * columns.shape[1])
