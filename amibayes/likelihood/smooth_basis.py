@@ -101,16 +101,16 @@ def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis
     lengths = tuple(lengths) or (weight.shape[-1],)
     n, longest = sum(lengths), max(lengths)
     across = [np.linspace(-1.0, 1.0, k) if k > 1 else np.zeros(1) for k in lengths]
-    shapes = [weight, weight * np.concatenate(across)]
-    wanted = np.stack(shapes[: 1 + (longest > 1)], axis=-1)
+    both = [weight, weight * np.concatenate(across)]
+    wanted = np.stack(both[: 1 + (longest > 1)], axis=-1)
     details: list[tuple[int, int, FloatArray]] = []
     leaf = int(np.clip(longest // 16, *LEAF))
 
     def kept(turned: FloatArray, first: int, depth: int) -> FloatArray:
         """What is wanted of a range; the rest becomes details."""
-        n_wanted = wanted.shape[-1]
-        details.extend((depth, first, turned[..., k]) for k in range(n_wanted, turned.shape[-1]))
-        return turned[..., :n_wanted]
+        n = wanted.shape[-1]
+        details.extend((depth, first, turned[..., k]) for k in range(n, turned.shape[-1]))
+        return turned[..., :n]
 
     def joined(left: FloatArray, right: FloatArray, first: int) -> FloatArray:
         """Basis of what is wanted in two ranges that follow each other from ``first`` on."""
@@ -139,10 +139,7 @@ def smooth_basis(weight: FloatArray, lengths: Sequence[int] = ()) -> SmoothBasis
     rows = [(-1, 0, whole[..., k]) for k in range(whole.shape[-1])]
     rows += sorted(details, key=lambda d: d[:2])
     length = [values.shape[-1] for _, _, values in rows]
-    column = np.concatenate(
-        [first + np.arange(k) for (_, first, _), k in zip(rows, length, strict=True)]
-    )
-    value = np.concatenate([values for *_, values in rows], axis=-1)
-    depth = np.array([d for d, *_ in rows])
+    column = np.concatenate([first + np.arange(v.shape[-1]) for _, first, v in rows])
+    value, depth = np.concatenate([v for *_, v in rows], -1), np.array([d for d, *_ in rows])
     row, spectrum = np.repeat(np.arange(n), length), np.repeat(np.arange(len(lengths)), lengths)
     return SmoothBasis(row, column, value, depth, spectrum, longest > 1)
