@@ -231,7 +231,8 @@ class MirroredTemplates:
     def match(self, data: DataRows) -> Match:
         """Products with data sets."""
         kind = data.even.dtype
-        product = at_both(data.even @ self.even.astype(kind), data.odd @ self.odd.astype(kind))
+        even, odd = (part.astype(kind, copy=False) for part in (self.even, self.odd))
+        product = at_both(data.even @ even, data.odd @ odd)
         product *= self.sigma[0].astype(kind)
         return [product]
 

@@ -100,19 +100,18 @@ def _series(z: FloatArray, order: FloatArray, *, slopes: bool) -> FloatArray:
     while size > LAST_TERM:
         last += 1
         size *= largest / last**2
-    k = np.arange(1.0, last + 1.0).reshape(-1, *(1,) * order.ndim)
-    terms = [1.0 / np.cumprod(k * (order + k), axis=0)]
+    shape = np.broadcast_shapes(z.shape, order.shape)
+    k = np.arange(1.0, last + 1.0).reshape(-1, *(1,) * len(shape))
+    factors = [1.0 / np.cumprod(k * (order + k), axis=0)]
     if slopes:
-        terms += [terms[0] * (order + 1.0) / (order + 1.0 + k)]
-        terms += [-terms[0] * np.cumsum(1.0 / (order + k), axis=0)]
-    first = np.ones((len(terms), *np.broadcast_shapes(z.shape, order.shape)))
+        factors += [factors[0] * (order + 1.0) / (order + 1.0 + k)]
+        factors += [-factors[0] * np.cumsum(1.0 / (order + k), axis=0)]
+    first = np.ones((len(factors), *shape))
     first[2:] = 0.0
     # From the last term on.
-    factors = np.array(terms).reshape(
-        len(terms), last, *(1,) * (first.ndim - 1 - order.ndim), *order.shape
-    )
+    terms = np.array(factors)
     out = np.zeros_like(first)
     for n in range(last - 1, -1, -1):
-        out += factors[:, n]
+        out += terms[:, n]
         out *= square
     return first + out
