@@ -37,8 +37,9 @@ BRIGHT = 0.03
 UNLIKELY = 0.01
 """Probability below which a difference between calibrators is mentioned."""
 
-FAR_TOO_SMALL = 1e-6
-"""Probability of a χ² as small, below which the errors are far too large."""
+FAR_TOO_SMALL, MEASURABLE = 1e-6, 0.01
+"""Probability of a χ² as small, below which the errors are too large, and least reduced χ² that
+tells by how much."""
 
 
 def calibration_warnings(calibration: Calibration | None) -> list[str]:
@@ -174,7 +175,7 @@ def _of_covariance(result: SearchResult) -> list[str]:
 
 
 def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
-    """Warn where the errors are so large that CANDID's nσ has lost its meaning."""
+    """Warn where the errors are larger than residuals allow, and say how many times."""
     if chi2.cdf(result.chi2_binary, result.ndof) > FAR_TOO_SMALL:
         return []
     of, size, dof = "", result.chi2_binary, float(result.ndof)
@@ -188,9 +189,10 @@ def _of_errors(result: SearchResult, noise: ExtraNoise) -> list[str]:
         which = f"the errors{of}, with the noise that was added,"
     if noise.floors:
         which = f"the errors{of}, with the calibration errors of the instrument,"
+    times = f"about {np.sqrt(dof / size):.2g}" if size > MEASURABLE * dof else "far more than ten"
     return [
-        f"{which} are far too large: chi2 is {size:.0f} for {dof:.0f} degrees of freedom with the "
-        "companion; CANDID's n_sigma, a ratio of two chi2, means nothing"
+        f"{which} are {times} times too large: chi2 is {size:.0f} for {dof:.0f} degrees of freedom "
+        "with the companion"
     ]
 
 

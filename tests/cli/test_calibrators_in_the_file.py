@@ -127,7 +127,7 @@ def test_what_is_refused(
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("sized", [False, True])
+@pytest.mark.parametrize("sized", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_calibrate_warns_of_calibrators_taken_for_points(
     night: Path, tmp_path: Path, sized: bool, capsys: pytest.CaptureFixture[str], monkeypatch
 ) -> None:

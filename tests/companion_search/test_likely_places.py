@@ -50,7 +50,14 @@ def test_without_vis2_nothing_is_left_out() -> None:
     assert likely_places(likelihood, make_grid(2.0, 8.0, 0.4), np.array([1.0])) is None
 
 
-@pytest.mark.parametrize(("name", "seed"), [("mirc6t", 5000), ("pionier", 5003), ("mirc6t", 5010)])
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("pionier", 5003),
+        pytest.param("mirc6t", 5000, marks=pytest.mark.slow),
+        pytest.param("mirc6t", 5010, marks=pytest.mark.slow),
+    ],
+)
 def test_a_bright_companion_in_a_wide_field_is_found_all_the_same(
     name: str, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

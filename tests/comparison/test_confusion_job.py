@@ -17,6 +17,7 @@ from amibayes.parallel import Journal, open_executor
 from amibayes.posterior.priors import Prior
 
 
+@pytest.mark.slow
 def test_confusion_does_not_depend_on_workers_or_interruptions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

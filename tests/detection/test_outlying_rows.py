@@ -52,7 +52,7 @@ def spoilt(data: Observables, kind: str, entry: int) -> Observables:
     return replace(data, **{name: replace(table, value=value)})
 
 
-@pytest.mark.parametrize("kind", ["vis2", "cp"])
+@pytest.mark.parametrize("kind", ["vis2", pytest.param("cp", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_spoilt_row_is_left_out_and_the_companion_found(kind: str, seed: int) -> None:
     """The row alone, and the binary as it is found without it; all data where asked for."""

@@ -87,5 +87,8 @@ def test_errors_that_are_far_too_large_are_those_of_one_kind(large: str, rng) ->
         expected = dof / (16.0 if kind == large else 1.0)
         assert dof == pytest.approx(n[kind], rel=0.02)
         assert chi2 == pytest.approx(expected, abs=5.0 * expected * np.sqrt(2.0 / dof))
-    said = [w for w in search_warnings(data, result, ExtraNoise(), None, None) if "far too" in w]
+    said = [w for w in search_warnings(data, result, ExtraNoise(), None, None) if " too large" in w]
     assert [f"errors of {kind}" in said[0] for kind in kinds] == [kind == large for kind in kinds]
+    times = float(said[0].split(" times too large")[0].split()[-1])
+    # 192 V² or 96 independent closure phases tell it to a fourteenth; five times that.
+    assert times == pytest.approx(4.0, rel=0.35)

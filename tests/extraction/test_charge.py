@@ -131,6 +131,7 @@ def test_calibrate_and_vet_print_what_was_taken_out(
     assert "not taken out" in line
 
 
+@pytest.mark.slow
 def test_limits_of_ramps_tell_and_show_it(visit: Path, tmp_path: Path) -> None:
     given = files(visit, "ramp.fits")
     fast = ("--criterion", "absil", "--null-draws", 0, "--separations", 3, "--out", tmp_path / "l")

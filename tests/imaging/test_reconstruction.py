@@ -225,7 +225,7 @@ def test_entropy_is_least_and_zero_at_its_default_image(flux: float | None) -> N
     assert all(value(light * prior * rng.uniform(0.5, 1.5, 49))[0] > 0.0 for _ in range(5))
 
 
-@pytest.mark.parametrize("regulariser", ["tv", "entropy"])
+@pytest.mark.parametrize("regulariser", ["tv", pytest.param("entropy", marks=pytest.mark.slow)])
 def test_light_at_the_brightest_place_is_the_companions(regulariser: str) -> None:
     """That of the whole image is more: noise adds light, and pixels are nowhere negative."""
     east, north, contrast = 173.2, -100.0, 0.01

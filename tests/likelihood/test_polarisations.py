@@ -133,6 +133,7 @@ def test_names_without_polarisation(name, expected) -> None:
     assert without_polarisation(name) == expected
 
 
+@pytest.mark.slow
 def test_two_polarisations_tell_no_more_than_their_average_where_they_err_alike() -> None:
     """Four binaries: errors as of averages (1.4 times smaller before), and 12 pulls of 1 or less.
 

@@ -89,6 +89,7 @@ def test_the_search_itself_reports_what_recovery_says(separation: float, n: int)
     assert alike >= n * expected - 4.5 * np.sqrt(n * expected * (1.0 - expected))
 
 
+@pytest.mark.slow
 def test_noise_does_not_move_a_companion_to_an_alias_farther_out() -> None:
     """Companions, noise and all, in the whole field: the limits count them as found at their place.
 

@@ -503,7 +503,9 @@ def test_public_files(data: Path) -> None:
         audit(data / "oifits" / "corrupted" / "truncated.fits")
 
 
-@pytest.mark.parametrize("spoilt", ["absent", "words", "wide"])
+@pytest.mark.parametrize(
+    "spoilt", ["absent", "words", pytest.param("wide", marks=pytest.mark.slow)]
+)
 def test_any_column_may_be_anything(spoilt: str, tmp_path: Path) -> None:
     """Whichever column it is, the audit ends, with the column named or the file refused."""
     whole = HandMade(np.random.default_rng(1)).tables

@@ -144,6 +144,7 @@ def test_a_faint_companion_nearer_than_the_default_field_is_not_put_on_its_edge(
     assert np.abs(off).max() < 3.0
 
 
+@pytest.mark.slow
 def test_a_bright_disc_outside_the_default_field_is_found(rng) -> None:
     """A point outside fits worse than a disc inside: both are compared with their discs."""
     stations = np.array([[0.0, 0.0], [125.0, 306.0], [-176.0, 216.0], [-69.0, 200.0]])
@@ -216,6 +217,7 @@ def test_a_mask_has_no_disc_of_the_star_in_its_closure_phases(rng) -> None:
     assert "diameter_mas" not in result.likelihood.parameters.names
 
 
+@pytest.mark.slow
 def test_a_field_that_is_widened_is_none_that_is_refused(rng, monkeypatch) -> None:
     """A motion is tried at many rates: of three nights of a month the wider field was too large."""
     monkeypatch.setattr("amibayes.companion_search.search.MAX_POSITIONS", 300_000)
@@ -236,7 +238,10 @@ def test_a_field_that_is_widened_is_none_that_is_refused(rng, monkeypatch) -> No
     np.testing.assert_allclose(rates, [54.8, 36.5], atol=5.0)
 
 
-@pytest.mark.parametrize(("most", "said"), [(625_000, "widened to"), (310_000, "not widened")])
+@pytest.mark.parametrize(
+    ("most", "said"),
+    [(625_000, "widened to"), pytest.param(310_000, "not widened", marks=pytest.mark.slow)],
+)
 def test_a_wide_companion_at_rest_is_no_reason_to_refuse_a_motion(
     most, said, rng, monkeypatch
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from epochs import epoch, noisy
 
 from amibayes.data.observables import join
@@ -36,6 +37,7 @@ def stated(contrast: float) -> Verdict:
     return verdict_on([(*place, contrast) for place in PLACES], 100.0, rng)
 
 
+@pytest.mark.slow
 def test_a_companion_that_moves_is_not_denied() -> None:
     """All nights together show nothing that is unlikely for noise; each has a clear companion."""
     said = stated(0.02)

@@ -257,6 +257,7 @@ def of_a_drifting_night(
     return replace(data.with_data(value), setups=setups)
 
 
+@pytest.mark.slow
 def test_a_night_that_drifts_takes_no_calibrator_along(rng) -> None:
     """Points that differ by the drift, less than the instrument's calibration errors, are kept.
 
@@ -275,7 +276,13 @@ def test_a_night_that_drifts_takes_no_calibrator_along(rng) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["alphacen_pionier_1", "canopus_matisse", "arcturus_iota", "alphacol_amber"]
+    "name",
+    [
+        "canopus_matisse",
+        "arcturus_iota",
+        "alphacen_pionier_1",
+        pytest.param("alphacol_amber", marks=pytest.mark.slow),
+    ],
 )
 def test_resolved_single_stars_have_no_companion(name: str, data: Path) -> None:
     """α Cen A had one of 6.6 mag, Canopus of 2.3, Arcturus and α Col of 0.0: `search` has none."""

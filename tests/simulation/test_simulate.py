@@ -423,7 +423,7 @@ def scene_of(folder: Path, n_integrations: int) -> str:
     return write(folder, text, f"n{n_integrations}.toml")
 
 
-@pytest.mark.parametrize("option", [(), ("--ramps",)])
+@pytest.mark.parametrize("option", [(), pytest.param(("--ramps",), marks=pytest.mark.slow)])
 def test_memory_does_not_grow_with_the_exposure(option: tuple[str, ...], tmp_path: Path) -> None:
     short, long = peak_memory_mb(tmp_path, 100, 800, options=option)
     assert long < 300.0
