@@ -226,7 +226,8 @@ def _term(
         added = csr_array(fitted.covariance.sparse - part.covariance.sparse)
         whitening, share, log_det = _about(covariance, added, extra)
     else:
-        whitening, share = _together(part.covariance, extra)
+        together, share = _together(part.covariance, extra)
+        whitening = (together,)
         log_det = part.covariance.logdet()
     columns = np.flatnonzero(which)
     place = csr_array(
@@ -235,7 +236,7 @@ def _term(
     )
     return NoiseTerm(
         kind,
-        csr_array(whitening @ place),
+        (*whitening[:-1], csr_array(whitening[-1] @ place)),
         share,
         typical,
         log_det,
@@ -254,8 +255,8 @@ def _together(covariance: Covariance, extra: csr_array) -> tuple[csr_array, Floa
 
 def _about(
     covariance: ChannelCovariance, added: csr_array, extra: csr_array
-) -> tuple[csr_array, FloatArray, float]:
-    """The same where channels share some of the noise, and ln of the determinant.
+) -> tuple[tuple[csr_array, ...], FloatArray, float]:
+    """The same, in factors, where channels share some of the noise, and ln of the determinant.
 
     ``covariance`` has the noise ``added`` that was fitted. Channels share as much of the extra
     noise as of the errors, and which combinations of them err independently goes with its amount:
@@ -269,7 +270,8 @@ def _about(
         return np.asarray(rows.growing * (rows.rotation.power(2) @ channels))
 
     stated = 1.0 - of_rows(added)
-    whitening = csr_array(diags_array(1.0 / np.sqrt(stated)) @ covariance.whitening)
+    first, *rest = covariance.factors
+    whitening = csr_array(diags_array(1.0 / np.sqrt(stated)) @ first), *rest
     return whitening, of_rows(extra) / stated, covariance.logdet() + float(np.log(stated).sum())
 
 

@@ -101,6 +101,13 @@ def share_of(shares: Sequence[ChannelShare], source: str) -> ChannelShare:
     return by_file.get(source) or by_file.get("") or ChannelShare()
 
 
+def multiplied(factors: Sequence[csr_array], x: FloatArray) -> FloatArray:
+    """Multiply x (n, …) by sparse factors, the last one first."""
+    for factor in reversed(factors):
+        x = factor @ x
+    return np.asarray(x)
+
+
 class ChannelCovariance:
     """A covariance with correlations between the channels of each exposure.
 
@@ -136,8 +143,17 @@ class ChannelCovariance:
         return csr_array(self._turn @ self.base.whitening)
 
     @cached_property
-    def _unwhitening(self) -> csr_array:
-        return csr_array(self.whitening.T)
+    def factors(self) -> tuple[csr_array, ...]:
+        """Sparse matrices whose product is the whitening, the first applied last.
+
+        Two where they hold fewer numbers than their product: that mixes the triangles of every
+        channel with those of all others.
+        """
+        base = self.base.whitening
+        product = int(np.diff(base.indptr)[self._turn.indices].sum())
+        if self._turn.nnz + base.nnz < product:
+            return self._turn, base
+        return (self.whitening,)
 
     @cached_property
     def _colouring(self) -> Any:
@@ -153,11 +169,15 @@ class ChannelCovariance:
         """Independent, unit-variance combinations, (rank, …)."""
         if self.base.has_large_blocks:
             return np.asarray(self._turn @ self.base.whiten(x))
-        return np.asarray(self.whitening @ x)
+        return multiplied(self.factors, x)
 
     def solve(self, x: FloatArray) -> FloatArray:
         """(Pseudo-)inverse of the covariance times x, (size, …)."""
-        return np.asarray(self._unwhitening @ (self.whitening @ x))
+        return multiplied(self._unwhitening, multiplied(self.factors, x))
+
+    @cached_property
+    def _unwhitening(self) -> tuple[csr_array, ...]:
+        return tuple(csr_array(factor.T) for factor in reversed(self.factors))
 
     def logdet(self) -> float:
         """Logarithm of the determinant of the covariance of the independent combinations."""

@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
 from amibayes.data.observables import Observables
+from amibayes.likelihood.channel_noise import multiplied
 from amibayes.likelihood.chi2 import deviance, log_peak
 from amibayes.likelihood.extra_noise import BOUND
 from amibayes.units import BoolArray, FloatArray
@@ -36,8 +37,9 @@ class NoiseTerm:
     ----------
     kind : {"vis2", "closure_phase_rad", "vis2 and closure phase"}
         The last where the file correlates both: then they share the relative amount.
-    whitening : (rank, n_data) sparse array
-        Of the whole data vector; also makes the extra noise's covariance diagonal.
+    whitening : tuple of sparse array
+        Factors of the matrix (rank, n_data) that whitens the whole data vector, the first applied
+        last; it also makes the extra noise's covariance diagonal.
     share : (rank,) float array
         Variance of the extra noise of one typical error, in whitened units.
     typical : dict
@@ -59,7 +61,7 @@ class NoiseTerm:
     """
 
     kind: str
-    whitening: csr_array
+    whitening: tuple[csr_array, ...]
     share: FloatArray
     typical: dict[str, float]
     log_det: float
@@ -77,7 +79,7 @@ class NoiseTerm:
 
     def white(self, difference: FloatArray) -> FloatArray:
         """Whitened data minus model (rank, n) of those that are not, (n_data, n)."""
-        return np.asarray(self.whitening @ difference)
+        return multiplied(self.whitening, difference)
 
     def log_likelihoods(self, difference: FloatArray, node: FloatArray) -> FloatArray:
         """ln L (n_nodes, n) of data minus model (n_data, n) for amounts of noise (n_nodes,)."""

@@ -302,7 +302,7 @@ def student_terms(
             used = abs(rows).sum(axis=0) > 0.0
             log_det = covariance.select(np.flatnonzero(which)).logdet()
             term = StudentTerm(
-                kind, covariance.whitening[used], share, typical, log_det,
+                kind, (covariance.whitening[used],), share, typical, log_det,
                 source=source, rows=rows[:, used],
             )  # fmt: skip
             terms.append(term)

@@ -133,7 +133,8 @@ class Unnoticed:
         self.parameters = likelihood.parameters
         values, vectors = np.linalg.eigh(alone.covariance)
         self.star = HeavyTailed(alone.mean, vectors * np.sqrt(np.clip(values, 1e-20, None)))
-        single = single_likelihood(likelihood)
+        self._some = _of_some_data(likelihood)
+        single = single_likelihood(self._some)
         self._step = np.linalg.pinv(single.jacobian(alone.mean)) if len(alone.mean) else None
         self._without = single.residuals(alone.mean)
 
@@ -160,8 +161,23 @@ class Unnoticed:
         if self._step is None:
             return theta[:, self.parameters.nuisance]
         theta[:, self.parameters.nuisance] = self.star.centre
-        found = [self.likelihood.residuals(part) for part in self.likelihood.in_parts(theta)]
+        found = [self._some.residuals(part) for part in self._some.in_parts(theta)]
         return np.asarray((self._step @ (np.hstack(found) - self._without)).T)
+
+
+SOME_DATA = 1000
+"""Data that tell how companions move the star: whatever is found, the density is that of the draws,
+and this step of them all costs as much as the likelihood."""
+
+
+def _of_some_data(likelihood: Likelihood) -> Likelihood:
+    """The likelihood of `SOME_DATA` of the data with their stated errors, if there are more."""
+    data = likelihood.observables.unflagged()
+    n = data.n_vis2 + data.n_closure_phases
+    if n <= SOME_DATA:
+        return likelihood
+    kept = np.random.default_rng(0).permutation(n) < SOME_DATA
+    return Likelihood(data.select(kept[: data.n_vis2], kept[data.n_vis2 :]), likelihood.model)
 
 
 @dataclass(frozen=True, eq=False)

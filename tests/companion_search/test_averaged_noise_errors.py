@@ -35,5 +35,5 @@ def test_they_stay_where_no_further_noise_is_needed(diameter_mas: float) -> None
     noise = averaged.likelihood.noise
     drawn = noise.draw(2000, np.random.default_rng(4))
     for term in noise.terms:
-        size = ((term.whitening @ drawn) ** 2).sum(axis=0).mean() / term.n_independent
+        size = (term.white(drawn) ** 2).sum(axis=0).mean() / term.n_independent
         assert abs(size - 1.0) < 0.04, term.kind

@@ -328,7 +328,7 @@ def test_the_averaged_noise_has_the_errors_that_data_are_simulated_with() -> Non
     noise = found.models[0].fit.model.likelihood.noise
     drawn = noise.draw(2000, np.random.default_rng(4))
     for term in noise.terms:
-        size = ((term.whitening @ drawn) ** 2).sum(axis=0).mean() / term.n_independent
+        size = (term.white(drawn) ** 2).sum(axis=0).mean() / term.n_independent
         assert 0.5 < size < 2.0
 
 

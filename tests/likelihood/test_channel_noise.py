@@ -76,6 +76,12 @@ def test_covariance_is_the_stated_matrix(covariance, rng) -> None:
     np.testing.assert_allclose(found.variance, np.diag(expected), rtol=1e-9)
     white = found.whitening.toarray()
     np.testing.assert_allclose(white @ expected @ white.T, np.eye(found.rank), atol=1e-9)
+    # Triangles of a channel are mixed first, and then the channels: a third of the numbers.
+    assert len(found.factors) == (2 if covariance == "assumed" else 1)
+    np.testing.assert_allclose(found.whiten(np.eye(found.size)), white, atol=1e-9)
+    np.testing.assert_allclose(
+        found.solve(np.eye(found.size)), white.T @ white, rtol=1e-9, atol=1e-6
+    )
     draws = found.draw(rng, 4000)
     assert np.abs((found.whiten(draws) ** 2).mean(axis=1) - 1.0).max() < 5 * np.sqrt(2 / 4000)
     values = np.linalg.eigvalsh(expected)
