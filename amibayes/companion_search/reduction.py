@@ -87,7 +87,7 @@ class Reduction:
             found.append(np.column_stack([product, basis[here].T @ offset[at]]))
         matrix = np.concatenate(found)
         touched = np.flatnonzero(np.abs(matrix).max(axis=1) > 0.0)
-        return Part(np.ascontiguousarray(matrix[touched, :-1]), touched), matrix[touched, -1]
+        return Part((np.ascontiguousarray(matrix[touched, :-1]),), touched), matrix[touched, -1]
 
     def normals(self, n: int, rng: np.random.Generator) -> FloatArray:
         """What data sets of unit normal deviates are, (n_rows, n)."""

@@ -146,8 +146,8 @@ class TemplateBank:
         def templates(index: IntArray) -> FloatArray:
             cosine, sine = self._fringes.at(east[index], north[index])
             out = np.zeros((2, self.n_data, len(index)))
-            out[0, self._even.rows] = self._even.matrix @ cosine - self._offset[:, None]
-            out[1, self._odd.rows] = self._odd.matrix @ sine
+            out[0, self._even.rows] = self._even.times(cosine) - self._offset[:, None]
+            out[1, self._odd.rows] = self._odd.times(sine)
             return np.hstack(list(out))
 
         found = reduction_of(templates, half, self.nuisance_basis, label)
@@ -382,8 +382,8 @@ class TemplateBank:
 
     def _mirrored(self, cosine: FloatArray, sine: FloatArray) -> MirroredTemplates:
         """Templates of one contrast at places and at their mirror images."""
-        even = self._even.matrix @ cosine - self._offset[:, None]
-        odd = self._odd.matrix @ sine
+        even = self._even.times(cosine) - self._offset[:, None]
+        odd = self._odd.times(sine)
         rows = self._even.rows, self._odd.rows
         return MirroredTemplates.of(even, odd, rows, self._shared, self.nuisance_basis)
 
@@ -393,8 +393,8 @@ class TemplateBank:
         out = np.zeros((len(self._bands), self.n_rows, len(signs) * cosine.shape[1]))
         change = cosine - self._primary[:, None]
         for template, here in zip(out, self._bands, strict=True):
-            even = self._even.matrix @ np.where(here, change, 0.0)
-            odd = self._odd.matrix @ np.where(here, sine, 0.0)
+            even = self._even.times(np.where(here, change, 0.0))
+            odd = self._odd.times(np.where(here, sine, 0.0))
             template[self._even.rows] = np.tile(even, len(signs))
             template[self._odd.rows] += np.hstack([sign * odd for sign in signs])
         return BandTemplates.beside(out, self.nuisance_basis)

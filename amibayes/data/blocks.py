@@ -222,12 +222,12 @@ class BlockCovariance:
         everywhere = np.concatenate([np.empty(0, np.intp), *(s.index.ravel() for s in self.stacks)])
         if len(everywhere) != size or not np.array_equal(np.sort(everywhere), np.arange(size)):
             raise ValueError("the blocks of a covariance have to tile the data vector")
-        factors = [stack.factors() for stack in self.stacks]
-        self.whitening, colouring, self._logdet = self._assemble(factors)
-        self._full = [white if white.shape[2] >= LARGE else None for white, _ in factors]
+        each = [stack.factors() for stack in self.stacks]
+        self.whitening, colouring, self._logdet = self._assemble(each)
+        self._full = [white if white.shape[2] >= LARGE else None for white, _ in each]
         self.colouring = csr_array(colouring.T)
         self._unwhitening = self.whitening.T.tocsr()
-        self.rank = int(self.whitening.shape[0])
+        self.factors, self.rank = (self.whitening,), int(self.whitening.shape[0])
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:

@@ -42,6 +42,11 @@ class Covariance(Protocol):
         """The sparse matrix W, (rank, size), with W C Wᵀ = 1."""
         ...
 
+    @property
+    def factors(self) -> tuple[csr_array, ...]:
+        """Sparse matrices whose product is the whitening, the first applied last."""
+        ...
+
     def whiten(self, x: FloatArray) -> FloatArray:
         """Independent, unit-variance combinations, (rank, …), of data (size, …)."""
         ...
@@ -74,6 +79,13 @@ class Covariance(Protocol):
     def select(self, keep: IntArray) -> Covariance:
         """Covariance of the entries ``keep``, in that order."""
         ...
+
+
+def multiplied(factors: Sequence[csr_array | FloatArray], x: FloatArray) -> FloatArray:
+    """Multiply x (n, …) by matrices, the last one first."""
+    for factor in reversed(factors):
+        x = factor @ x
+    return np.asarray(x)
 
 
 def diagonal_covariance(variance: FloatArray) -> BlockCovariance:

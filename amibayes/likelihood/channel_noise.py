@@ -30,7 +30,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
 from amibayes.data.blocks import Block, BlockCovariance, orthonormal
-from amibayes.data.covariance import Covariance
+from amibayes.data.covariance import Covariance, multiplied
 from amibayes.data.observables import Observables
 from amibayes.data.systematics import Systematics
 from amibayes.likelihood.channel_rows import APART, ChannelLayout, ChannelRows, channel_layout
@@ -99,13 +99,6 @@ def share_of(shares: Sequence[ChannelShare], source: str) -> ChannelShare:
     """The correlations of one file: its own, or those of all."""
     by_file = {s.source: s for s in shares}
     return by_file.get(source) or by_file.get("") or ChannelShare()
-
-
-def multiplied(factors: Sequence[csr_array], x: FloatArray) -> FloatArray:
-    """Multiply x (n, …) by sparse factors, the last one first."""
-    for factor in reversed(factors):
-        x = factor @ x
-    return np.asarray(x)
 
 
 class ChannelCovariance:

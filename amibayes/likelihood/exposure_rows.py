@@ -149,16 +149,20 @@ def _names(data: Observables, which: IntArray) -> list[tuple[object, ...]]:
     """
     n, closure = data.n_vis2, data.closure_phase
     together = data.covariance_kind == "assumed"
-    of_set = np.empty(len(closure), dtype=np.intp)
-    for k, entries in enumerate(closure.sets if together else ()):
-        of_set[entries] = k
+    of_set, numbers = (
+        np.empty(len(closure), dtype=np.intp),
+        dict[frozenset[tuple[object, ...]], int](),
+    )
+    for entries in closure.sets if together else ():
+        # A number for its triangles, which are hundreds where holes are many.
+        triangles = frozenset(_named(data, closure, i) for i in entries.tolist())
+        of_set[entries] = numbers.setdefault(triangles, len(numbers))
 
     def name(k: int) -> tuple[object, ...]:
         if k < n:
             return _named(data, data.vis2, k)
         if together:
-            entries = closure.sets[of_set[k - n]]
-            return tuple(sorted({_named(data, closure, i) for i in entries.tolist()}))
+            return (int(of_set[k - n]),)
         sign = canonical(closure.stations[k - n : k - n + 1])[1]
         return (*_named(data, closure, k - n), int(sign[0]))
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from operator import matmul
 
 import numpy as np
 from scipy.sparse import csr_array
 
+from amibayes.data.covariance import multiplied
 from amibayes.likelihood.likelihood import SMALL_DISC, Likelihood
 from amibayes.models.companion import point_visibility
 from amibayes.units import MAS, ComplexArray, FloatArray, IntArray
@@ -24,19 +28,56 @@ UNSEEN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A matrix (n_rows, n_samples) and the data that its rows stand for."""
+    """A matrix (n_rows, n_samples) and the data that its rows stand for.
 
-    matrix: csr_array | FloatArray
+    Parameters
+    ----------
+    factors : tuple of array
+        Their product is the matrix, the first applied last.
+    rows : (n_rows,) int array
+    """
+
+    factors: tuple[csr_array | FloatArray, ...]
     rows: IntArray
 
+    @cached_property
+    def matrix(self) -> csr_array | FloatArray:
+        """The product of the factors."""
+        return reduce(matmul, self.factors)
 
-def _part(matrix: csr_array) -> Part:
+    def times(self, x: FloatArray) -> FloatArray:
+        """Multiply x (n_samples, …) by the matrix."""
+        return multiplied(self.factors, x)
+
+
+def _part(turn: Sequence[csr_array], matrix: csr_array) -> Part:
+    """Keep what is not zero of a matrix, whose rows may be turned by another one.
+
+    Both stay as they are where a product with each of them takes less time than one with both.
+    """
     matrix = csr_array(matrix)
     matrix.eliminate_zeros()
     rows = np.flatnonzero(np.diff(matrix.indptr))
     kept = matrix[rows]
-    dense = kept.nnz > DENSE_ENOUGH * kept.shape[0] * kept.shape[1]
-    return Part(kept.toarray() if dense else kept, rows)
+    if not turn:
+        return Part((_fast(kept),), rows)
+    turned = csr_array(turn[0][:, rows])
+    rows = np.flatnonzero(np.diff(turned.indptr))
+    turned = turned[rows]
+    product = csr_array(turned @ kept)
+    if _work(turned) + _work(kept) < _work(product):
+        return Part((_fast(turned), _fast(kept)), rows)
+    return Part((_fast(product),), rows)
+
+
+def _work(matrix: csr_array) -> float:
+    """Time of a product, in that of one number of a sparse matrix."""
+    return min(float(matrix.nnz), DENSE_ENOUGH * float(np.prod(matrix.shape)))
+
+
+def _fast(matrix: csr_array) -> csr_array | FloatArray:
+    """The same, dense where that is the faster one."""
+    return matrix.toarray() if _work(matrix) < matrix.nnz else matrix
 
 
 def common_rows(even: Part, odd: Part) -> tuple[IntArray, IntArray]:
@@ -75,7 +116,7 @@ def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> WhitenedRes
     """Make the response of the whitened data to a faint companion."""
     response = likelihood.model.linear_response(likelihood.samples, nuisance)
     star, across, scale = response.star, response.across, response.scale
-    whitening = likelihood.noise.covariance.whitening
+    *turn, whitening = likelihood.noise.covariance.factors
     n2 = likelihood.samples.squares.shape[0]
     by_vis2, by_closure = whitening[:, :n2], whitening[:, n2:]
     squares, legs = likelihood.samples.squares, likelihood.samples.legs
@@ -85,11 +126,11 @@ def linear_response(likelihood: Likelihood, nuisance: FloatArray) -> WhitenedRes
     if across.any():
         along = along - by_closure @ legs.multiply(scale * (across / size2))
         turned = turned - by_vis2 @ squares.multiply(2.0 * scale * across)
-    even, odd = _part(along), _part(turned)
+    even, odd = _part(turn, along), _part(turn, turned)
     if not across.any():
-        return WhitenedResponse(even, odd, star, np.asarray(even.matrix @ star), response.disc)
+        return WhitenedResponse(even, odd, star, even.times(star), response.disc)
     taken = by_vis2 @ (squares @ (2.0 * scale * (star**2 + across**2)))
-    return WhitenedResponse(even, odd, star, np.asarray(taken)[even.rows], response.disc)
+    return WhitenedResponse(even, odd, star, multiplied(turn, taken)[even.rows], response.disc)
 
 
 def nuisance_directions(likelihood: Likelihood, nuisance: FloatArray) -> FloatArray:

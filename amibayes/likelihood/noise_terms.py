@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.sparse import csr_array
 
+from amibayes.data.covariance import multiplied
 from amibayes.data.observables import Observables
-from amibayes.likelihood.channel_noise import multiplied
 from amibayes.likelihood.chi2 import deviance, log_peak
 from amibayes.likelihood.extra_noise import BOUND
 from amibayes.units import BoolArray, FloatArray
