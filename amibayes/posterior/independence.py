@@ -165,7 +165,7 @@ class Unnoticed:
         return np.asarray((self._step @ (np.hstack(found) - self._without)).T)
 
 
-SOME_DATA = 1000
+SOME_DATA = 400
 """Data that tell how companions move the star: whatever is found, the density is that of the draws,
 and this step of them all costs as much as the likelihood."""
 
