@@ -136,6 +136,15 @@ def test_scatter_of_one_kind_of_data_is_none_of_the_other(moved: str) -> None:
     assert narrow < 0.6
 
 
+def test_a_member_with_a_companion_is_named() -> None:
+    """One of twelve with 3 % at 130 mas: it makes the errors of all larger."""
+    mjd = 60000.0 + 7.0 * np.arange(13)
+    for companions, told in (({3: [80.0, 100.0, 0.03]}, ["star3.oifits"]), (None, [])):
+        *library, target = visits(Drift(), mjd, np.random.default_rng(4), companions)
+        out = calibrate(target, library, method="population").observables
+        assert [n.split()[1] for n in out.notes if "not what the others predict" in n] == told
+
+
 def test_a_small_library_is_refused() -> None:
     stars = visits(Drift(), 60000.0 + np.arange(5.0), np.random.default_rng(1))
     with pytest.raises(DataError, match="a population takes 6"):
