@@ -179,9 +179,8 @@ def calibrate(
     target, kept, told = _told(target, kept, covariate)
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
     response = replace(response, freedom=response_freedom(used, kept))
-    notes = _notes(used, keys, response)
     return Calibration(
-        apply_response(target, keys, response, calibrators, notes),
+        apply_response(target, keys, response, calibrators, _notes(used, keys, response)),
         chosen,
         _uses(calibrators, seen, dict(zip(serving, kept, strict=True))),
         *_tau(response),
