@@ -123,8 +123,8 @@ def run(arguments: argparse.Namespace) -> int:
         drifting=found.method == "population",
     )
     content = _json(arguments, found, folder, warned) | {"charge_migration": migration}
-    taken_out = migration_lines(migration)
-    common.finish(arguments, content, lambda: _summary(found, folder, taken_out, warned))
+    taken_out, told = migration_lines(migration), [*found.observables.notes, *warned]
+    common.finish(arguments, content, lambda: _summary(found, folder, taken_out, told))
     return 0
 
 
