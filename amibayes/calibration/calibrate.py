@@ -12,7 +12,7 @@ from amibayes.calibration.freedom import response_freedom
 from amibayes.calibration.hierarchical import hierarchical_response
 from amibayes.calibration.matching import Keys, foreign, keys_of
 from amibayes.calibration.narrowing import Narrowed, narrowed
-from amibayes.calibration.population import population_response
+from amibayes.calibration.population import population_response, unlike_the_others
 from amibayes.calibration.transfer import (
     Diameter,
     Transfer,
@@ -178,9 +178,9 @@ def calibrate(
     mjd = [mean_mjd(c) for c in (target, *used)]
     target, kept, told = _told(target, kept, covariate)
     response = _response(chosen, kept, keys, rng or np.random.default_rng(1), covariate, mjd)
-    response, notes = replace(response, freedom=response_freedom(used, kept)), _notes(used, keys)
+    response = replace(response, freedom=response_freedom(used, kept))
     return Calibration(
-        apply_response(target, keys, response, calibrators, notes),
+        apply_response(target, keys, response, calibrators, _notes(used, keys, response)),
         chosen,
         _uses(calibrators, seen, dict(zip(serving, kept, strict=True))),
         *_tau(response),
@@ -190,8 +190,9 @@ def calibrate(
     )
 
 
-def _notes(used: list[Observables], keys: Keys) -> tuple[str, ...]:
-    return tuple(note for c in used if (note := foreign(c, keys)))
+def _notes(used: list[Observables], keys: Keys, response: TransferFunction) -> tuple[str, ...]:
+    unlike = (unlike_the_others(used[j].source, chi2) for j, chi2 in response.unlike)
+    return (*(note for c in used if (note := foreign(c, keys))), *unlike)
 
 
 def _told(

@@ -6,8 +6,9 @@ the principal components of the transfer functions of a library. Calibrator j at
     z_j = μ + Σ_k u_k a_k(t_j) + δ_j + n_j,
 
 with amplitudes a_k of mean 0 and variance σ_k² whose covariance between two dates is
-σ_k² (ρ exp(−|Δt|/ℓ) + 1 − ρ if they are one), a scatter δ_j of τ² times the errors, and the
-errors n_j. The target is one more draw: amplitudes at its date come from the calibrators near to it
+σ_k² (ρ exp(−|Δt|/ℓ) + 1 − ρ if they are one), a scatter δ_j of τ² times the errors, with a τ of V²
+and one of closure phases (coherence that is lost moves the one and not the other), and the errors
+n_j. The target is one more draw: amplitudes at its date come from the calibrators near to it
 (kriging with an unknown mean), and what is left of their variance is put into its
 covariance, so that a fit does not rest on the combinations of V² and closure phases that drift.
 ρ and ℓ are averaged over a grid by their likelihood.
@@ -31,7 +32,7 @@ from amibayes.calibration.matching import Keys
 from amibayes.calibration.transfer import Transfer, closure_sets
 from amibayes.calibration.weighted import TransferFunction
 from amibayes.errors import DataError
-from amibayes.units import BoolArray, FloatArray
+from amibayes.units import BoolArray, FloatArray, IntArray
 
 MIN_MEMBERS = 6
 """Below it a covariance of components means nothing: hierarchical calibration serves better."""
@@ -46,13 +47,20 @@ MAX_LEFT_OUT = 20
 """Calibrators that are predicted from the others: the mean of their χ² is then known to a
 twentieth, since each is of many data."""
 
+FARTHEST = 3
+"""Of more calibrators those farthest from the median are left out too, to tell of them."""
+
+UNLIKE = 8.0
+"""Times the usual χ² per datum: of libraries of 7 to 20 simulated stars that drift the largest has
+4 times the usual one, a star with a companion of 2 % at errors of 1 % and 0.3° 10 and more."""
+
 UNKNOWN_MEAN = 100.0
 """Variance of the mean amplitude in units of the component's: as good as no knowledge."""
 
 
 @dataclass(frozen=True, eq=False)
 class Components:
-    """The population, in units of the median error of every combination of the data.
+    """The population, in units in which what components leave is alike in all data.
 
     Parameters
     ----------
@@ -61,14 +69,14 @@ class Components:
         Orthonormal.
     variance : (k,) float array
         Of the amplitudes.
-    scatter : float
+    scatter : (q,) float array
         τ²: variance of what neither components nor errors explain.
     """
 
     mean: FloatArray
     modes: FloatArray
     variance: FloatArray
-    scatter: float
+    scatter: FloatArray
 
 
 def components(data: FloatArray, noise: FloatArray) -> Components:
@@ -77,11 +85,12 @@ def components(data: FloatArray, noise: FloatArray) -> Components:
     Parameters
     ----------
     data : (n, q) float array
-        Of n calibrators, in units of the typical error.
-    noise : (n,) float array
+        Of n calibrators, in units of the typical error and scatter.
+    noise : (n,) or (n, q) float array
         Variance of the errors of each, in these units.
     """
     n, q = data.shape
+    errors = _of_each(noise, data)
     mean = data.mean(axis=0)
     _, singular, rows = np.linalg.svd((data - mean) / np.sqrt(n - 1), full_matrices=False)
     singular, rows = singular[: n - 1], rows[: n - 1]  # the mean took one direction
@@ -91,8 +100,28 @@ def components(data: FloatArray, noise: FloatArray) -> Components:
     free = (q - n_modes) * (1.0 - n_modes / (n - 1))
     bulk = float(eigen[n_modes:].sum()) / max(free, 1.0)
     variance = _debiased(eigen[:n_modes], bulk, q / (n - 1))
-    scatter = max(bulk - float(noise.mean()), 0.0)
+    scatter = np.maximum(bulk - errors.mean(axis=0), 0.0)
     return Components(mean, rows[:n_modes].T, variance, scatter)
+
+
+def _of_each(noise: FloatArray, data: FloatArray) -> FloatArray:
+    """Variances of the errors of every calibrator and datum, (n, q)."""
+    return np.broadcast_to(np.reshape(noise, (len(data), -1)), data.shape)
+
+
+def _units(data: FloatArray, noise: FloatArray, kind: IntArray) -> FloatArray:
+    """Root of scatter and errors of each kind of datum by itself, (q,).
+
+    Components are directions that stand out of what is alike in all others: V² that scatter by
+    five errors among closure phases that do not scatter would be components, or the mean of both
+    would be the scatter of each.
+    """
+    out = np.empty(data.shape[1])
+    for number in np.unique(kind):
+        ours = kind == number
+        alone = components(data[:, ours], noise[:, ours])
+        out[ours] = np.sqrt(np.mean(alone.scatter + noise[:, ours].mean(axis=0)))
+    return out
 
 
 def _threshold(n: int, q: int) -> float:
@@ -125,7 +154,7 @@ def predict(
     ----------
     found : Components
     data : (n, q) float array
-    noise : (n,) float array
+    noise : (n,) or (n, q) float array
     days : (n,) float array
         Dates of the calibrators.
     at : float
@@ -133,10 +162,11 @@ def predict(
     """
     n, q = data.shape
     amplitude = (data - found.mean) @ found.modes
-    own = noise + found.scatter
+    own = _of_each(noise, data) + found.scatter
+    of_amplitude = own @ found.modes**2
     apart, gap = np.abs(days[:, None] - days), np.abs(days - at)
     settings = [
-        _krige(amplitude, found.variance, own, rho * np.exp(-apart / time), 1.0 - rho,
+        _krige(amplitude, found.variance, of_amplitude, rho * np.exp(-apart / time), 1.0 - rho,
                rho * np.exp(-gap / time))
         for rho, time in _grid(days)
     ]  # fmt: skip
@@ -147,7 +177,8 @@ def predict(
     centre = weight @ means
     variance = weight @ (np.array([s[2] for s in settings]) + (means - centre) ** 2)
     outside = np.eye(q) - found.modes @ found.modes.T
-    covariance = found.scatter * np.eye(q) + float(own.mean()) / n * outside
+    of_mean = outside @ np.diag(own.mean(axis=0) / n) @ outside
+    covariance = np.diag(found.scatter) + of_mean
     covariance = covariance + (found.modes * variance) @ found.modes.T
     return Prediction(found.mean + found.modes @ centre, covariance)
 
@@ -171,8 +202,8 @@ def _krige(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Likelihood of the amplitudes, and mean and variance of the target's, (k,) each."""
     log_likelihood, means, variances = 0.0, [], []
-    for a, v in zip(amplitude.T, variance, strict=True):
-        matrix = v * (together + UNKNOWN_MEAN) + np.diag(v * alone + own)
+    for a, v, noise in zip(amplitude.T, variance, own.T, strict=True):
+        matrix = v * (together + UNKNOWN_MEAN) + np.diag(v * alone + noise)
         lower = np.linalg.cholesky(matrix)
         white = np.linalg.solve(lower, np.stack([a, v * (near + UNKNOWN_MEAN)], axis=1))
         log_likelihood -= 0.5 * float(white[:, 0] @ white[:, 0])
@@ -182,17 +213,42 @@ def _krige(
     return log_likelihood, np.array(means), np.array(variances)
 
 
-def inflation(data: FloatArray, noise: FloatArray, days: FloatArray) -> float:
-    """Mean χ² per number of each calibrator predicted from the others, at least 1."""
-    chi2 = []
-    for j in np.unique(np.linspace(0, len(data) - 1, MAX_LEFT_OUT).astype(int)):
+def left_out(
+    data: FloatArray, noise: FloatArray, days: FloatArray, numbers: IntArray
+) -> FloatArray:
+    """χ² per datum of some calibrators, each predicted from all others."""
+    chi2, errors = [], _of_each(noise, data)
+    for j in numbers:
         rest = np.arange(len(data)) != j
         found = components(data[rest], noise[rest])
         made = predict(found, data[rest], noise[rest], days[rest], float(days[j]))
         residual = data[j] - made.mean
-        total = made.covariance + noise[j] * np.eye(len(residual))
+        total = made.covariance + np.diag(errors[j])
         chi2.append(float(residual @ np.linalg.solve(total, residual)) / len(residual))
-    return max(float(np.mean(chi2)), 1.0)
+    return np.array(chi2)
+
+
+def inflation(data: FloatArray, noise: FloatArray, days: FloatArray) -> float:
+    """Mean χ² per datum of each calibrator predicted from the others, at least 1."""
+    return max(float(left_out(data, noise, days, _evenly(len(data))).mean()), 1.0)
+
+
+def _evenly(n: int) -> IntArray:
+    return np.unique(np.linspace(0, n - 1, MAX_LEFT_OUT).astype(np.intp))
+
+
+def _unlike(
+    data: FloatArray, noise: FloatArray, days: FloatArray
+) -> tuple[float, list[tuple[int, float]]]:
+    """By how much to scale the covariance, and who is far from what the others predict."""
+    numbers = _evenly(len(data))
+    away = np.argsort(((data - np.median(data, axis=0)) ** 2).sum(axis=1))[-FARTHEST:]
+    others = np.setdiff1d(away, numbers)
+    chi2 = left_out(data, noise, days, np.append(numbers, others))
+    usual = max(float(np.median(chi2)), 1.0)
+    found = zip(np.append(numbers, others).tolist(), chi2.tolist(), strict=True)
+    scale = max(float(chi2[: len(numbers)].mean()), 1.0)
+    return scale, [(j, each) for j, each in found if each > UNLIKE * usual]
 
 
 def population_response(
@@ -227,16 +283,30 @@ def population_response(
     basis = _basis(keys, known)
     data = np.array([basis.T @ transfers[j].value for j in members])
     errors = [basis.T @ _covariance(transfers[j]) @ basis for j in members]
-    lower = np.linalg.cholesky(np.median(errors, axis=0) + _ridge(errors))
+    kind = (np.abs(basis[: keys.n_vis2]).sum(axis=0) == 0.0).astype(np.intp)
+    # Scatter of V² is no scatter of closure phases, even where their errors are correlated.
+    middle = np.median(errors, axis=0) * (kind[:, None] == kind)
+    lower = np.linalg.cholesky(middle + _ridge(errors))
     inverse = np.linalg.inv(lower)
     white = data @ inverse.T
-    noise = np.array([np.trace(inverse @ e @ inverse.T) / len(lower) for e in errors])
+    noise = np.array([np.diagonal(inverse @ e @ inverse.T) for e in errors])
+    units = _units(white, noise, kind)
+    white, noise, lower = white / units, noise / units**2, lower * units
     found = components(white, noise)
     made = predict(found, white, noise, np.asarray(days)[members], at)
-    scale = inflation(white, noise, np.asarray(days)[members])
+    scale, unlike = _unlike(white, noise, np.asarray(days)[members])
     back = basis @ lower
     covariance = csr_array(back @ (scale * made.covariance) @ back.T)
-    return TransferFunction(back @ made.mean, covariance, known)
+    named = tuple((members[j], chi2) for j, chi2 in unlike)
+    return TransferFunction(back @ made.mean, covariance, known, unlike=named)
+
+
+def unlike_the_others(source: str, chi2: float) -> str:
+    """Tell of a calibrator of a population that the others do not predict."""
+    return (
+        f"calibrator {source} is not what the others predict (chi2 per datum {chi2:.1f}), which "
+        "makes all errors larger: if it has a companion (amibayes vet), make the library without it"
+    )
 
 
 def _covariance(transfer: Transfer) -> FloatArray:

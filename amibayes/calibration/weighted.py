@@ -35,6 +35,9 @@ class TransferFunction:
         The covariance by the scatter of the calibrators' integrations alone, where it is known.
     shared : SharedErrors, optional
         Errors in common with other data; the covariances do not hold them.
+    unlike : tuple of (int, float)
+        Calibrators of a population that are far from what the others predict, by number, and
+        their χ² per datum.
     """
 
     value: FloatArray
@@ -44,6 +47,7 @@ class TransferFunction:
     freedom: Freedom | None = None
     scatter: csr_array | None = None
     shared: SharedErrors | None = None
+    unlike: tuple[tuple[int, float], ...] = ()
 
 
 def clipped(transfers: Sequence[Transfer], keys: Keys, clip: float) -> list[Transfer]:

@@ -116,10 +116,15 @@ def run(arguments: argparse.Namespace) -> int:
         _keep(arguments, calibrators, diameters)
     charge = charge_of([*arguments.targets, *arguments.cal], images)
     migration = migration_json(charge, found)
-    warned = calibrator_warnings(targets, calibrators, sized=diameters is not None)
+    warned = calibrator_warnings(
+        targets,
+        calibrators,
+        sized=diameters is not None,
+        drifting=found.method == "population",
+    )
     content = _json(arguments, found, folder, warned) | {"charge_migration": migration}
-    taken_out = migration_lines(migration)
-    common.finish(arguments, content, lambda: _summary(found, folder, taken_out, warned))
+    taken_out, told = migration_lines(migration), [*found.observables.notes, *warned]
+    common.finish(arguments, content, lambda: _summary(found, folder, taken_out, told))
     return 0
 
 

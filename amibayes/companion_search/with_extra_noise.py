@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from amibayes.companion_search.result import SearchResult
+from amibayes.companion_search.result import SearchResult, companions_of
 from amibayes.companion_search.search import BETTER, search, with_global_check
 from amibayes.companion_search.second_companion import TwoCompanions
 from amibayes.data.observables import Observables
-from amibayes.likelihood.averaged_noise import averaged_noise
+from amibayes.likelihood.averaged_noise import averaged_noise, errors_beside_noise
 from amibayes.likelihood.extra_noise import (
     CONVERGED,
     MAX_ROUNDS,
@@ -190,6 +190,29 @@ def noise_averaged(
     if two is not None:
         two = replace(two, likelihood=averaged.with_model(two.likelihood.model))
     return replace(result, likelihood=averaged), two
+
+
+def with_errors_of(result: SearchResult, averaged: SearchResult) -> SearchResult:
+    """The search with errors of its best fit averaged over the amounts of extra noise.
+
+    Noise that no χ² shows for certain is not fitted: of 41 companions of 3 % with true errors 1.4
+    (closure phases) and 1.7 (V²) times the stated ones pulls are 1.3 to 1.5 rms with the errors of
+    the fitted noise, and 1.1 to 1.3 with these.
+
+    Parameters
+    ----------
+    result : SearchResult
+        With the most likely noise.
+    averaged : SearchResult
+        From `noise_averaged`.
+    """
+    if result.robustness is not None or not np.isfinite(result.theta_covariance).any():
+        return result
+    covariance = errors_beside_noise(averaged.likelihood, result.theta)
+    if covariance is None:
+        return result
+    first = companions_of(result.likelihood.parameters, result.theta, covariance)[0]
+    return replace(result, theta_covariance=covariance, companion=first)
 
 
 def _expected(stated: Observables, fitted: Observables) -> Observables:

@@ -190,6 +190,63 @@ def averaged_noise(
     return AveragedNoise(fit, tuple(with_nodes(t, differences) for t in found))
 
 
+def errors_beside_noise(likelihood: Likelihood, theta: FloatArray) -> FloatArray | None:
+    """Covariance (n_dim, n_dim) of the parameters of a fit, averaged over the amounts of noise.
+
+    The mean of the inverse Fisher matrices of all amounts, each with its share in the likelihood of
+    the residuals and the volume that it leaves to the parameters: `Likelihood.errors` knows the
+    amounts of the fit alone, and noise that no test noticed is not in them.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        With `AveragedNoise`; None is given of others, and where a covariance was estimated.
+    theta : (n_dim,) float array
+        The best fit.
+    """
+    noise = likelihood.noise
+    if not isinstance(noise, AveragedNoise) or np.isfinite([t.degrees for t in noise.terms]).any():
+        return None
+    slopes = likelihood.slopes(likelihood.sized(theta))
+    scale = np.linalg.norm(slopes, axis=0)
+    scale[scale == 0.0] = 1.0
+    difference = likelihood.difference(theta)
+    each = [(term.fisher(slopes / scale), term.log_parts(difference)[:, 0]) for term in noise.terms]
+    fisher, log_weight = _sums(each)
+    log_weight = log_weight - 0.5 * _log_volume(fisher)
+    weight = np.exp(log_weight - log_weight.max())
+    inverse = np.linalg.pinv(fisher, hermitian=True)
+    mean = np.tensordot(weight / weight.sum(), inverse, axes=1)
+    return np.asarray(mean / np.outer(scale, scale))
+
+
+def _sums(each: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Fisher matrices of all combinations of nodes of terms, and their log likelihoods.
+
+    Beyond `MAX_COMBINED` the other terms count with their mean: of many files the sum is known.
+    """
+    each = sorted(each, key=lambda one: -len(one[1]))
+    fisher, log_weight = each[0]
+    for own, log_own in each[1:]:
+        if len(log_weight) * len(log_own) > MAX_COMBINED:
+            share = np.exp(log_own - logsumexp(log_own))
+            own, log_own = np.tensordot(share, own, axes=1)[None], np.zeros(1)
+        fisher = (fisher[:, None] + own).reshape(-1, *own.shape[1:])
+        log_weight = np.add.outer(log_weight, log_own).ravel()
+    return fisher, log_weight
+
+
+MAX_COMBINED = 5000
+"""Combinations of amounts of noise: two kinds of data have 65² at most."""
+
+
+def _log_volume(fisher: FloatArray) -> FloatArray:
+    """ln of the determinants (n,) of matrices (n, d, d), of directions that the data tell."""
+    values = np.linalg.eigvalsh(fisher)
+    told = values > 1e-14 * values[:, -1:]
+    return np.asarray(np.log(values, where=told, out=np.zeros_like(values)).sum(axis=1))
+
+
 def differences_of(fits: Sequence[tuple[Likelihood, FloatArray]]) -> list[FloatArray]:
     """Data minus model (n_data,) of each fit."""
     return [likelihood.difference(theta)[:, 0] for likelihood, theta in fits]

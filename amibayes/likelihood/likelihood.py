@@ -239,7 +239,7 @@ class Likelihood(Shown):
         With an estimated covariance that of the t distribution which parameters of a linear
         model have: (ν − 2 + χ²)/(ν + n − n_dim − 2) times as large.
         """
-        jacobian = self.jacobian(self._sized(np.atleast_1d(theta)))
+        jacobian = self.jacobian(self.sized(np.atleast_1d(theta)))
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0.0] = 1.0
         fisher = (jacobian / scale).T @ (jacobian / scale)
@@ -249,7 +249,7 @@ class Likelihood(Shown):
         rest = self.degrees - 2.0 + self.n_independent - len(scale)
         return np.asarray(inverse * (self.degrees - 2.0 + self.chi2(theta)[0]) / rest)
 
-    def _sized(self, theta: ArrayLike) -> FloatArray:
+    def sized(self, theta: ArrayLike) -> FloatArray:
         """The parameter set (n_dim,) with discs too small to be seen as large as their error.
 
         Data move with the square of a small disc, whose derivative vanishes with it: its

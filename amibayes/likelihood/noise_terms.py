@@ -93,6 +93,12 @@ class NoiseTerm:
         chi2 = (1.0 / variance) @ white**2
         return np.asarray(norm[:, None] - 0.5 * deviance(chi2, n, self.degrees))
 
+    def fisher(self, slopes: FloatArray) -> FloatArray:
+        """Fisher matrices (n_nodes, d, d) at the nodes, of slopes of the data (n_data, d)."""
+        white = self.white(slopes)
+        variance = 1.0 + np.outer(np.expm1(2.0 * self.node), self.share)
+        return np.array([white.T @ (white / row[:, None]) for row in variance])
+
     def log_parts(self, difference: FloatArray) -> FloatArray:
         """Logarithm of likelihood times prior at the nodes, (n_nodes, n)."""
         return self.log_parts_of_white(self.white(difference))

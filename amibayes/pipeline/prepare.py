@@ -130,7 +130,8 @@ def prepare(
         *calibrator_warnings(
             [part.only(options.observables) for part in parts],
             ready.serving,
-            sized=options.calibrator_diameters is not None,
+            sized=_sized(ready, options),
+            drifting=ready.calibration is not None and ready.calibration.method == "population",
         ),
         *unused_calibrators(ready.calibration, [r.source for r in references]),
         *(uncalibrated_images(targets) if ready.calibration is None else ()),
@@ -273,6 +274,12 @@ def _calibrated(
         serving=tuple(serving),
         diameters_mas=tuple(sizes),
     )
+
+
+def _sized(ready: Prepared, options: SearchOptions) -> bool:
+    """Whether sizes of calibrators are stated, by an option or by a library for all of them."""
+    stored = [diameter > 0.0 for diameter, _ in ready.diameters_mas]
+    return options.calibrator_diameters is not None or (bool(stored) and all(stored))
 
 
 def _two_that_disagree(ready: Prepared) -> list[str]:

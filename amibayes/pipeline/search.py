@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from amibayes.companion_search.result import SearchResult
 from amibayes.companion_search.second_companion import TwoCompanions, search_second
-from amibayes.companion_search.with_extra_noise import noise_averaged
+from amibayes.companion_search.with_extra_noise import noise_averaged, with_errors_of
 from amibayes.comparison.compare import ModelComparison
 from amibayes.comparison.hypotheses import extended_parameters
 from amibayes.comparison.limits import LimitsBeside
@@ -231,6 +231,7 @@ class Inference:
     evidence: Evidence | None = None
     noise: dict[str, NoisePosterior] | None = None
     resampled: Bootstrap | None = None
+    best: SearchResult | None = None
 
 
 def _inferred(
@@ -279,7 +280,8 @@ def _inferred(
                 progress=run.progress,
             ),
         )  # fmt: skip
-    return Inference(samples, grid, evidence, _noise_posterior(result, samples), resampled)
+    best = with_errors_of(found.result, result)
+    return Inference(samples, grid, evidence, _noise_posterior(result, samples), resampled, best)
 
 
 def _noise_posterior(
@@ -312,7 +314,7 @@ def _report(
         calibration=ready.calibration,
         references=ready.references,
         vetting=ready.vetting,
-        result=found.result,
+        result=posterior.best or found.result,
         noise=found.noise,
         left_out=found.left_out,
         significance=tests.first,

@@ -60,7 +60,11 @@ USUAL_CALIBRATOR_MAS, NOTABLE_LOSS = 0.3, 0.01
 
 
 def calibrator_warnings(
-    targets: Sequence[Observables], references: Sequence[Observables], *, sized: bool
+    targets: Sequence[Observables],
+    references: Sequence[Observables],
+    *,
+    sized: bool,
+    drifting: bool = False,
 ) -> list[str]:
     """Tell of calibrators taken for points that may not be, and of those of other nights.
 
@@ -70,6 +74,8 @@ def calibrator_warnings(
         As read; V² that are not used are flagged or left out.
     sized : bool
         Diameters of calibrators were given.
+    drifting : bool
+        They are a population, which tells how the instrument changes with time.
     """
     if not references:
         return []
@@ -85,7 +91,7 @@ def calibrator_warnings(
             "(--calibrator-diameters)"
         )
     dates = np.concatenate([_dates(data) for data in references])
-    for data in targets if len(dates) else ():
+    for data in targets if len(dates) and not drifting else ():
         days = float(np.abs(_dates(data)[:, None] - dates).min(axis=1).max(initial=0.0))
         if days > EPOCH_GAP_DAYS:
             found.append(

@@ -73,3 +73,16 @@ def test_commands_add_to_a_library_and_draw_on_it(tmp_path: Path, capsys) -> Non
     assert run("calibrate", target, *words) == 0
     assert run("calibrate", target, "--out", tmp_path / "e") == 2
     assert "no calibrator given" in error_of(capsys)
+
+
+def test_what_is_wrong_with_a_library_is_told(tmp_path: Path, capsys) -> None:
+    """One of its stars has a companion."""
+    mjd = 60000.0 + 3.0 * np.arange(11)
+    stars = visits(Drift(), mjd, np.random.default_rng(3), {5: [80.0, 100.0, 0.03]})
+    write_oifits(tmp_path / "target.oifits", stars[-1])
+    add_to_library(tmp_path / "f480m.h5", stars[:-1])
+    words = ("--library", tmp_path / "f480m.h5", "--out", tmp_path / "d")
+    assert run("calibrate", tmp_path / "target.oifits", *words) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "WARNING" in line]
+    assert len(told) == 1
+    assert "star5.oifits is not what the others predict" in told[0]

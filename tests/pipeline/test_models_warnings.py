@@ -97,3 +97,5 @@ def test_calibrators_of_another_night_are_told(days: float, told: bool) -> None:
     )  # fmt: skip
     said = calibrator_warnings([target], [calibrator], sized=False)
     assert any("3.0 days from the nearest" in text for text in said) is told
+    # A library of many nights tells how the instrument changes.
+    assert calibrator_warnings([target], [calibrator], sized=False, drifting=True) == []
