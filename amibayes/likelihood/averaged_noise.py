@@ -107,6 +107,12 @@ class AveragedNoise(FittedNoise):
             out[which, k] = np.sum(parts, axis=0)
         return out
 
+    def fisher(self, slopes: FloatArray, difference: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of all combinations of the amounts of the terms, with likelihood times prior."""
+        return _sums(
+            [(term.fisher(slopes), term.log_parts(difference)[:, 0]) for term in self.terms]
+        )
+
     def delta_chi2(self, log_gain: FloatArray) -> FloatArray:
         """Δχ², at the noise of the fit itself, that goes with a gain in ln L over no companion.
 
@@ -200,19 +206,16 @@ def errors_beside_noise(likelihood: Likelihood, theta: FloatArray) -> FloatArray
     Parameters
     ----------
     likelihood : Likelihood
-        With `AveragedNoise`; None is given of others, and where a covariance was estimated.
+        None is given where its noise has no unknown amounts, or its covariance was estimated.
     theta : (n_dim,) float array
         The best fit.
     """
-    noise = likelihood.noise
-    if not isinstance(noise, AveragedNoise) or np.isfinite([t.degrees for t in noise.terms]).any():
+    if not likelihood.noise.parameters or np.isfinite(likelihood.degrees):
         return None
     slopes = likelihood.slopes(likelihood.sized(theta))
     scale = np.linalg.norm(slopes, axis=0)
     scale[scale == 0.0] = 1.0
-    difference = likelihood.difference(theta)
-    each = [(term.fisher(slopes / scale), term.log_parts(difference)[:, 0]) for term in noise.terms]
-    fisher, log_weight = _sums(each)
+    fisher, log_weight = likelihood.noise.fisher(slopes / scale, likelihood.difference(theta))
     log_weight = log_weight - 0.5 * _log_volume(fisher)
     weight = np.exp(log_weight - log_weight.max())
     inverse = np.linalg.pinv(fisher, hermitian=True)

@@ -110,6 +110,13 @@ class NoiseModel(Protocol):
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         ...
 
+    def fisher(self, slopes: FloatArray, difference: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Fisher matrices (n, d, d) at n amounts of noise, and logarithms of their weights (n,).
+
+        Of slopes of the data (n_data, d) and data minus model (n_data, 1).
+        """
+        ...
+
     def without_companion(self) -> NoiseModel:
         """The noise that a test of no companion may use: nothing in it rests on one."""
         ...
@@ -196,6 +203,11 @@ class GaussianNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """Half of Δχ²."""
         return np.asarray(0.5 * delta_chi2)
+
+    def fisher(self, slopes: FloatArray, difference: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Fisher matrix (1, d, d) of the one covariance."""
+        white = self.whiten(slopes)
+        return (white.T @ white)[None], np.zeros(1)
 
     def without_companion(self) -> GaussianNoise:
         """The same."""
@@ -342,6 +354,10 @@ class FittedNoise:
     def log_loss(self, delta_chi2: FloatArray) -> FloatArray:
         """What a Δχ² from the best fit costs in ln L, (n,)."""
         return self.fit.log_loss(delta_chi2)
+
+    def fisher(self, slopes: FloatArray, difference: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """That of the fit."""
+        return self.fit.fisher(slopes, difference)
 
     def without_companion(self) -> NoiseModel:
         """That of the fit."""

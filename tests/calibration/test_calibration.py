@@ -521,7 +521,7 @@ def test_scatter_is_found_and_the_target_has_it_too(rng: np.random.Generator) ->
     assert weighted.observables.errors[0].mean() < found.observables.errors[0].mean()
 
 
-@pytest.mark.parametrize("tau", [0.0, 3.0])
+@pytest.mark.parametrize("tau", [3.0, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_two_calibrators_that_scatter_give_the_target_their_scatter(tau: float) -> None:
     """χ² per datum of stars that are points, whose true errors the instrument here draws.
 

@@ -43,6 +43,7 @@ def alone(night: Path, *names: str) -> list[str]:
     return [str(night.with_name(f"{name}.oifits")) for name in names]
 
 
+@pytest.mark.slow
 def test_one_file_is_as_good_as_one_for_each_star(night: Path, tmp_path: Path) -> None:
     one, each = tmp_path / "one", tmp_path / "each"
     words = ("calibrate", night, "--target", "sci", "--cal", night)

@@ -80,7 +80,10 @@ def test_slopes_by_the_cube_against_differences(name: str, rng) -> None:
         np.testing.assert_allclose(slopes[:, :, k], white, atol=2e-4 * np.abs(white).max() + 1e-4)
 
 
-@pytest.mark.parametrize("truth", ["companion", "disc", "ring", "crescent"])
+@pytest.mark.parametrize(
+    "truth",
+    ["companion", "disc", *(pytest.param(t, marks=pytest.mark.slow) for t in ("ring", "crescent"))],
+)
 @pytest.mark.parametrize("name", ["companion", "disc", "ring", "crescent"])
 def test_search_is_as_good_as_brute_force(truth: str, name: str) -> None:
     """Fits from hundreds of random points find nothing that the search does not."""

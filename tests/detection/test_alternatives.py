@@ -99,7 +99,7 @@ def test_what_it_is_fits_as_well_as_a_companion(source: Visibility, kind: str | 
 
 
 @pytest.mark.parametrize(("source", "kind"), [(halo, "extended light"), (faint, None)])
-@pytest.mark.parametrize("too_large", [1.0, 3.0])
+@pytest.mark.parametrize("too_large", [3.0, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_errors_that_are_too_large_change_no_comparison(
     source: Visibility, kind: str | None, too_large: float
 ) -> None:

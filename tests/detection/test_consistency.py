@@ -142,7 +142,7 @@ def test_slopes_by_noise_are_those_of_noise_that_is_drawn(rng) -> None:
     assert stats.kstest(quick[1], stats.chi2(3).cdf).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("size", [1.0, 0.3])
+@pytest.mark.parametrize("size", [1.0, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_gains_within_their_floor_make_no_disagreement(
     size: float, rng: np.random.Generator
 ) -> None:

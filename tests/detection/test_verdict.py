@@ -214,6 +214,7 @@ def test_a_companion_without_a_place_is_said_to_have_none(
     assert open_.because == f"{known.because}; its place is undetermined"
 
 
+@pytest.mark.slow
 def test_two_files_with_a_companion_at_other_places_are_inconsistent() -> None:
     """At PA 0 in one file, at PA 90 in the other: no companion of both."""
     rng, parts = np.random.default_rng(2), []

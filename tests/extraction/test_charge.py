@@ -74,6 +74,7 @@ def test_a_search_of_ramps_shows_what_was_fitted(of_ramps: tuple[Path, dict[str,
     assert "were it all that changes along the ramps" in report.casefold()
 
 
+@pytest.mark.slow
 def test_what_extract_writes_is_reported_as_from_the_ramps(
     visit: Path, tmp_path: Path, of_ramps: tuple[Path, dict[str, Any]], capsys: Any
 ) -> None:

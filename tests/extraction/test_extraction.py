@@ -138,7 +138,9 @@ def test_companions_in_the_images_keep_their_contrast(
     assert np.hypot(*(found - truth)[:2]) < 0.5
 
 
-@pytest.mark.parametrize("method", ["fringes", "matched", "unique"])
+@pytest.mark.parametrize(
+    "method", ["fringes", "matched", pytest.param("unique", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(
     ("offset", "contrast"),
     [

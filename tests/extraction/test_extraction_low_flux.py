@@ -57,7 +57,9 @@ def test_noise_of_the_flux_moves_all_v2_together(third: float) -> None:
     np.testing.assert_allclose(found[21:], 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["fringes", "matched", "unique"])
+@pytest.mark.parametrize(
+    "method", ["fringes", *(pytest.param(m, marks=pytest.mark.slow) for m in ("matched", "unique"))]
+)
 @pytest.mark.parametrize(("photons", "read_noise"), [(300.0, 0.0), (8000.0, 21.0)])
 def test_drawn_photons_scatter_as_expected(
     method: str, photons: float, read_noise: float, monkeypatch: pytest.MonkeyPatch

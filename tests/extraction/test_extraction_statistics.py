@@ -158,7 +158,9 @@ def test_scatter_is_near_the_cramer_rao_bound(photons: float) -> None:
             assert np.sqrt(np.mean(ratio[part] ** 2)) < worst + 0.03
 
 
-@pytest.mark.parametrize("method", ["fringes", "matched", "unique"])
+@pytest.mark.parametrize(
+    "method", ["fringes", *(pytest.param(m, marks=pytest.mark.slow) for m in ("matched", "unique"))]
+)
 def test_pointing_does_not_bias_what_is_calibrated(method: str) -> None:
     """Jitter and dither without noise: the bias is below a tenth of the error at 1e9 photons."""
     instrument, rng = load_instrument("niriss", "F430M"), np.random.default_rng(31)
@@ -175,7 +177,7 @@ def test_pointing_does_not_bias_what_is_calibrated(method: str) -> None:
     assert np.abs(off).max() < 2.7e-5
 
 
-@pytest.mark.parametrize("method", ["fringes", "matched"])
+@pytest.mark.parametrize("method", ["fringes", pytest.param("matched", marks=pytest.mark.slow)])
 def test_bright_stars_are_not_biased(method: str) -> None:
     scaled = []
     for seed in range(3):

@@ -40,7 +40,7 @@ def companion(u: np.ndarray, v: np.ndarray, _wavelength: np.ndarray) -> np.ndarr
 
 
 @pytest.mark.parametrize("floor", [0.0, 0.01, 0.03, 0.05])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_extra_noise_of_channels_is_found_beside_a_floor(floor, seed):
     """192 V² tell it to 5 %, 96 combinations of closure phases to 7 %.
 

@@ -124,7 +124,9 @@ VARIANTS: tuple[Spoil, ...] = (
 )
 
 
-@pytest.mark.parametrize("compressed", [False, True], ids=["plain", "gz"])
+@pytest.mark.parametrize(
+    "compressed", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "gz"]
+)
 @pytest.mark.parametrize("spoil", VARIANTS, ids=lambda f: f.__name__)
 def test_what_is_left_out_changes_no_number(
     made: MaskFile, tmp_path: Path, spoil: Spoil, compressed: bool

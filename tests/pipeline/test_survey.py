@@ -172,6 +172,7 @@ def test_the_picture_of_few_and_of_many(n: int, tmp_path: Path) -> None:
 
 # With the process beside this one that draws for all targets, as a user has it.
 @pytest.mark.usefixtures("full_pictures")
+@pytest.mark.slow
 def test_limits_of_a_survey(survey, tmp_path, capsys) -> None:
     out = tmp_path / "out"
     assert run("limits", "--batch", survey, "--out", out, *CLOSED) == 4
