@@ -9,6 +9,7 @@ and discs and shells surround hot stars. Both have point symmetry, so that their
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -22,7 +23,7 @@ from amibayes.likelihood.chi2 import chi2_of_part
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.extended import Extended
 from amibayes.models.limb_darkening import power_law_disc
-from amibayes.units import FloatArray
+from amibayes.units import FloatArray, IntArray
 
 CLEARLY = 10.0
 """Δχ² by which a companion is the better explanation: odds of 150 to 1, before they pay for the
@@ -54,6 +55,16 @@ EDGE = 1e-6
 LADDER = np.linspace(0.94, 1.06, 121)
 """Factors that are tried of the diameter at one wavelength: where a baseline is at a null its
 closure phases turn by 180° at once, and a fit by slopes does not see the other side."""
+
+AT_ONCE = 16
+"""Factors whose models are in memory together."""
+
+FINE = 0.01
+"""Step of ln of the diameter that all wavelengths are tried with: a twentieth of a lobe of the
+visibility of a star that is seen past four nulls."""
+
+STEP = 1e-6
+"""Change of a diameter, relative, that its slopes are taken of."""
 
 
 @dataclass(frozen=True)
@@ -128,45 +139,115 @@ def symmetric_chi2(likelihood: Likelihood) -> float:
     return chi2_of_part(likelihood.noise.covariance, closure, nearest)[0]
 
 
+@dataclass(frozen=True, eq=False)
+class ChromaticStar:
+    """A star with a diameter of its own at several wavelengths, linear in between.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+        Of the star alone.
+    nodes : (n_nodes,) float array
+        The wavelengths, m.
+    limb_darkening, background : float
+        Those of the best fit of the search.
+    """
+
+    likelihood: Likelihood
+    nodes: FloatArray
+    limb_darkening: float
+    background: float
+
+    @cached_property
+    def share(self) -> FloatArray:
+        """What part of the diameter of each datum is that of each node, (n_data, n_nodes)."""
+        data = self.likelihood.observables
+        wavelengths = np.concatenate([data.vis2.wavelength_m, data.closure_phase.wavelength_m])
+        return np.array(
+            [np.interp(wavelengths, self.nodes, one) for one in np.eye(len(self.nodes))]
+        ).T
+
+    @cached_property
+    def error(self) -> FloatArray:
+        """Standard deviation of each datum, (n_data,)."""
+        return np.sqrt(self.likelihood.noise.covariance.variance)
+
+    def difference(self, diameters: FloatArray) -> FloatArray:
+        """Data minus model (n_data, n) for diameters at the nodes (n_nodes, n), mas."""
+        points = self.likelihood.samples
+        wavelengths = np.asarray(points.wavelength_m)
+        at = np.array([np.interp(wavelengths, self.nodes, one) for one in diameters.T]).T
+        exponent = np.array(self.limb_darkening)
+        wave = power_law_disc(points.frequency[:, None], at, exponent) / (1.0 + self.background)
+        model = self.likelihood.observe(wave.astype(complex))
+        return self.likelihood.wrapped(self.likelihood.observables.data[:, None] - model)
+
+    def slopes(self, diameters: FloatArray) -> FloatArray:
+        """Derivative (n_data, n_nodes) of `difference`, of one star (n_nodes,).
+
+        A datum knows the diameter at its own wavelength alone: one more star gives all columns.
+        """
+        here, there = self.difference(np.outer(diameters, [1.0, 1.0 + STEP])).T
+        moved = self.likelihood.wrapped(there - here) / (STEP * self.share @ diameters)
+        return moved[:, None] * self.share
+
+    def near(self, sizes: FloatArray) -> FloatArray:
+        """Diameters (n_nodes,) that suit the data near each node best, among ``sizes``.
+
+        Then one by one past nulls of baselines, every other node at once: no datum knows two of
+        them. Errors count as independent; a phase on the wrong side of a null is off by 180°.
+        """
+        every = np.ones((len(self.nodes), 1))
+        best = sizes[self._best(every * sizes, self.share)]
+        for parity in (0, 1, 0, 1):
+            group = np.arange(parity, len(best), 2)
+            tried = np.repeat(best[:, None], len(LADDER), axis=1)
+            tried[group] *= LADDER
+            best[group] *= LADDER[self._best(tried, (self.share[:, group] > 0.0).astype(float))]
+        return best
+
+    def _best(self, tried: FloatArray, weight: FloatArray) -> IntArray:
+        """Which of some stars (n_nodes, n) has the least χ² with each weight (n_data, k), (k,)."""
+        loss = [
+            (self.difference(few) / self.error[:, None]).T ** 2 @ weight
+            for few in np.array_split(tried, 1 + tried.shape[1] // AT_ONCE, axis=1)
+        ]
+        return np.asarray(np.concatenate(loss).argmin(axis=0))
+
+
+def _diameters(result: SearchResult) -> FloatArray:
+    """Of the star with its companion, and alone, where they are seen, mas.
+
+    A companion makes the star another one where it stands for changes with wavelength.
+    """
+    alone = result.star_alone().get("diameter_mas", (0.0, 0.0))[0]
+    both = np.array([result.nuisance("diameter_mas"), alone])
+    return both[both > 0.0]
+
+
 def _chromatic_star(likelihood: Likelihood, result: SearchResult) -> Alternative | None:
     """A star with a diameter of its own at several wavelengths."""
     coloured = likelihood.with_model(
         replace(likelihood.model, companions=0, contrast_slope="free", surroundings=())
     )
-    points = coloured.samples
-    wavelengths = np.asarray(points.wavelength_m)
-    channels = np.unique(wavelengths)
-    grey = result.nuisance("diameter_mas")
-    if len(channels) < 3 or grey <= 0.0:
+    channels, grey = np.unique(np.asarray(coloured.samples.wavelength_m)), _diameters(result)
+    if len(channels) < 3 or not len(grey):
         return None
     nodes = np.linspace(channels[0], channels[-1], min(MAX_NODES, len(channels)))
-    exponent, background = (result.nuisance(name) for name in ("limb_darkening", "background"))
-    n_vis2 = likelihood.observables.n_vis2
-    size = np.sqrt(likelihood.noise.covariance.variance[:n_vis2])
-
-    def seen(diameters: FloatArray) -> FloatArray:
-        at = np.array([np.interp(wavelengths, nodes, one) for one in diameters.T]).T
-        wave = power_law_disc(points.frequency[:, None], at, np.array(exponent))
-        return coloured.observe((wave / (1.0 + background)).astype(complex))
-
-    def difference(diameters: FloatArray) -> FloatArray:
-        return coloured.wrapped(likelihood.observables.data - seen(diameters[:, None])[:, 0])
-
-    def by_vis2(diameters: FloatArray) -> FloatArray:
-        return np.asarray(difference(diameters)[:n_vis2] / size)
+    star = ChromaticStar(
+        coloured, nodes, result.nuisance("limb_darkening"), result.nuisance("background")
+    )
 
     def white(diameters: FloatArray) -> FloatArray:
-        return np.asarray(likelihood.noise.whiten(difference(diameters)))
+        return likelihood.noise.whiten(star.difference(diameters[:, None])[:, 0])
 
-    # V² have no walls at nulls, and lead near to the right side of each.
-    bounds = (0.3 * grey, 3.0 * grey)
-    best = least_squares(by_vis2, np.full(len(nodes), grey), bounds=bounds, max_nfev=STEPS).x
-    for k in np.tile(np.arange(len(nodes)), 2):
-        tried = np.repeat(best[:, None], len(LADDER), axis=1)
-        tried[k] *= LADDER
-        best = tried[:, np.argmin(coloured.chi2_of_model(seen(tried)))]
-    best = np.clip(best, *bounds)
-    fit = least_squares(white, best, bounds=bounds, max_nfev=STEPS)
+    def slopes(diameters: FloatArray) -> FloatArray:
+        return likelihood.noise.whiten(star.slopes(diameters))
+
+    bounds = 0.3 * grey.min(), 3.0 * grey.max()
+    n_sizes = int(np.ceil(np.log(bounds[1] / bounds[0]) / FINE)) + 1
+    start = np.clip(star.near(np.geomspace(*bounds, n_sizes)), *bounds)
+    fit = least_squares(white, start, slopes, bounds=bounds, max_nfev=STEPS)
     more = _noise_of(len(nodes) - len(result.theta), result)
     words = (
         f"a star whose diameter changes with wavelength, from {fit.x.min():.4g} to "

@@ -21,9 +21,13 @@ from amibayes.report.words import (
     FARTHEST_TOLD,
     LARGEST_ANGLE_DEG,
     LARGEST_MAG,
+    OPEN_ANGLE_DEG,
     capital,
     percent,
     places_of,
+    three_digits,
+    with_error,
+    with_sides,
 )
 from amibayes.support.terminal import equals, row, with_warnings
 
@@ -131,34 +135,6 @@ def _rivals(result: SearchResult) -> str:
     )
 
 
-def with_error(value: float, error: float, unit: str = "", largest: float = np.inf) -> str:
-    """Write a number and its error, both to the error's second digit.
-
-    An error above ``largest`` says that nothing is known.
-    """
-    if not np.isfinite(error) or error > largest:
-        return "undetermined"
-    places = max(0, places_of(error)) if error > 0.0 else 4
-    return f"{value:.{places}f} +/- {error:.{places}f}{unit}"
-
-
-def with_sides(median: float, low: float, high: float) -> str:
-    """Write a median and the sides of its interval, to the second digit of the smaller one."""
-    below, above = median - low, high - median
-    if above + below > OPEN_SHARE * abs(median):
-        return f"{low:.3g} to {high:.3g}"
-    least = min((x for x in (below, above) if x > 0.0), default=0.0)
-    places = max(0, places_of(least)) if least > 0.0 else 4
-    return f"{median:.{places}f} +{above:.{places}f} -{below:.{places}f}"
-
-
-OPEN_SHARE = 1.0
-"""An interval wider than this share of its median has no middle worth stating: its ends are."""
-
-OPEN_ANGLE_DEG = 180.0
-"""A 68 % interval of position angles wider than this leaves every direction open."""
-
-
 def _verdict(report: SearchReport) -> str:
     tested = report.significance
     if tested is None:
@@ -219,11 +195,6 @@ def _power(probability: float) -> str:
     return f"{probability:.0e}"
 
 
-def three_digits(value: float) -> str:
-    """A reduced χ²: three digits that count, more only where it is large."""
-    return f"{value:.0f}" if value >= 100.0 else f"{value:#.3g}"
-
-
 def _shape_lines(report: SearchReport) -> list[str]:
     """Disc and colour of the companion that is stated, where these are free."""
     result, lines = report.result, []
@@ -239,14 +210,25 @@ def _shape_lines(report: SearchReport) -> list[str]:
         elif (bound := _upper_limit(value, error)) is not None:
             lines.append(row("disc", f"companion not resolved: below {bound:.2g} mas (2 sigma)"))
         else:
-            shown = f"of the companion {with_error(value, error, ' mas')}{_by_phases(result)}"
+            remark = _remark(result, parameters[k].name, value)
+            shown = f"of the companion {with_error(value, error, ' mas')}{remark}"
             lines.append(row("disc", shown))
     return lines
 
 
-def _by_phases(result: SearchResult) -> str:
-    """Say what discs of phases alone are: o Leo's of 0.7 and 1.3 mas came out as 3.5 ± 0.2."""
+def _remark(result: SearchResult, name: str, diameter: float) -> str:
+    """Say what the largest disc is that is tried, and what discs of phases alone are.
+
+    o Leo's of 0.7 and 1.3 mas came out as 3.5 ± 0.2.
+    """
+    parameters = result.likelihood.parameters
+    if diameter > AT_BOUND * parameters[parameters.index(name)].upper:
+        return " (the largest that is tried: every baseline resolves it)"
     return "" if result.likelihood.observables.n_vis2 else " (closure phases alone hardly tell it)"
+
+
+AT_BOUND = 0.999
+"""Part of the upper bound of a disc, above which its fit ended there."""
 
 
 def _upper_limit(diameter: float, error: float) -> float | None:
@@ -273,7 +255,7 @@ def _nuisance_lines(report: SearchReport) -> list[str]:
         else:
             largest = np.inf if unit else LARGEST_SHAPE
             shown = with_error(value, error, unit, largest) + (" (star alone)" if alone else "")
-            shown += _by_phases(result) if name == "diameter_mas" else ""
+            shown += _remark(result, name, value) if name == "diameter_mas" else ""
         lines.append(row(label, shown))
     return lines
 

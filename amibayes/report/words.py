@@ -112,3 +112,36 @@ def sentence(text: str) -> str:
 def capital(text: str) -> str:
     """Begin with a capital, and leave names as they are."""
     return text[:1].upper() + text[1:]
+
+
+def with_error(value: float, error: float, unit: str = "", largest: float = math.inf) -> str:
+    """Write a number and its error, both to the error's second digit.
+
+    An error above ``largest`` says that nothing is known.
+    """
+    if not math.isfinite(error) or error > largest:
+        return "undetermined"
+    places = max(0, places_of(error)) if error > 0.0 else 4
+    return f"{value:.{places}f} +/- {error:.{places}f}{unit}"
+
+
+def with_sides(median: float, low: float, high: float) -> str:
+    """Write a median and the sides of its interval, to the second digit of the smaller one."""
+    below, above = median - low, high - median
+    if above + below > OPEN_SHARE * abs(median):
+        return f"{low:.3g} to {high:.3g}"
+    least = min((x for x in (below, above) if x > 0.0), default=0.0)
+    places = max(0, places_of(least)) if least > 0.0 else 4
+    return f"{median:.{places}f} +{above:.{places}f} -{below:.{places}f}"
+
+
+OPEN_SHARE = 1.0
+"""An interval wider than this share of its median has no middle worth stating: its ends are."""
+
+OPEN_ANGLE_DEG = 180.0
+"""A 68 % interval of position angles wider than this leaves every direction open."""
+
+
+def three_digits(value: float) -> str:
+    """A reduced χ²: three digits that count, more only where it is large."""
+    return f"{value:.0f}" if value >= 100.0 else f"{value:#.3g}"

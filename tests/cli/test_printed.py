@@ -100,6 +100,16 @@ def test_a_disc_of_closure_phases_alone_is_told_as_such(report: SearchReport) ->
     assert line(told, "diameter").endswith("mas (closure phases alone hardly tell it)")
 
 
+def test_a_disc_that_is_as_large_as_may_be_is_told_as_such(report: SearchReport) -> None:
+    found = report.result
+    theta, at = found.theta.copy(), found.likelihood.parameters.index("diameter_mas")
+    theta[at] = found.likelihood.parameters[at].upper
+    told = replace(report, result=replace(found, theta=theta))
+    assert line(told, "diameter").endswith(
+        "(the largest that is tried: every baseline resolves it)"
+    )
+
+
 def test_what_was_not_tested_is_written_so(report: SearchReport) -> None:
     # Two companions are there: the verdict refuses a model of one.
     assert "not stated: see the verdict; " in line(report, "companion")

@@ -15,7 +15,13 @@ from interferometer import darkened_disc
 from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
-from amibayes.detection.alternatives import _extended_light, alternative, symmetric_chi2
+from amibayes.detection.alternatives import (
+    ChromaticStar,
+    _chromatic_star,
+    _extended_light,
+    alternative,
+    symmetric_chi2,
+)
 from amibayes.detection.verdict import Verdict, without_companion
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
@@ -127,6 +133,38 @@ def test_a_star_that_changes_more_than_any_is_no_reason_for_no_companion(
     first = Verdict("companion", "", 0.5)
     stated = without_companion(first, found, result).statement
     assert stated == ("no companion" if plausible else "model rejected")
+
+
+def test_a_star_past_nulls_is_found_wherever_its_search_ends() -> None:
+    """8 mas where the star beside the best "companion" has 4; as likely as the truth, or more."""
+
+    def giant(u: np.ndarray, v: np.ndarray, wavelength: np.ndarray) -> np.ndarray:
+        return chromatic(2.3 * u, 2.3 * v, wavelength)
+
+    data = observed(giant, 3)
+    likelihood = Likelihood(data, MODEL)
+    result = search(likelihood, check=False)
+    assert result.nuisance("diameter_mas") < 5.0
+    found = _chromatic_star(likelihood, result)
+    assert found is not None
+    wavelengths = np.unique(data.vis2.wavelength_m)
+    coloured = Likelihood(data, replace(MODEL, companions=0, contrast_slope="free"))
+    truth = 8.05 * (1.0 + 0.06 * np.exp(-0.5 * ((wavelengths - 1.7e-6) / 0.05e-6) ** 2))
+    left = ChromaticStar(coloured, wavelengths, 0.0, 0.0).difference(truth[:, None])
+    assert found.chi2 < float((coloured.noise.whiten(left) ** 2).sum())
+    low, high = map(float, re.findall(r"[\d.]+(?= mas| to)", found.words))
+    assert [low, high] == pytest.approx([truth.min(), truth.max()], abs=0.15)
+
+
+def test_slopes_of_a_chromatic_star_are_differences() -> None:
+    likelihood = Likelihood(observed(chromatic, 1), replace(MODEL, contrast_slope="free"))
+    wavelengths = np.asarray(likelihood.samples.wavelength_m)
+    nodes = np.linspace(wavelengths.min(), wavelengths.max(), 4)
+    star = ChromaticStar(likelihood, nodes, 0.2, 0.05)
+    at = np.array([2.0, 2.1, 1.9, 2.3])
+    step = 1e-4 * np.eye(len(at))
+    up, down = (star.difference(at[:, None] + sign * step) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(star.slopes(at), (up - down) / 2e-4, atol=1e-4)
 
 
 def test_closure_phases_of_a_symmetric_source_leave_their_noise() -> None:

@@ -267,6 +267,7 @@ def test_alternatives_and_outlying_rows(monkeypatch: pytest.MonkeyPatch, num_reg
         found: Any = SimpleNamespace(
             theta=theta,
             nuisance=lambda wanted: {"diameter_mas": 3.4}.get(wanted, 0.0),
+            star_alone=dict,
             companion=SimpleNamespace(separation_mas=2.2),
             chi2_binary=float(likelihood.n_independent),
             ndof=likelihood.n_independent - 4,
