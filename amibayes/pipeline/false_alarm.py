@@ -11,7 +11,7 @@ from amibayes.calibration.transfer import Diameter
 from amibayes.companion_search.field import on_outer_edge
 from amibayes.companion_search.result import SearchResult, stated_parameters
 from amibayes.data.observables import Observables
-from amibayes.detection.alternatives import alternative
+from amibayes.detection.alternatives import Alternative, alternative
 from amibayes.detection.consistency import MAX_PARTS, by_night, consistency
 from amibayes.detection.false_alarm import (
     Significance,
@@ -198,8 +198,11 @@ def verdict_of(
         result, tested, rest, splits,
         structured=structured, noise=noise, compared=compared, alone=alone,
     )  # fmt: skip
-    if said.statement == "companion" and (other := alternative(result)) is not None:
+    other = alternative(result) if said.statement in ("companion", "model rejected") else None
+    if other is not None and said.statement == "companion":
         said = without_companion(said, other, result, compared=compared)
+    elif other is not None:
+        said = with_what_fits(said, other, result)
     if said.statement == "companion" and options.separation_mas is None and on_outer_edge(result):
         said = at_the_edge(said, result)
     if said.statement == "no companion" and (seen := _seen_in_one_part(found, options, rng)):
@@ -207,6 +210,19 @@ def verdict_of(
     if said.statement == "no companion" and options.extra_noise and alone is not None:
         said = replace(said, star=stated_parameters(*alone))
     return said, splits
+
+
+def with_what_fits(said: Verdict, other: Alternative, result: SearchResult) -> Verdict:
+    """The verdict where the model is rejected, with a source that fits far better than it."""
+    if other.chi2 > FAR_BETTER * result.chi2_binary:
+        return said
+    better = f"fits better (χ² {other.chi2:.4g}, with a companion {result.chi2_binary:.4g})"
+    return replace(said, because=f"{said.because}; {other.words}, {better}")
+
+
+FAR_BETTER = 0.75
+"""Part of χ² that a source leaves which is worth naming where no model fits: with more parameters
+any leaves a tenth less, and noise that was fitted to the model makes all χ² small."""
 
 
 def _seen_in_one_part(found: FieldSearch, options: SearchOptions, rng: np.random.Generator) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import interferometer
 import numpy as np
@@ -16,6 +17,7 @@ from amibayes.companion_search.field import resolution_mas
 from amibayes.companion_search.search import search
 from amibayes.data.observables import Observables
 from amibayes.detection.alternatives import (
+    Alternative,
     ChromaticStar,
     _chromatic_star,
     _extended_light,
@@ -26,6 +28,7 @@ from amibayes.detection.verdict import Verdict, without_companion
 from amibayes.likelihood.likelihood import Likelihood
 from amibayes.models.binary import BinaryModel
 from amibayes.models.extended import Extended
+from amibayes.pipeline.false_alarm import with_what_fits
 from amibayes.units import MAS
 
 Visibility = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -182,3 +185,12 @@ def test_one_kind_of_data_has_no_alternative() -> None:
     result = search(Likelihood(data.only("vis2"), MODEL), (0.7, 10.0))
     assert result.delta_chi2 > 40.0
     assert alternative(result) is None
+
+
+@pytest.mark.parametrize("left", [0.7, 0.8])
+def test_what_fits_far_better_than_a_model_that_is_rejected_is_named(left: float) -> None:
+    rejected = Verdict("model rejected", "it does not fit", 0.0)
+    other = Alternative("chromatic star", 100.0 * left, "a star that changes")
+    said = with_what_fits(rejected, other, SimpleNamespace(chi2_binary=100.0))  # type: ignore[arg-type]
+    better = "; a star that changes, fits better (χ² 70, with a companion 100)"
+    assert said == replace(rejected, because="it does not fit" + (better if left < 0.75 else ""))
