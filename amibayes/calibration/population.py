@@ -228,25 +228,20 @@ def left_out(
     return np.array(chi2)
 
 
-def inflation(data: FloatArray, noise: FloatArray, days: FloatArray) -> float:
-    """Mean χ² per datum of each calibrator predicted from the others, at least 1."""
-    return max(float(left_out(data, noise, days, _evenly(len(data))).mean()), 1.0)
-
-
-def _evenly(n: int) -> IntArray:
-    return np.unique(np.linspace(0, n - 1, MAX_LEFT_OUT).astype(np.intp))
-
-
-def _unlike(
+def inflation(
     data: FloatArray, noise: FloatArray, days: FloatArray
 ) -> tuple[float, list[tuple[int, float]]]:
-    """By how much to scale the covariance, and who is far from what the others predict."""
-    numbers = _evenly(len(data))
+    """By how much to scale the covariance, and who is far from what the others predict.
+
+    The mean χ² per datum of calibrators predicted from the others, at least 1; numbers and χ² per
+    datum of those that are far.
+    """
+    numbers = np.unique(np.linspace(0, len(data) - 1, MAX_LEFT_OUT).astype(np.intp))
     away = np.argsort(((data - np.median(data, axis=0)) ** 2).sum(axis=1))[-FARTHEST:]
-    others = np.setdiff1d(away, numbers)
-    chi2 = left_out(data, noise, days, np.append(numbers, others))
+    every = np.append(numbers, np.setdiff1d(away, numbers))
+    chi2 = left_out(data, noise, days, every)
     usual = max(float(np.median(chi2)), 1.0)
-    found = zip(np.append(numbers, others).tolist(), chi2.tolist(), strict=True)
+    found = zip(every.tolist(), chi2.tolist(), strict=True)
     scale = max(float(chi2[: len(numbers)].mean()), 1.0)
     return scale, [(j, each) for j, each in found if each > UNLIKE * usual]
 
@@ -294,7 +289,7 @@ def population_response(
     white, noise, lower = white / units, noise / units**2, lower * units
     found = components(white, noise)
     made = predict(found, white, noise, np.asarray(days)[members], at)
-    scale, unlike = _unlike(white, noise, np.asarray(days)[members])
+    scale, unlike = inflation(white, noise, np.asarray(days)[members])
     back = basis @ lower
     covariance = csr_array(back @ (scale * made.covariance) @ back.T)
     named = tuple((members[j], chi2) for j, chi2 in unlike)

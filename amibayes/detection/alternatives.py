@@ -179,8 +179,7 @@ class ChromaticStar:
         at = np.array([np.interp(wavelengths, self.nodes, one) for one in diameters.T]).T
         exponent = np.array(self.limb_darkening)
         wave = power_law_disc(points.frequency[:, None], at, exponent) / (1.0 + self.background)
-        model = self.likelihood.observe(wave.astype(complex))
-        return self.likelihood.wrapped(self.likelihood.observables.data[:, None] - model)
+        return self.likelihood.difference_from(self.likelihood.observe(wave.astype(complex)))
 
     def slopes(self, diameters: FloatArray) -> FloatArray:
         """Derivative (n_data, n_nodes) of `difference`, of one star (n_nodes,).
@@ -270,7 +269,7 @@ def _elongated_star(likelihood: Likelihood, result: SearchResult) -> Alternative
         across = (points.u[:, None] * cosine - points.v[:, None] * sine) * np.exp(shapes[1])
         wave = power_law_disc(np.hypot(along, across), np.exp(shapes[0]), np.array(exponent))
         model = likelihood.observe((wave / (1.0 + background)).astype(complex))
-        return np.asarray(likelihood.wrapped(data.data[:, None] - model))
+        return likelihood.difference_from(model)
 
     def by_vis2(shape: FloatArray) -> FloatArray:
         return np.asarray(difference(shape[:, None])[: data.n_vis2, 0] / error)

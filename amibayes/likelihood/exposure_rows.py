@@ -149,10 +149,8 @@ def _names(data: Observables, which: IntArray) -> list[tuple[object, ...]]:
     """
     n, closure = data.n_vis2, data.closure_phase
     together = data.covariance_kind == "assumed"
-    of_set, numbers = (
-        np.empty(len(closure), dtype=np.intp),
-        dict[frozenset[tuple[object, ...]], int](),
-    )
+    of_set = np.empty(len(closure), dtype=np.intp)
+    numbers: dict[frozenset[tuple[object, ...]], int] = {}
     for entries in closure.sets if together else ():
         # A number for its triangles, which are hundreds where holes are many.
         triangles = frozenset(_named(data, closure, i) for i in entries.tolist())

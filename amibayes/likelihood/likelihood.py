@@ -167,7 +167,7 @@ class Likelihood(Shown):
 
     def difference(self, theta: ArrayLike) -> FloatArray:
         """Data − model, closure phases the short way round, (n_data, n)."""
-        return self._difference(self.predict(theta))
+        return self.difference_from(self.predict(theta))
 
     def chi2(self, theta: ArrayLike) -> FloatArray:
         """χ² of parameter sets (n, n_dim), (n,)."""
@@ -179,7 +179,7 @@ class Likelihood(Shown):
 
     def chi2_of_model(self, model: FloatArray) -> FloatArray:
         """χ² of a model of the data (n_data, n), closure phases in radians, (n,)."""
-        white = self.noise.whiten(self._difference(model))
+        white = self.noise.whiten(self.difference_from(model))
         return np.asarray(np.einsum("dn,dn->n", white, white))
 
     def log_prob(self, theta: ArrayLike) -> FloatArray:
@@ -195,7 +195,7 @@ class Likelihood(Shown):
     def log_prob_and_gradient(self, theta: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood with the one covariance (n,), and its gradient (n, n_dim)."""
         value, slopes = self.model.gradient(self.samples, self._sets(theta))
-        difference = self._difference(self.observe(value))
+        difference = self.difference_from(self.observe(value))
         weighted = self.noise.solve(difference)
         chi2 = (difference * weighted).sum(axis=0)
         # Reverse mode: fold the data's weights back onto the samples once, so that the
@@ -225,7 +225,7 @@ class Likelihood(Shown):
         (n_independent, 1 + n_dim, n), residuals first.
         """
         model, slopes = self.model_and_slopes(theta)
-        both = np.concatenate([self._difference(model)[:, None], slopes], axis=1)
+        both = np.concatenate([self.difference_from(model)[:, None], slopes], axis=1)
         white = self.noise.whiten(both.reshape(len(both), -1))
         return np.asarray(white.reshape(-1, *both.shape[1:]))
 
@@ -293,7 +293,8 @@ class Likelihood(Shown):
             return np.asarray(power)
         return np.concatenate([power, self.samples.legs @ phase])
 
-    def _difference(self, model: FloatArray) -> FloatArray:
+    def difference_from(self, model: FloatArray) -> FloatArray:
+        """Data minus model (n_data, n), whatever that is of; closure phases the short way."""
         return self.wrapped(self.observables.data[:, None] - model)
 
     def wrapped(self, change: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ class NoiseTerm:
 
     def log_likelihoods_of_white(self, white: FloatArray, node: FloatArray) -> FloatArray:
         """The same of whitened data minus model (rank, n)."""
-        variance = 1.0 + np.outer(np.expm1(2.0 * node), self.share)
+        variance = self._variance(node)
         n = self.n_independent
         norm = log_peak(n, self.degrees) - 0.5 * (np.log(variance).sum(axis=1) + self.log_det)
         chi2 = (1.0 / variance) @ white**2
@@ -96,8 +96,11 @@ class NoiseTerm:
     def fisher(self, slopes: FloatArray) -> FloatArray:
         """Fisher matrices (n_nodes, d, d) at the nodes, of slopes of the data (n_data, d)."""
         white = self.white(slopes)
-        variance = 1.0 + np.outer(np.expm1(2.0 * self.node), self.share)
-        return np.array([white.T @ (white / row[:, None]) for row in variance])
+        return np.array([white.T @ (white / row[:, None]) for row in self._variance(self.node)])
+
+    def _variance(self, node: FloatArray) -> FloatArray:
+        """Variances of whitened data for amounts of noise (n_nodes,), (n_nodes, rank)."""
+        return 1.0 + np.outer(np.expm1(2.0 * node), self.share)
 
     def log_parts(self, difference: FloatArray) -> FloatArray:
         """Logarithm of likelihood times prior at the nodes, (n_nodes, n)."""

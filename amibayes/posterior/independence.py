@@ -129,8 +129,7 @@ class Unnoticed:
     """
 
     def __init__(self, likelihood: Likelihood, prior: Prior, alone: StarAlone) -> None:
-        self.likelihood, self.prior = likelihood, prior
-        self.parameters = likelihood.parameters
+        self.prior, self.parameters = prior, likelihood.parameters
         values, vectors = np.linalg.eigh(alone.covariance)
         self.star = HeavyTailed(alone.mean, vectors * np.sqrt(np.clip(values, 1e-20, None)))
         self._some = _of_some_data(likelihood)

@@ -198,7 +198,7 @@ def test_components_of_a_population_are_those_recorded(num_regression) -> None:
         scatter=found.scatter,
         space=found.modes @ found.modes.T,
         predicted=predict(found, data, noise, days, 21.0),
-        inflation=inflation(data, noise, days),
+        inflation=inflation(data, noise, days)[0],
     )
 
 

@@ -172,7 +172,7 @@ def test_binaries_are_exact_without_noise(
 def truth_differences(calibrated: Observables, theta: list[float]) -> tuple[float, float]:
     """RMS of V² and of closure phase (degrees) about a binary."""
     likelihood = Likelihood(calibrated)
-    rest = likelihood._difference(likelihood.predict([theta]))[:, 0]
+    rest = likelihood.difference_from(likelihood.predict([theta]))[:, 0]
     n = calibrated.n_vis2
     return rms(rest[:n]), float(np.degrees(rms(rest[n:])))
 
